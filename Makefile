@@ -1,0 +1,44 @@
+# make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884
+# make test  every check: format, lint, types, import directions, tests
+# What they install goes to .venv, what they make to run; both can be deleted at any time.
+
+PYTHON ?= python3
+PORT ?= 8883
+PLAIN_PORT ?= 1883
+BIN := .venv/bin
+INTEROP := tests/interop
+
+# A sourced ROS is used as it is; without one, ROS 2 comes from PyPI.
+ifdef ROS_DISTRO
+VENV_OPTIONS := --system-site-packages
+TEST_EXTRAS := [test]
+else
+RUN_EXTRAS := [ros]
+TEST_EXTRAS := [ros,test]
+endif
+
+.PHONY: run test
+run: .venv/run.stamp
+	@$(BIN)/appliance init --demo --dir run
+	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
+
+test: .venv/test.stamp $(INTEROP)/node_modules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest
+
+.venv/run.stamp: pyproject.toml constraints.txt
+	@echo "Setting up .venv; the first time this takes a minute."
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV_OPTIONS) .venv
+	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(RUN_EXTRAS)'
+	@touch $@
+
+.venv/test.stamp: .venv/run.stamp
+	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(TEST_EXTRAS)'
+	@touch $@
+
+# MQTT.js is one of the clients that the tests speak with; without npm those tests are skipped.
+$(INTEROP)/node_modules: $(wildcard $(INTEROP)/package-lock.json)
+	@if command -v npm >/dev/null && test -n "$<"; then cd $(INTEROP) && npm ci --silent --no-audit --no-fund && touch node_modules; fi

@@ -1,0 +1,25 @@
+"""Who may come in and what they may do: the users file and the ACL file, in mosquitto's formats."""
+
+from __future__ import annotations
+
+from appliance.broker.ports import Refusal
+
+from .acl import Acl, Explanation, Permission, Rule, Verdict
+from .files import FileAccess
+from .passwords import Passwords, check_password, check_username
+from .problems import AccessFileError, Problem
+
+__all__ = [
+    "AccessFileError",
+    "Acl",
+    "Explanation",
+    "FileAccess",
+    "Passwords",
+    "Permission",
+    "Problem",
+    "Refusal",
+    "Rule",
+    "Verdict",
+    "check_password",
+    "check_username",
+]

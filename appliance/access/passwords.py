@@ -1,0 +1,335 @@
+"""The users file: `user:hash`, one a line, as mosquitto's password file."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import fcntl
+import hashlib
+import hmac
+import logging
+import os
+import re
+import stat
+import tempfile
+import threading
+import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import argon2
+from argon2.exceptions import InvalidHashError, VerificationError
+
+from .problems import AccessFileError, Problem, read_text
+
+_log = logging.getLogger(__name__)
+
+# OWASP's parameters for argon2id (Password Storage Cheat Sheet): a robot's computer is small, and
+# every login that waits takes this memory.
+_MEMORY_KIB: Final = 19 * 1024
+_PASSES: Final = 2
+_LANES: Final = 1
+_HASHER: Final = argon2.PasswordHasher(_PASSES, _MEMORY_KIB, _LANES)
+
+# Checked when there is nothing else to check, so that an unknown user takes as long as a known
+# one. Nobody knows a password that gives 32 zero bytes.
+_DECOY: Final = (
+    f"$argon2id$v=19$m={_MEMORY_KIB},t={_PASSES},p={_LANES}$" + "A" * 22 + "$" + "A" * 43
+)
+
+# A stored hash may not make one login take all the memory, or minutes: a slip of the pen in the
+# file would stop the robot from being reached.
+_MAX_MEMORY_KIB: Final = 1024 * 1024
+_MAX_PASSES: Final = 64
+_MAX_LANES: Final = 16
+_MAX_ITERATIONS: Final = 10_000_000
+
+_MAX_USERNAME: Final = 256  # bytes
+
+_ARGON2ID: Final = re.compile(
+    r"\$argon2id\$v=19\$m=(\d{1,9}),t=(\d{1,9}),p=(\d{1,9})"
+    r"\$[A-Za-z0-9+/]{11,}\$[A-Za-z0-9+/]{16,}"
+)
+_SHA512_SIZE: Final = 64
+
+
+def check_username(username: str) -> None:
+    """Raises a ValueError that says why `username` cannot be a user's name in the users file."""
+    if not username:
+        raise ValueError("a user name must not be empty")
+    if len(username.encode("utf-8", "surrogatepass")) > _MAX_USERNAME:
+        raise ValueError(f"a user name must not be longer than {_MAX_USERNAME} bytes")
+    if ":" in username:
+        raise ValueError("a user name must not hold ':', which ends it in the users file")
+    if username[0] == "#":
+        raise ValueError("a user name must not begin with '#', which begins a comment")
+    if username != username.strip():
+        raise ValueError("a user name must not begin or end with a space")
+    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in username):
+        raise ValueError("a user name must not hold control characters or line ends")
+
+
+def check_password(stored: str, password: bytes) -> bool:
+    """Whether `password` is the one that `stored`, a hash of any kind we read, was made of."""
+    if stored.startswith("$argon2id$"):
+        try:
+            return _HASHER.verify(stored, password)
+        except (VerificationError, InvalidHashError):
+            return False
+    if stored.startswith("$7$"):
+        _, _, iterations, salt, digest = stored.split("$")
+        made = hashlib.pbkdf2_hmac("sha512", password, base64.b64decode(salt), int(iterations))
+    else:
+        _, _, salt, digest = stored.split("$")
+        made = hashlib.sha512(password + base64.b64decode(salt)).digest()
+    return hmac.compare_digest(made, base64.b64decode(digest))
+
+
+class Passwords:
+    """The users and their password hashes, as read from a users file and changed since.
+
+    `set` and `remove` change the memory; `save` brings these changes, and no others, into the
+    file, so that what another process has written there meanwhile stays. Any thread may verify.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """No users yet; the file at `path` is neither read nor written."""
+        self.path = path
+        self._hashes: dict[str, str] = {}
+        self._changes: dict[str, str | None] = {}
+        self._rehashing = threading.Lock()
+
+    @classmethod
+    def load(cls, path: Path) -> Passwords:
+        """The users of the file at `path`; AccessFileError names every line that is wrong."""
+        self = cls(path)
+        text = read_text(path, "add a first user with: appliance user add NAME")
+        self._hashes = _parse(path, text)
+        with suppress(OSError):
+            if path.stat().st_mode & 0o007:
+                _log.warning(
+                    "%s is open to every user of this computer; close it with: chmod o= %s",
+                    path,
+                    path,
+                )
+        return self
+
+    def users(self) -> list[str]:
+        """The names of all users, sorted."""
+        return sorted(self._hashes)
+
+    def hash_of(self, username: str) -> str | None:
+        """The hash of a user's password; None when there is no such user."""
+        return self._hashes.get(username)
+
+    def verify(self, username: str, password: bytes) -> bool:
+        """Whether this is a user and its password; see `verified_hash`."""
+        return self.verified_hash(username, password) is not None
+
+    def verified_hash(self, username: str, password: bytes) -> str | None:
+        """The user's hash if this is its password, else None.
+
+        Takes tens of milliseconds of CPU, as long for an unknown user as for a wrong password. A
+        hash of mosquitto's is then replaced by argon2id in memory and in the file; that the file
+        cannot be written is logged, and the login is good all the same.
+        """
+        stored = self._hashes.get(username)
+        if stored is None:
+            check_password(_DECOY, password)
+            return None
+        known = check_password(stored, password)
+        if stored.startswith("$argon2id$"):
+            return stored if known else None
+        if not known:
+            # mosquitto's hashes are quick: a wrong password would tell that the user exists.
+            check_password(_DECOY, password)
+            return None
+        return self._rehash(username, stored, password)
+
+    def set(self, username: str, password: str | bytes) -> None:
+        """Adds a user or changes its password; ValueError says what is wrong with either."""
+        check_username(username)
+        if not password:
+            raise ValueError("a password must not be empty")
+        self._changes[username] = self._hashes[username] = _HASHER.hash(password)
+
+    def remove(self, username: str) -> None:
+        """Removes a user; KeyError when there is none of this name."""
+        del self._hashes[username]
+        self._changes[username] = None
+
+    def save(self) -> None:
+        """Brings what was set and removed into the file: all or nothing, and safe on disk.
+
+        The file is made with mode 0600; one that is there keeps its owner, its comments and its
+        group's right to read. AccessFileError when it cannot be written.
+        """
+        try:
+            _rewrite(self.path, self._changes)
+        except OSError as error:
+            message = (
+                f"cannot be written ({error.strerror}); use the user that owns the file and its "
+                "directory"
+            )
+            raise AccessFileError([Problem(self.path, 0, 0, message)]) from error
+        self._changes.clear()
+
+    def _rehash(self, username: str, old: str, password: bytes) -> str:
+        new = _HASHER.hash(password)
+        with self._rehashing:
+            current = self._hashes.get(username, old)
+            if current != old:  # Another thread was quicker.
+                return current
+            self._hashes[username] = new
+            try:
+                _rewrite(self.path, {username: new}, only_if=old)
+            except (OSError, AccessFileError) as error:
+                _log.warning("the new hash of user %r is not saved: %s", username, error)
+            else:
+                _log.info("the password of user %r is kept as argon2id from now on", username)
+        return new
+
+
+def _parse(path: Path, text: str) -> dict[str, str]:
+    hashes: dict[str, str] = {}
+    lines: dict[str, int] = {}
+    problems: list[Problem] = []
+    for number, line in enumerate(text.split("\n"), 1):
+        entry = _entry(line)
+        if entry is None:
+            continue
+        username, colon, stored = entry
+        try:
+            if not colon:
+                raise ValueError("not user:hash; add users with: appliance user add NAME")
+            check_username(username)
+        except ValueError as error:
+            problems.append(Problem(path, number, 1, str(error)))
+            continue
+        if username in lines:
+            message = f"user {username!r} is in line {lines[username]} already; remove one of them"
+            problems.append(Problem(path, number, 1, message))
+            continue
+        lines[username] = number
+        try:
+            _check_hash(stored, username)
+        except ValueError as error:
+            problems.append(Problem(path, number, len(username) + 2, str(error)))
+        else:
+            hashes[username] = stored
+    if problems:
+        raise AccessFileError(problems)
+    return hashes
+
+
+def _entry(line: str) -> tuple[str, str, str] | None:
+    """User, colon and hash of a line; None for an empty line and a comment."""
+    line = line.rstrip(" \t\r")
+    if not line or line[0] == "#":
+        return None
+    return line.partition(":")
+
+
+def _check_hash(stored: str, username: str) -> None:
+    """Raises a ValueError that says why `stored` is no hash we read, and never shows it."""
+    advice = f"set a password with: appliance user passwd {username}"
+    argon2id = _ARGON2ID.fullmatch(stored)
+    if argon2id:
+        memory, passes, lanes = map(int, argon2id.groups())
+        if memory > _MAX_MEMORY_KIB or passes > _MAX_PASSES or lanes > _MAX_LANES:
+            raise ValueError(f"this hash costs more than one login may; {advice}")
+        if memory < 8 * lanes or not passes or not lanes:
+            raise ValueError(f"not a valid argon2id hash; {advice}")
+    elif stored.startswith("$7$"):
+        match = re.fullmatch(r"\$7\$(\d{1,9})\$([^$]+)\$([^$]+)", stored)
+        if not match or not int(match[1]) or not _is_digest(match[2], match[3]):
+            raise ValueError(f"not a valid $7$ hash of mosquitto's (PBKDF2-SHA512); {advice}")
+        if int(match[1]) > _MAX_ITERATIONS:
+            raise ValueError(f"this hash costs more than one login may; {advice}")
+    elif stored.startswith("$6$"):
+        match = re.fullmatch(r"\$6\$([^$]+)\$([^$]+)", stored)
+        if not match or not _is_digest(match[1], match[2]):
+            raise ValueError(f"not a valid $6$ hash of mosquitto's (salted SHA-512); {advice}")
+    elif stored.startswith("$argon2id$"):
+        raise ValueError(f"not a valid argon2id hash; {advice}")
+    elif stored.startswith("$"):
+        raise ValueError(f"a kind of hash that is not read here ($argon2id$, $7$, $6$); {advice}")
+    elif stored:
+        raise ValueError(f"a plain password is not accepted; {advice}")
+    else:
+        raise ValueError(f"the user has no password; {advice}")
+
+
+def _is_digest(salt: str, digest: str) -> bool:
+    try:
+        base64.b64decode(salt, validate=True)
+        return len(base64.b64decode(digest, validate=True)) == _SHA512_SIZE
+    except binascii.Error:
+        return False
+
+
+def _rewrite(path: Path, changes: Mapping[str, str | None], only_if: str | None = None) -> None:
+    """Replaces, adds and (None) removes users in the file, leaving all other lines as they are.
+
+    With `only_if` a user is replaced only where its hash still is that one.
+    """
+    path = path.resolve()  # Of a symbolic link the file is replaced, not the link.
+    with _locked(path.parent):
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            status, text = None, ""
+        else:
+            text = read_text(path, "add it again")
+            _parse(path, text)
+        left = dict(changes) if only_if is None else {}
+        lines: list[str] = []
+        for line in text.split("\n"):
+            entry = _entry(line)
+            if entry is None or entry[0] not in changes or only_if not in (None, entry[2]):
+                lines.append(line)
+                continue
+            stored = changes[entry[0]]
+            left.pop(entry[0], None)
+            if stored is not None:
+                lines.append(f"{entry[0]}:{stored}")
+        if lines[-1] == "":
+            lines.pop()
+        lines += [f"{user}:{stored}" for user, stored in left.items() if stored is not None]
+        _replace(path, "".join(f"{line}\n" for line in lines), status)
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Holds off other processes that rewrite a file of this directory.
+
+    The lock is on the directory because the file itself is replaced by another one.
+    """
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+        os.fsync(descriptor)  # The new name is on disk, too.
+    finally:
+        os.close(descriptor)
+
+
+def _replace(path: Path, text: str, status: os.stat_result | None) -> None:
+    """Writes a file beside `path` and puts it in its place once it is safe on disk."""
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            if status is not None:
+                # root may have changed a password: the appliance's user must still read the file.
+                with suppress(PermissionError):
+                    os.fchown(descriptor, status.st_uid, status.st_gid)
+                    os.fchmod(descriptor, 0o600 | stat.S_IMODE(status.st_mode) & 0o040)
+            os.fsync(descriptor)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

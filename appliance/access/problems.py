@@ -1,0 +1,49 @@
+"""What is wrong with a users file or an ACL file, told so that it can be mended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing wrong in one file; lines and columns count from 1, and 0 means the whole file."""
+
+    file: Path
+    line: int
+    column: int
+    message: str
+
+    def __str__(self) -> str:
+        if not self.line:
+            return f"{self.file}: {self.message}"
+        return f"{self.file}:{self.line}:{self.column}: {self.message}"
+
+
+class AccessFileError(ValueError):
+    """A users file or an ACL file cannot be used; `problems` has all that is wrong with it."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = list(problems)
+
+
+def read_text(path: Path, advice: str) -> str:
+    """The text of a file; AccessFileError when it is missing (then with `advice`) or not UTF-8."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise AccessFileError([Problem(path, 0, 0, f"there is no such file; {advice}")]) from None
+    except OSError as error:
+        message = f"cannot be read ({error.strerror}); let the user that runs the appliance read it"
+        raise AccessFileError([Problem(path, 0, 0, message)]) from error
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = data[: error.start]
+        line = before.count(b"\n") + 1
+        column = len(before.rpartition(b"\n")[2].decode("utf-8", "replace")) + 1
+        message = "not UTF-8; save the file in that encoding"
+        raise AccessFileError([Problem(path, line, column, message)]) from None

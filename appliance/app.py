@@ -1,0 +1,183 @@
+"""The composition root: builds the parts, starts them in order, stops them in reverse."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+from importlib.metadata import version
+
+import uvloop
+
+from appliance.access import FileAccess
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Identity, Limits, Refusal
+from appliance.broker.sys_topics import SysTopics
+from appliance.certs import server_context
+from appliance.config import Settings
+from appliance.listeners import Listeners, ListenerSettings
+from appliance.mqtt.packets import Connect
+from appliance.store import MemoryStore
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two ticks of the broker's clock: the grain of keep alive and expiry.
+TICK = 1.0
+
+
+class App:
+    """The whole appliance, on the running event loop."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Assign only; `start` reads files and opens ports."""
+        self.settings = settings
+        self.addresses: list[tuple[str, int]] = []
+        self._stack = contextlib.AsyncExitStack()
+        self._stopping = asyncio.Event()
+
+    async def start(self) -> None:
+        """Start everything, or nothing.
+
+        Raises:
+            AccessFileError, CertificateError: a file is missing or wrong.
+            OSError: a port cannot be listened on.
+        """
+        try:
+            await self._start()
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def _start(self) -> None:
+        loop = asyncio.get_running_loop()
+        settings = self.settings
+        broker_settings = settings.broker
+        access = FileAccess(
+            broker_settings.users, broker_settings.acl, settings.robot, broker_settings.anonymous
+        )
+        self._stack.callback(access.close)
+        limits = broker_settings.limits
+        self.broker = broker = Broker(access, MemoryStore(), _broker_limits(settings))
+        broker.tick(loop.time())
+
+        async def authenticate(connect: Connect, address: str) -> Identity | Refusal:
+            return await access.authenticate(
+                connect.username, connect.password, connect.client_id, address
+            )
+
+        listeners = Listeners(
+            broker,
+            authenticate,
+            connections=limits.connections,
+            connect_timeout=limits.connect_timeout,
+        )
+        self._stack.push_async_callback(listeners.stop)
+        self._inside = broker.attach("_appliance", _Deaf())
+        self._start_clock(loop)
+        self.addresses = await listeners.start(self._listener_settings())
+        for host, port in self.addresses:
+            log.info("listening on %s:%d", host or "*", port)
+        state = f"{settings.robot}/_appliance/state"
+        self._publish(state, b"online", retain=True)
+        self._stack.callback(self._publish, state, b"offline", retain=True)
+
+    def _listener_settings(self) -> list[ListenerSettings]:
+        tls = self.settings.broker.tls
+        context = None
+        if any(listener.tls for listener in self.settings.broker.listeners):
+            context = server_context(tls.certificate, tls.key, tls.ca, tls.client_certificates)
+        return [
+            ListenerSettings(
+                listener.bind.host, listener.bind.port, context if listener.tls else None
+            )
+            for listener in self.settings.broker.listeners
+        ]
+
+    def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Tick once a second; publish `$SYS` every `broker.sys_interval`."""
+        sys_topics = SysTopics(self.broker, version("ros-mqtt-appliance"))
+        interval = self.settings.broker.sys_interval
+        next_sys = loop.time() + min(interval, TICK)
+        timer: asyncio.TimerHandle
+
+        def tick() -> None:
+            nonlocal timer, next_sys
+            now = loop.time()
+            self.broker.tick(now)
+            if interval and now >= next_sys:
+                next_sys = now + interval
+                for topic, payload in sys_topics.update():
+                    self._publish(topic, payload, retain=True)
+            timer = loop.call_later(TICK, tick)
+
+        timer = loop.call_later(TICK, tick)
+        self._stack.callback(lambda: timer.cancel())
+
+    def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        self.broker.publish(Message(topic, payload, 0, retain), self._inside)
+        self.broker.flush()
+
+    async def stop(self) -> None:
+        """Stop everything, in reverse order; may be called twice."""
+        await self._stack.aclose()
+
+    async def run(self) -> None:
+        """Start, run until SIGTERM or SIGINT (or `request_stop`), stop."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.request_stop)
+        await self.start()
+        try:
+            await self._stopping.wait()
+            log.info("stopping")
+        finally:
+            await self.stop()
+
+    def request_stop(self) -> None:
+        """Let `run` end."""
+        self._stopping.set()
+
+
+class _Deaf:
+    """The link of the session that the appliance itself publishes with: it receives nothing."""
+
+    writable = True
+
+    def publish(self, *_: object) -> None:
+        """It subscribes to nothing, so this is not called."""
+
+    def pubrel(self, packet_id: int) -> None:
+        """Nor is this."""
+
+    def close(self, reason: object, message: str) -> None:
+        """There is no connection to close."""
+
+
+def _broker_limits(settings: Settings) -> Limits:
+    limits = settings.broker.limits
+    return Limits(
+        packet_size=limits.packet_size,
+        memory=limits.memory,
+        queue_messages=limits.queue_messages,
+        queue_bytes=limits.queue_bytes,
+        inflight=limits.inflight,
+        subscriptions=limits.subscriptions,
+        topic_levels=limits.topic_levels,
+        retained_messages=limits.retained_messages,
+        retained_bytes=limits.retained_bytes,
+        session_expiry=round(limits.session_expiry),
+        topic_alias=limits.topic_alias,
+        keep_alive=round(limits.keep_alive),
+    )
+
+
+def run(settings: Settings) -> int:
+    """Run the appliance until it is told to stop; returns the exit code of the command."""
+    uvloop.run(_main(settings))
+    return 0
+
+
+async def _main(settings: Settings) -> None:
+    await App(settings).run()

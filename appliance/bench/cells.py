@@ -1,0 +1,314 @@
+"""The rows of the comparison: what each drives, on which brokers, and what is to be reached."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from appliance.bench import peers
+from appliance.bench.load import Result
+from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site
+
+REPEATS = 3  # of each broker, in turn, so that both see the same disturbances; the median counts
+GRACE_SECONDS = 90.0  # a run's connecting and settling, above the time it measures
+PACE = 1000.0  # messages a second of the bridge's rows
+
+Figures = Result  # of one broker: each figure the median of its runs
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one cell gave on both brokers; None where it did not run."""
+
+    cell: Cell
+    ours: Figures | None = None
+    peer: Figures | None = None
+    problem: str | None = None  # what went wrong
+    missing: str | None = None  # what this computer lacks to run it
+
+    def ratio(self, figure: str) -> float | None:
+        """The peer's figure divided by ours: above 1 we need less."""
+        ours, peer = (getattr(each, figure, None) for each in (self.ours, self.peer))
+        return peer / ours if ours and peer is not None else None
+
+    @property
+    def met(self) -> bool | None:
+        """Whether every goal is met; None when that cannot be told."""
+        ratios = [(self.ratio(figure), goal) for figure, goal in self.cell.goals.items()]
+        if any(ratio is None for ratio, _ in ratios):
+            return None
+        return all(ratio is not None and ratio >= goal for ratio, goal in ratios)
+
+
+class Side(Protocol):
+    """One broker, as a cell sees it."""
+
+    @property
+    def name(self) -> str:
+        """Whose figures these are."""
+
+    def measure(self, seconds: float) -> Result:
+        """Run the cell once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One row: `goals` are the least ratios, mosquitto's figure divided by ours."""
+
+    name: str
+    title: str
+    goals: Mapping[str, float] = field(default_factory=dict)
+
+    def missing(self) -> str | None:
+        """What this computer lacks to run the cell."""
+        return None
+
+    def ours(self, site: Site) -> contextlib.AbstractContextManager[Side]:
+        """This appliance, running."""
+        raise NotImplementedError
+
+    def peer(self, site: Site, command: str) -> contextlib.AbstractContextManager[Side]:
+        """mosquitto, running, with what else the cell needs."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True)
+class LoadSide:
+    """A broker driven by the load generator."""
+
+    server: Server
+    load: str
+    tls: bool
+
+    @property
+    def name(self) -> str:
+        """Whose figures these are."""
+        return self.server.name
+
+    def measure(self, seconds: float) -> Result:
+        """Run the load generator once."""
+        return run_measuring(
+            ["load", self.load, *self.server.arguments(self.tls)], self.server.site, seconds
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LoadCell(Cell):
+    """A broker alone, driven by `appliance.bench.load`."""
+
+    load: str = ""
+    tls: bool = False
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        with peers.appliance(site, [], os.environ) as server:
+            yield LoadSide(server, self.load, self.tls)
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        with peers.mosquitto(command, site) as server:
+            yield LoadSide(server, self.load, self.tls)
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeSide:
+    """A broker with a bridge, between a sender and a receiver."""
+
+    server: Server
+    send: Sequence[str]
+    receive: Sequence[str]
+    environment: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """Whose figures these are."""
+        return self.server.name
+
+    def measure(self, seconds: float) -> Result:
+        """Start a sender and a receiver, and stop the sender when the receiver has measured."""
+        site, options = self.server.site, self.server.arguments()
+        sending = [*self.send, *options, "--rate", str(PACE), "--seconds", str(GRACE_SECONDS)]
+        command = [sys.executable, "-m", "appliance.bench.ends", *sending]
+        environment = {**self.environment, PASSWORD_VARIABLE: site.password}
+        with peers.running("the sender", command, environment, site.directory / "sender.log"):
+            return run_measuring(["ends", *self.receive, *options], site, seconds, environment)
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeCell(Cell):
+    """Paced std_msgs/String through the bridge, against the tutorial node with mosquitto."""
+
+    send: Sequence[str] = ()
+    receive: Sequence[str] = ()
+
+    def missing(self) -> str | None:
+        for module in ("rclpy", "std_msgs"):
+            if importlib.util.find_spec(module) is None:
+                return f"needs ROS 2: no Python module {module}; source it, or install .[ros]"
+        return None
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        # As the tutorial node does it: the text as it is, QoS 0, and what is queued is ten deep.
+        route = {"type": "std_msgs/msg/String", "encoding": "text", "qos": 0, "keep": 10}
+        routes = [{"ros": "/chatter", "to": "mqtt"}, {"ros": "/command", "to": "ros"}]
+        environment = ros_environment(0)
+        with peers.appliance(site, [each | route for each in routes], environment) as server:
+            yield BridgeSide(server, self.send, self.receive, environment)
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        environment = {**ros_environment(1), PASSWORD_VARIABLE: site.password}
+        with peers.mosquitto(command, site) as server:
+            argv = [sys.executable, "-m", "appliance.bench.tutorial"]
+            argv += [str(server.port), peers.USER, PASSWORD_VARIABLE]
+            log = site.directory / "tutorial.log"
+            with peers.running("the tutorial node", argv, environment, log) as node:
+                both = dataclasses.replace(server, pids=(*server.pids, node.pid))
+                yield BridgeSide(both, self.send, self.receive, environment)
+
+
+def ros_environment(number: int) -> dict[str, str]:
+    """An environment whose ROS sees this computer only, in a domain of its own for each number."""
+    # Domains above 101 use ports that Linux gives to clients.
+    domain = 2 + (2 * os.getpid() + number) % 98
+    return {
+        **os.environ,
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOCALHOST_ONLY": "1",  # Humble's name for it
+        "ROS_DOMAIN_ID": str(domain),
+    }
+
+
+def run_measuring(
+    arguments: Sequence[str],
+    site: Site,
+    seconds: float,
+    environment: Mapping[str, str] = os.environ,
+) -> Result:
+    """Run one of this package's programs in a process of its own; its result. Raises PeerError."""
+    module, *options = arguments
+    command = [sys.executable, "-m", f"appliance.bench.{module}", *options]
+    if module == "load":
+        command.append("--json")
+    try:
+        done = subprocess.run(
+            [*command, "--seconds", str(seconds)],
+            capture_output=True,
+            text=True,
+            timeout=3 * seconds + GRACE_SECONDS,
+            env={**environment, PASSWORD_VARIABLE: site.password},
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise PeerError(f"no result after {3 * seconds + GRACE_SECONDS:g} s") from None
+    if done.returncode:
+        raise PeerError(done.stderr.strip().rpartition("\n")[2] or f"exit {done.returncode}")
+    return Result(**json.loads(done.stdout))
+
+
+CPU = "cpu_us"
+CELLS: tuple[Cell, ...] = (
+    LoadCell("qos0-pair", "QoS 0, one pair, one at a time", {CPU: 1.0}, "qos0-pair"),
+    LoadCell("qos0-pipelined", "QoS 0, one pair, pipelined", {CPU: 3.0}, "qos0-pipelined"),
+    LoadCell("qos1-inflight50", "QoS 1, one pair, 50 in flight", {CPU: 1.5}, "qos1-inflight50"),
+    LoadCell("qos1-50pairs", "QoS 1, 50 pairs, one at a time each", {CPU: 1.0}, "qos1-50pairs"),
+    LoadCell("qos0-fanout50", "QoS 0, one to 50 subscribers", {CPU: 1.0}, "qos0-fanout50"),
+    LoadCell("qos1-100k", "QoS 1, 100 KB payload", {CPU: 1.0}, "qos1-100k"),
+    LoadCell("qos0-pair-tls", "TLS: QoS 0, one at a time", {CPU: 1.0}, "qos0-pair", True),
+    LoadCell("qos1-50pairs-tls", "TLS: QoS 1, 50 pairs", {CPU: 1.0}, "qos1-50pairs", True),
+    LoadCell(
+        "qos1-inflight50-tls", "TLS: QoS 1, 50 in flight", {CPU: 1.5}, "qos1-inflight50", True
+    ),
+    LoadCell("idle-tls", "memory an idle TLS connection", {"memory_kib": 0.25}, "idle", True),
+    BridgeCell(
+        "ros-to-mqtt",
+        "ROS → MQTT, String at 1 kHz",
+        {CPU: 5.0, "p50_us": 2.0, "p99_us": 2.0},
+        ("ros-send", "--topic", "chatter"),
+        ("mqtt-receive", "--topic", "bench/chatter"),
+    ),
+    BridgeCell(
+        "mqtt-to-ros",
+        "MQTT → ROS, String at 1 kHz",
+        {CPU: 3.0, "p50_us": 2.0, "p99_us": 2.0},
+        ("mqtt-send", "--topic", "bench/command"),
+        ("ros-receive", "--topic", "command"),
+    ),
+)
+
+
+def median(runs: Sequence[Result]) -> Figures:
+    """Each figure's median over the runs; losses are added up, as none may be overlooked."""
+    figures = {}
+    for name in (each.name for each in dataclasses.fields(Result)):
+        values = [getattr(run, name) for run in runs]
+        if name == "lost":
+            figures[name] = sum(values)
+        elif isinstance(values[0], (str, bool)) or None in values:
+            figures[name] = values[0]
+        else:
+            figures[name] = statistics.median(values)
+    return Figures(**figures)
+
+
+def compare(
+    cell: Cell,
+    command: str | None,
+    seconds: float,
+    repeats: int = REPEATS,
+    progress: Callable[[str], object] = lambda text: None,
+) -> Row:
+    """Run one cell on freshly started brokers, ours and the peer's in turn."""
+    if missing := cell.missing():
+        return Row(cell, missing=missing)
+    # A connection's memory shows in a process that has not freed any: one run, a process each.
+    repeats = 1 if "memory_kib" in cell.goals else repeats
+    runs: dict[str, list[Result]] = {}
+    problems: dict[str, str] = {}
+    with (
+        tempfile.TemporaryDirectory(prefix="appliance-bench-") as directory,
+        contextlib.ExitStack() as stack,
+    ):
+        site = Site(Path(directory))
+        site.prepare()
+        sides: list[tuple[str, Side]] = []
+        starts: list[tuple[str, Callable[[], contextlib.AbstractContextManager[Side]]]] = [
+            ("ours", lambda: cell.ours(site))
+        ]
+        if command is not None:
+            starts.append(("peer", lambda: cell.peer(site, command)))
+        for whose, start in starts:
+            progress("starting")
+            try:
+                sides.append((whose, stack.enter_context(start())))
+            except PeerError as error:
+                problems[whose] = str(error)
+        for repeat in range(repeats):
+            for whose, side in sides:
+                if whose in problems:
+                    continue
+                progress(f"{side.name}, {repeat + 1} of {repeats}")
+                try:
+                    result = side.measure(seconds)
+                    runs.setdefault(whose, []).append(result)
+                except PeerError as error:
+                    problems[whose] = f"{side.name}: {error}"
+        progress("stopping")
+    return Row(
+        cell,
+        ours=median(runs["ours"]) if "ours" in runs else None,
+        peer=median(runs["peer"]) if "peer" in runs else None,
+        problem="; ".join(problems.values()) or None,
+    )

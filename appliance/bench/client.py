@@ -1,0 +1,225 @@
+"""The load's side of an MQTT connection: raw sockets, and as little of MQTT 3.1.1 as a load needs.
+
+It uses nothing of `appliance.mqtt`: the measure must not share a mistake with what it measures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+CONNECT_SECONDS = 60.0  # five hundred TLS handshakes and password checks on a small computer
+RECORDS_BYTES = 1 << 18  # TLS records taken in one system call
+
+
+class LoadError(Exception):
+    """The load could not be brought to the broker; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The broker to be driven."""
+
+    host: str = "127.0.0.1"
+    port: int = 1883
+    tls: ssl.SSLContext | None = None
+    username: str | None = None
+    password: bytes | None = None
+    pids: tuple[int, ...] = ()  # the processes whose CPU time and memory are the broker's
+
+
+def field(data: bytes) -> bytes:
+    """`data` with its length in two bytes before it (section 1.5.3)."""
+    return len(data).to_bytes(2, "big") + data
+
+
+def packet(first_byte: int, body: bytes) -> bytes:
+    """A whole packet: first byte, remaining length (section 2.2.3), body."""
+    length, head = len(body), bytearray([first_byte])
+    while True:
+        length, low = length >> 7, length & 0x7F
+        head.append(low | 0x80 if length else low)
+        if not length:
+            return bytes(head) + body
+
+
+def connect_packet(client_id: str, username: str | None, password: bytes | None) -> bytes:
+    """CONNECT with a clean session and no keep alive (section 3.1)."""
+    flags, body = 0x02, field(client_id.encode())
+    if username is not None:
+        flags, body = flags | 0x80, body + field(username.encode())
+    if password is not None:
+        flags, body = flags | 0x40, body + field(password)
+    return packet(0x10, field(b"MQTT") + bytes([4, flags, 0, 0]) + body)
+
+
+def publish_packet(topic: str, payload: bytes, packet_id: int | None = None) -> bytes:
+    """PUBLISH with QoS 1, or QoS 0 without a packet identifier (section 3.3)."""
+    if packet_id is None:
+        return packet(0x30, field(topic.encode()) + payload)
+    return packet(0x32, field(topic.encode()) + packet_id.to_bytes(2, "big") + payload)
+
+
+class Plain:
+    """A TCP connection."""
+
+    backlog = False  # bytes were taken that the socket has not sent yet
+    more = False  # bytes have arrived that were not handed out yet
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._socket = connection
+
+    def send(self, data: memoryview) -> int:
+        """Send what the socket takes; returns how much that was."""
+        try:
+            return self._socket.send(data) if data else 0
+        except BlockingIOError:
+            return 0
+
+    def recv_into(self, buffer: memoryview) -> int:
+        """Receive; returns the number of bytes, 0 when there is nothing yet."""
+        try:
+            size = self._socket.recv_into(buffer)
+        except BlockingIOError:
+            return 0
+        if not size:
+            raise LoadError("the broker closed a connection")
+        return size
+
+
+class Tls:
+    """A TLS connection: one system call for many records, where SSLSocket takes two for each."""
+
+    def __init__(self, connection: socket.socket, context: ssl.SSLContext, host: str) -> None:
+        self._socket = connection
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_hostname=host)
+        # Into a buffer, it returns the number of bytes; its declared type knows only the other way.
+        self._read = cast("Callable[[int, memoryview], int]", cast(Any, self._tls.read))
+        self._sealed = memoryview(b"")
+        self.more = False
+        while True:
+            try:
+                self._tls.do_handshake()
+            except ssl.SSLWantReadError:
+                connection.sendall(self._outgoing.read())
+                self._incoming.write(connection.recv(RECORDS_BYTES))
+            else:
+                break
+        connection.sendall(self._outgoing.read())
+
+    @property
+    def backlog(self) -> bool:
+        """Whether bytes were taken that the socket has not sent yet."""
+        return bool(self._sealed)
+
+    def send(self, data: memoryview) -> int:
+        """Send, one record at most a time; returns how many bytes were taken."""
+        taken = 0
+        if not self._sealed and data:
+            taken = self._tls.write(data[:RECORDS_BYTES])
+            self._sealed = memoryview(self._outgoing.read())
+        with contextlib.suppress(BlockingIOError):
+            while self._sealed:
+                self._sealed = self._sealed[self._socket.send(self._sealed) :]
+        return taken
+
+    def recv_into(self, buffer: memoryview) -> int:
+        """Receive; returns the number of bytes, 0 when there is nothing yet."""
+        if not self.more:
+            try:
+                sealed = self._socket.recv(RECORDS_BYTES)
+            except BlockingIOError:
+                return 0
+            if not sealed:
+                raise LoadError("the broker closed a connection")
+            self._incoming.write(sealed)
+        size, room = 0, len(buffer)
+        try:
+            while size < room:
+                size += self._read(room - size, buffer[size:])
+        except ssl.SSLWantReadError:
+            self.more = False
+        else:
+            self.more = True
+        return size
+
+
+class Client:
+    """One MQTT connection: opened step by step while blocking, then without ever blocking."""
+
+    def __init__(self, target: Target, client_id: str) -> None:
+        self.client_id = client_id
+        self.socket = socket.create_connection((target.host, target.port), CONNECT_SECONDS)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.transport: Plain | Tls = (
+            Plain(self.socket) if target.tls is None else Tls(self.socket, target.tls, target.host)
+        )
+        self._watch: Callable[[bool], None] = lambda wanted: None
+        self._waiting = False
+        self.write(connect_packet(client_id, target.username, target.password))
+
+    def connected(self) -> None:
+        """Wait for the CONNACK."""
+        if (code := self._expect(0x20, 4)[3]) != 0:
+            raise LoadError(f"{self.client_id}: the broker refuses the connection, code {code}")
+
+    def subscribe(self, topic: str, qos: int) -> None:
+        """Subscribe, and wait for the SUBACK."""
+        self.write(packet(0x82, b"\0\1" + field(topic.encode()) + bytes([qos])))
+        if (code := self._expect(0x90, 5)[4]) != qos:
+            raise LoadError(f"{self.client_id}: subscription to {topic} answered with {code:#x}")
+
+    def _expect(self, first_byte: int, size: int) -> bytes:
+        answer, filled = memoryview(bytearray(size)), 0
+        while filled < size:
+            filled += self.transport.recv_into(answer[filled:])
+        if answer[0] != first_byte:
+            raise LoadError(f"{self.client_id}: expected {first_byte:#x}, got {answer.hex()}")
+        return bytes(answer)
+
+    def attach(self, poll: select.epoll, events: dict[int, Callable[[int], None]]) -> None:
+        """Hand the connection to a loop, which calls `ready` when there is something to do."""
+        self.socket.setblocking(False)
+        descriptor = self.socket.fileno()
+        events[descriptor] = self.ready
+        poll.register(descriptor, select.EPOLLIN)
+        self._watch = lambda wanted: poll.modify(
+            descriptor, select.EPOLLIN | select.EPOLLOUT if wanted else select.EPOLLIN
+        )
+
+    def ready(self, event: int) -> None:
+        """Do what epoll says can be done."""
+        if event & select.EPOLLOUT:
+            self.write(b"")
+            self.flush()
+        if event & ~select.EPOLLOUT:
+            self.receive()
+            while self.transport.more:
+                self.receive()
+
+    def receive(self) -> None:
+        """Take what has arrived."""
+        raise NotImplementedError
+
+    def flush(self) -> None:
+        """Go on sending what the connection did not take."""
+        raise NotImplementedError
+
+    def write(self, data: bytes | memoryview) -> int:
+        """Send what the connection takes; returns how much that was."""
+        taken = self.transport.send(memoryview(data))
+        if (full := taken < len(data) or self.transport.backlog) != self._waiting:
+            self._waiting = full
+            self._watch(full)
+        return taken
+
+    def close(self) -> None:
+        """Close, in whatever state the connection is."""
+        with contextlib.suppress(OSError):
+            self.socket.close()

@@ -1,0 +1,230 @@
+"""The two ends of a bridge: a paced sender and a measuring receiver, on ROS or on MQTT.
+
+The sender puts the time and a number into each text; the receiver knows from them how long it took
+and what is missing::
+
+    python -m appliance.bench.ends mqtt-receive --port 1883 --topic bench/chatter --pid PID
+    python -m appliance.bench.ends ros-send --topic chatter --rate 1000
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict
+from importlib import import_module
+from typing import Any
+
+from appliance.bench.client import Client, LoadError, Target, publish_packet
+from appliance.bench.load import Result, cpu_seconds, percentile, pin
+
+TEXT_BYTES = 64
+FIRST_SECONDS = 30.0  # discovery, on a computer that has other things to do
+SETTLE_SECONDS = 1.0  # after the first message: the backlog of the start has gone through
+RECEIVE_BYTES = 1 << 16
+
+
+def text(number: int) -> str:
+    """What is sent: the time it is sent at, and its number."""
+    return f"{time.monotonic_ns():020d} {number:010d}".ljust(TEXT_BYTES)
+
+
+class Meter:
+    """Latency, loss, and the CPU time of everything between the two ends."""
+
+    def __init__(self, cell: str, pids: Sequence[int], seconds: float) -> None:
+        self._cell, self._pids, self._seconds = cell, pids, seconds
+        self._latencies: list[tuple[float, int]] = []
+        self._first = self._last = 0
+        self._starts = self._ends = 0.0  # the measurement, in seconds of the monotonic clock
+        self._began = self._elapsed = 0.0
+        self._cpu = 0.0
+
+    @property
+    def complete(self) -> bool:
+        """Whether the time is over."""
+        return self._elapsed > 0
+
+    def add(self, data: str | bytes) -> None:
+        """One message arrived."""
+        now = time.monotonic_ns() * 1e-9
+        if self.complete:
+            return
+        if not self._starts:
+            self._starts = now + SETTLE_SECONDS
+        if now < self._starts:
+            return
+        number = int(data[21:31])
+        if not self._began:
+            self._first, self._began = number, now
+            self._cpu = cpu_seconds(self._pids)
+        elif now >= self._began + self._seconds:
+            self._elapsed = now - self._began
+            self._cpu = cpu_seconds(self._pids) - self._cpu
+            return
+        self._last = max(self._last, number)
+        self._latencies.append((now - int(data[:20]) * 1e-9, 1))
+
+    def result(self) -> Result:
+        """The figures. Raises LoadError when the time was never over."""
+        if not self.complete:
+            raise LoadError("nothing comes through" if not self._starts else "it stopped flowing")
+        messages = len(self._latencies)
+        return Result(
+            cell=self._cell,
+            tls=False,
+            seconds=self._elapsed,
+            messages=messages,
+            lost=self._last - self._first + 1 - messages,
+            rate=messages / self._elapsed,
+            cpu_us=1e6 * self._cpu / messages if self._pids else None,
+            p50_us=1e6 * percentile(self._latencies, 0.50),
+            p99_us=1e6 * percentile(self._latencies, 0.99),
+            broker_busy=self._cpu / self._elapsed if self._pids else None,
+        )
+
+
+def paced(rate: float, seconds: float, send: Callable[[str], object]) -> None:
+    """Send `rate` texts a second for so long; what was missed is made up for."""
+    began = time.monotonic()
+    for number in range(int(rate * seconds)):
+        if (wait := began + number / rate - time.monotonic()) > 0:
+            time.sleep(wait)
+        send(text(number))
+
+
+# --- MQTT ---
+
+
+def mqtt_send(target: Target, topic: str, rate: float, seconds: float) -> None:
+    """Publish with QoS 0."""
+    with closing(Client(target, f"bench-send-{os.getpid()}")) as client:
+        client.connected()
+        paced(rate, seconds, lambda data: client.write(publish_packet(topic, data.encode())))
+
+
+def mqtt_receive(target: Target, topic: str, meter: Meter, seconds: float) -> None:
+    """Subscribe with QoS 0 and measure."""
+    size = len(publish_packet(topic, bytes(TEXT_BYTES)))
+    buffer, filled = memoryview(bytearray(RECEIVE_BYTES)), 0
+    with closing(Client(target, f"bench-receive-{os.getpid()}")) as client:
+        client.connected()
+        client.subscribe(topic, 0)
+        client.socket.settimeout(FIRST_SECONDS)
+        until = time.monotonic() + FIRST_SECONDS + SETTLE_SECONDS + 2 * seconds
+        while not meter.complete and time.monotonic() < until:
+            filled += client.transport.recv_into(buffer[filled:])
+            whole = filled - filled % size
+            for end in range(size, whole + 1, size):
+                meter.add(bytes(buffer[end - TEXT_BYTES : end]))
+            buffer[: filled - whole] = bytes(buffer[whole:filled])
+            filled -= whole
+
+
+# --- ROS ---
+
+
+def ros_send(topic: str, rate: float, seconds: float) -> None:
+    """Publish std_msgs/String."""
+    import rclpy
+
+    string = import_module("std_msgs.msg").String
+    rclpy.init()
+    node = rclpy.create_node("bench_send")
+    publisher = node.create_publisher(string, topic, 10)
+
+    def send(data: str) -> None:
+        if not rclpy.ok():  # a signal came
+            raise KeyboardInterrupt
+        publisher.publish(string(data=data))
+
+    try:
+        paced(rate, seconds, send)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def ros_receive(topic: str, meter: Meter, seconds: float) -> None:
+    """Subscribe to std_msgs/String and measure."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.task import Future
+
+    rclpy.init()
+    node = rclpy.create_node("bench_receive")
+    try:  # from Jazzy on; a fifth of the other's cost, which would be part of the latency
+        executor: Any = import_module("rclpy.experimental").EventsExecutor()
+    except ImportError:
+        executor = SingleThreadedExecutor()
+    complete: Any = Future(executor=executor)
+
+    def receive(message: Any) -> None:
+        meter.add(message.data)
+        if meter.complete and not complete.done():
+            complete.set_result(None)
+
+    node.create_subscription(import_module("std_msgs.msg").String, topic, receive, 1000)
+    executor.add_node(node)
+    try:
+        executor.spin_until_future_complete(
+            complete, timeout_sec=FIRST_SECONDS + SETTLE_SECONDS + 2 * seconds
+        )
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+ROLES = ("mqtt-send", "mqtt-receive", "ros-send", "ros-receive")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m appliance.bench.ends", description="One end of a bridge."
+    )
+    parser.add_argument("role", choices=ROLES)
+    parser.add_argument("--topic", required=True)
+    parser.add_argument("--cell", default="bridge", help="the name in the result")
+    parser.add_argument("--host", default="127.0.0.1")
+    parser.add_argument("--port", type=int, default=1883)
+    parser.add_argument("--user", help="user name")
+    parser.add_argument("--password-env", metavar="NAME", help="variable that holds the password")
+    parser.add_argument("--rate", type=float, default=1000.0, help="messages a second")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument(
+        "--pid", type=int, action="append", default=[], help="what is between; repeatable"
+    )
+    options = parser.parse_args(arguments)
+
+    password = os.environ[options.password_env].encode() if options.password_env else None
+    target = Target(options.host, options.port, None, options.user, password)
+    meter = Meter(options.cell, options.pid, options.seconds)
+    pin(options.pid)  # both ends on one core, what is between on another
+    try:
+        if options.role == "mqtt-send":
+            mqtt_send(target, options.topic, options.rate, options.seconds)
+        elif options.role == "ros-send":
+            ros_send(options.topic, options.rate, options.seconds)
+        else:
+            if options.role == "mqtt-receive":
+                mqtt_receive(target, options.topic, meter, options.seconds)
+            else:
+                ros_receive(options.topic, meter, options.seconds)
+            sys.stdout.write(json.dumps(asdict(meter.result())) + "\n")
+    except (LoadError, OSError) as error:
+        sys.stderr.write(f"{options.role}: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

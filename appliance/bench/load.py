@@ -1,0 +1,513 @@
+"""The load generator: one process that drives one broker with one cell's load, and measures it.
+
+Works against any MQTT 3.1.1 broker::
+
+    python -m appliance.bench.load qos1-inflight50 --port 1883 --pid "$(pidof mosquitto)" --json
+
+It must never be what limits the figures. So packets are encoded before the clock starts, all of a
+cell have one size, what arrives is counted by its length, and packet identifiers are picked out of
+a received chunk, and put into the acknowledgements, by slices that step from packet to packet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import select
+import ssl
+import statistics
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from appliance.bench.client import Client, LoadError, Target, publish_packet
+
+STALL_SECONDS = 3.0  # nothing arrives for so long: the broker has lost messages, or stands still
+DRAIN_SECONDS = 2.0  # what is still on the way after the last message was sent
+WARM_UP_SECONDS = 0.3
+RECEIVE_BYTES = 1 << 20
+RING_BYTES = 8 << 20  # the most that a publisher's packets, encoded beforehand, take
+CPUCLOCK_SCHED = 2  # clock_getcpuclockid(3): nanoseconds of all threads of a process
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """One cell: what is sent, to how many, and how much of it may be on the way."""
+
+    qos: int = 0
+    pairs: int = 1
+    subscribers: int = 1  # of each publisher
+    window: int = 1  # messages of one publisher neither delivered nor acknowledged
+    batch: int = 1  # send only when this many fit into the window
+    payload: int = 64  # bytes
+    idle: int = 0  # connections that only stay: measures memory, not messages
+
+
+CELLS: dict[str, Load] = {
+    "qos0-pair": Load(),
+    "qos0-pipelined": Load(window=4096, batch=1024),
+    "qos1-inflight50": Load(qos=1, window=50),
+    "qos1-50pairs": Load(qos=1, pairs=50),
+    "qos0-fanout50": Load(subscribers=50),
+    "qos1-100k": Load(qos=1, payload=100_000, window=10),
+    "idle": Load(idle=500),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What one run measured. None: does not apply to the cell, or no process was given."""
+
+    cell: str
+    tls: bool
+    seconds: float
+    messages: int = 0  # delivered
+    lost: int = 0
+    rate: float | None = None  # delivered messages a second
+    cpu_us: float | None = None  # the broker's CPU time a delivered message, µs
+    p50_us: float | None = None  # latency from sent to received, µs
+    p99_us: float | None = None
+    broker_busy: float | None = None  # CPU time / time; 1.0 is one core
+    generator_busy: float | None = None
+    memory_kib: float | None = None  # the broker's resident memory a connection, KiB
+
+
+class Flow:
+    """One publisher's messages: how many may be sent, and how long they took."""
+
+    def __init__(self, load: Load) -> None:
+        self.load = load
+        self.sent = 0
+        self.acknowledged = 0
+        self.deliveries = 0  # over all subscribers
+        self.latencies: list[tuple[float, int]] = []  # seconds, and of how many deliveries
+        self._marks: deque[tuple[int, float]] = deque()  # deliveries due, since when
+        self._publisher: Publisher
+
+    def start(self, publisher: Publisher) -> None:
+        """Send the first messages."""
+        self._publisher = publisher
+        self._send()
+
+    def acknowledge(self, count: int) -> None:
+        """The broker acknowledged messages."""
+        self.acknowledged += count
+        self._send()
+
+    def deliver(self, count: int) -> None:
+        """Messages arrived at a subscriber."""
+        now, done, marks = time.perf_counter(), self.deliveries, self._marks
+        self.deliveries = end = done + count
+        while done < end:
+            if not marks:
+                raise LoadError("the broker delivered more messages than were sent")
+            due, sent_at = marks[0]
+            taken = min(due, end)
+            self.latencies.append((now - sent_at, taken - done))
+            done = taken
+            if done == due:
+                marks.popleft()
+        self._send()
+
+    @property
+    def on_the_way(self) -> int:
+        """Messages neither delivered to all subscribers nor, with QoS 1, acknowledged."""
+        done = self.deliveries // self.load.subscribers
+        if self.load.qos:
+            done = min(done, self.acknowledged)
+        return self.sent - done
+
+    def stop(self) -> None:
+        """Send nothing more."""
+        self.load = replace(self.load, window=0)
+
+    def _send(self) -> None:
+        room = self.load.window - self.on_the_way
+        if room >= self.load.batch:
+            self.sent += room
+            self._marks.append((self.sent * self.load.subscribers, time.perf_counter()))
+            self._publisher.send(room)
+
+
+class Publisher(Client):
+    """Sends packets out of a ring in which they lie ready, one after the other."""
+
+    def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
+        super().__init__(target, client_id)
+        load = flow.load
+        payload = bytes(index & 0x7F for index in range(load.payload))
+        self._flow = flow
+        self._size = len(publish_packet(topic, payload, 1 if load.qos else None))
+        # Twice the window: an identifier is free again long before its packet's turn comes.
+        count = min(max(2 * load.window, 64), max(2 * load.window, RING_BYTES // self._size), 65535)
+        self._ring = memoryview(
+            b"".join(
+                publish_packet(topic, payload, 1 + index if load.qos else None)
+                for index in range(count)
+            )
+        )
+        self._position = 0
+        self._owed = 0
+        self._answer = memoryview(bytearray(4 * 65536))
+        self._answered = 0
+
+    def send(self, count: int) -> None:
+        """Send `count` messages, now or as soon as the socket takes them."""
+        if self._owed:
+            self._owed += count * self._size
+        else:
+            self._owed = count * self._size
+            self.flush()
+
+    def flush(self) -> None:
+        while self._owed:
+            sent = self.write(self._ring[self._position : self._position + self._owed])
+            if not sent:
+                return
+            self._owed -= sent
+            self._position = (self._position + sent) % len(self._ring)
+
+    def receive(self) -> None:
+        before = self._answered // 4
+        size = self.transport.recv_into(self._answer)
+        if size and self._answered % 4 == 0 and self._answer[0] != 0x40:
+            raise LoadError(f"{self.client_id}: expected PUBACK, got {self._answer[0]:#x}")
+        self._answered += size
+        if count := self._answered // 4 - before:
+            self._flow.acknowledge(count)
+
+
+class Subscriber(Client):
+    """Counts messages by their length, and acknowledges them where QoS 1 asks for it."""
+
+    def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
+        super().__init__(target, client_id)
+        load = flow.load
+        example = publish_packet(topic, bytes(load.payload), 0 if load.qos else None)
+        self._flow = flow
+        self._qos = load.qos
+        self._size = len(example)
+        self._identifier = self._size - load.payload - 2
+        self._buffer = memoryview(bytearray(max(RECEIVE_BYTES // load.subscribers, 2 * self._size)))
+        self._filled = 0
+        self._acknowledgements = memoryview(b"")
+
+    def receive(self) -> None:
+        buffer, size = self._buffer, self._size
+        self._filled = filled = self._filled + self.transport.recv_into(buffer[self._filled :])
+        count, rest = divmod(filled, size)
+        if not count:
+            return
+        if buffer[0] & 0xF0 != 0x30:
+            raise LoadError(f"{self.client_id}: expected PUBLISH, got {buffer[0]:#x}")
+        end = count * size
+        if self._qos:
+            answer = bytearray(b"\x40\x02\0\0" * count)
+            answer[2::4] = buffer[self._identifier : end : size]
+            answer[3::4] = buffer[self._identifier + 1 : end : size]
+            if self._acknowledgements:
+                answer = bytearray(self._acknowledgements) + answer
+            self._acknowledgements = memoryview(answer)
+            self.flush()
+        if rest:
+            buffer[:rest] = bytes(buffer[end:filled])
+        self._filled = rest
+        self._flow.deliver(count)
+
+    def flush(self) -> None:
+        self._acknowledgements = self._acknowledgements[self.write(self._acknowledgements) :]
+
+
+# --- Runs ---
+
+
+def cpu_seconds(pids: Iterable[int]) -> float:
+    """CPU time that these processes used so far, all their threads, ended ones included."""
+    return sum(time.clock_gettime((~pid << 3) | CPUCLOCK_SCHED) for pid in pids)
+
+
+def resident_kib(pids: Iterable[int]) -> int:
+    """Resident memory of these processes, KiB."""
+    return sum(
+        int(line.split()[1])
+        for pid in pids
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmRSS:")
+    )
+
+
+def pin(pids: Iterable[int]) -> bool:
+    """Give this process one core and the broker another; False where there is only one."""
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        return False
+    os.sched_setaffinity(0, cores[:1])
+    for pid in pids:
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            os.sched_setaffinity(int(task.name), cores[1:2])
+    return True
+
+
+def percentile(weighted: Iterable[tuple[float, int]], part: float) -> float:
+    """The value that `part` (0 to 1) of the weighted samples do not exceed."""
+    samples = sorted(weighted)
+    left = part * sum(weight for _, weight in samples)
+    for value, weight in samples:
+        left -= weight
+        if left <= 0:
+            return value
+    raise LoadError("nothing was delivered while measuring")
+
+
+class Run:
+    """All clients of one cell, and the loop that serves them."""
+
+    def __init__(self, target: Target, load: Load, spin: bool) -> None:
+        self._target = target
+        self._patience = 0.0 if spin else 0.1
+        self._poll = select.epoll()
+        self._events: dict[int, Callable[[int], None]] = {}
+        self._clients: list[Client] = []
+        self._publishers: list[Publisher] = []
+        self._subscribers: list[tuple[Subscriber, str]] = []
+        self._flows: list[Flow] = []
+        self._load = load
+
+    def open(self) -> None:
+        """Connect and subscribe everyone."""
+        run = f"bench-{os.getpid()}"
+        for pair in range(self._load.pairs):
+            topic, flow = f"bench/load/{pair:02d}", Flow(self._load)
+            self._flows.append(flow)
+            for number in range(self._load.subscribers):
+                subscriber = Subscriber(self._target, f"{run}-s{pair}-{number}", flow, topic)
+                self._subscribers.append((subscriber, topic))
+                self._clients.append(subscriber)
+            publisher = Publisher(self._target, f"{run}-p{pair}", flow, topic)
+            self._publishers.append(publisher)
+            self._clients.append(publisher)
+        # Only now: a broker may take its time for a password, and checks several at once.
+        for client in self._clients:
+            client.connected()
+        for subscriber, topic in self._subscribers:
+            subscriber.subscribe(topic, self._load.qos)
+        for client in self._clients:
+            client.attach(self._poll, self._events)
+
+    def start(self) -> None:
+        """Send the first messages."""
+        for flow, publisher in zip(self._flows, self._publishers, strict=True):
+            flow.start(publisher)
+
+    def serve(self, until: float, drained: bool = False) -> None:
+        """Serve the connections up to a time of `perf_counter`, or until all has arrived."""
+        poll, events, clock = self._poll.poll, self._events, time.perf_counter
+        patience = self._patience
+        progress, seen = clock(), self.deliveries
+        while (now := clock()) < until:
+            if drained and not any(flow.on_the_way for flow in self._flows):
+                return
+            for descriptor, event in poll(patience):
+                events[descriptor](event)
+            if now - progress > STALL_SECONDS / 2:
+                if self.deliveries == seen and now - progress > STALL_SECONDS:
+                    missing = sum(flow.on_the_way for flow in self._flows)
+                    raise LoadError(
+                        f"nothing arrives: {missing} messages are on the way"
+                        f" after {seen} deliveries (lost, or the broker stands still)"
+                    )
+                if self.deliveries != seen:
+                    progress, seen = now, self.deliveries
+
+    @property
+    def deliveries(self) -> int:
+        """Messages delivered so far, over all subscribers."""
+        return sum(flow.deliveries for flow in self._flows)
+
+    def forget_latencies(self) -> None:
+        """Leave the warm-up out of the figures."""
+        for flow in self._flows:
+            flow.latencies = []
+
+    def latencies(self) -> list[tuple[float, int]]:
+        """Latencies since the warm-up: seconds, and of how many deliveries."""
+        return [sample for flow in self._flows for sample in flow.latencies]
+
+    def drain(self) -> int:
+        """Stop sending and wait for what is on the way; returns the deliveries that never came."""
+        for flow in self._flows:
+            flow.stop()
+        self.serve(time.perf_counter() + DRAIN_SECONDS, drained=True)
+        return sum(flow.sent * flow.load.subscribers - flow.deliveries for flow in self._flows)
+
+    def close(self) -> None:
+        """Close every connection."""
+        for client in self._clients:
+            client.close()
+        self._poll.close()
+
+
+def run_messages(cell: str, target: Target, load: Load, seconds: float, spin: bool) -> Result:
+    """Drive a broker with messages for `seconds`, after a short warm-up.
+
+    With `spin` the loop never sleeps, which takes a core of its own: waking up a sleeping process
+    costs whoever writes to it, here the broker, more than a message does.
+    """
+    run = Run(target, load, spin)
+    try:
+        run.open()
+        run.start()
+        run.serve(time.perf_counter() + WARM_UP_SECONDS)
+        run.forget_latencies()
+        before, generator, cpu = run.deliveries, time.process_time(), cpu_seconds(target.pids)
+        began = time.perf_counter()
+        run.serve(began + seconds)
+        elapsed = time.perf_counter() - began
+        cpu, generator = cpu_seconds(target.pids) - cpu, time.process_time() - generator
+        messages, latencies = run.deliveries - before, run.latencies()
+        lost = run.drain()
+    finally:
+        run.close()
+    return Result(
+        cell=cell,
+        tls=target.tls is not None,
+        seconds=elapsed,
+        messages=messages,
+        lost=lost,
+        rate=messages / elapsed,
+        cpu_us=1e6 * cpu / messages if target.pids and messages else None,
+        p50_us=1e6 * percentile(latencies, 0.50),
+        p99_us=1e6 * percentile(latencies, 0.99),
+        broker_busy=cpu / elapsed if target.pids else None,
+        generator_busy=generator / elapsed,
+    )
+
+
+def run_idle(cell: str, target: Target, load: Load, seconds: float) -> Result:
+    """Open connections that stay idle, and see what memory each costs a freshly started broker."""
+    if not target.pids:
+        raise LoadError("the idle cell measures memory: tell the broker's process with --pid")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2 * load.idle + 100
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, wanted)), hard))
+    clients: list[Client] = []
+    try:
+        # The first connections also pay for what is made once.
+        _open_idle(target, "warm", max(load.idle // 10, 10), clients)
+        before = _settled_kib(target.pids, seconds / 2)
+        _open_idle(target, "idle", load.idle, clients)
+        after = _settled_kib(target.pids, seconds / 2)
+    finally:
+        for client in clients:
+            client.close()
+    memory = (after - before) / load.idle
+    return Result(cell, target.tls is not None, seconds, memory_kib=memory)
+
+
+def _open_idle(target: Target, name: str, count: int, clients: list[Client]) -> None:
+    opened = []
+    for number in range(count):
+        client = Client(target, f"bench-{os.getpid()}-{name}{number}")
+        clients.append(client)
+        opened.append(client)
+    for client in opened:
+        client.connected()
+
+
+def _settled_kib(pids: Sequence[int], seconds: float) -> float:
+    """Resident memory over `seconds`: the median, as an allocator gives back in its own time."""
+    until, samples = time.monotonic() + seconds, [resident_kib(pids)]
+    while time.monotonic() < until:
+        time.sleep(0.1)
+        samples.append(resident_kib(pids))
+    return statistics.median(samples)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m appliance.bench.load",
+        description="Drive an MQTT broker with one cell's load and measure it.",
+    )
+    parser.add_argument("cell", choices=CELLS, metavar="CELL", help=", ".join(CELLS))
+    parser.add_argument("--host", default="127.0.0.1")
+    parser.add_argument("--port", type=int, help="default: 1883, with TLS 8883")
+    parser.add_argument("--tls", action="store_true", help="connect over TLS")
+    parser.add_argument("--ca", metavar="FILE", help="the CA that signed the broker's certificate")
+    parser.add_argument("--user", help="user name")
+    parser.add_argument("--password-env", metavar="NAME", help="variable that holds the password")
+    parser.add_argument(
+        "--pid", type=int, action="append", default=[], help="the broker's process; repeatable"
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="time to measure (default: 3)")
+    parser.add_argument("--no-pin", action="store_true", help="leave both to the scheduler")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    tuning = parser.add_argument_group("to change the cell")
+    tuning.add_argument("--window", type=int, help="messages on the way, each publisher")
+    tuning.add_argument("--batch", type=int, help="send only when so many fit in the window")
+    tuning.add_argument("--payload", type=int, help="bytes")
+    tuning.add_argument("--pairs", type=int, help="publishers, each with its subscribers")
+    tuning.add_argument("--subscribers", type=int, help="of each publisher")
+    tuning.add_argument("--idle", type=int, help="connections of the idle cell")
+    options = parser.parse_args(arguments)
+
+    changes = {
+        name: value
+        for name in ("window", "batch", "payload", "pairs", "subscribers", "idle")
+        if (value := getattr(options, name)) is not None
+    }
+    if any(value < 1 for value in changes.values()) or options.seconds <= 0:
+        parser.error("numbers must be greater than 0")
+    load = replace(CELLS[options.cell], **changes)
+    if load.batch > load.window:
+        parser.error("a batch larger than the window would never be sent")
+    password = os.environ.get(options.password_env) if options.password_env else None
+    if options.password_env and password is None:
+        parser.error(f"there is no variable {options.password_env}")
+    try:
+        target = Target(
+            host=options.host,
+            port=options.port or (8883 if options.tls else 1883),
+            tls=ssl.create_default_context(cafile=options.ca) if options.tls else None,
+            username=options.user,
+            password=password.encode() if password is not None else None,
+            pids=tuple(options.pid),
+        )
+        spin = not options.no_pin and pin(target.pids)
+        if load.idle:
+            result = run_idle(options.cell, target, load, options.seconds)
+        else:
+            result = run_messages(options.cell, target, load, options.seconds, spin)
+    except (LoadError, OSError) as error:
+        sys.stderr.write(f"{options.cell}: {error}\n")
+        return 1
+    sys.stdout.write((json.dumps(asdict(result)) if options.json else describe(result)) + "\n")
+    return 0
+
+
+def describe(result: Result) -> str:
+    """A result in one line."""
+
+    def shown(name: str, value: float | None, unit: str) -> str:
+        return "" if value is None else f"  {name} {value:,.1f}{unit}"
+
+    return (
+        f"{result.cell}{' TLS' if result.tls else ''}:"
+        + shown("CPU", result.cpu_us, " µs/message")
+        + shown("rate", result.rate, "/s")
+        + shown("p50", result.p50_us, " µs")
+        + shown("p99", result.p99_us, " µs")
+        + shown("memory", result.memory_kib, " KiB/connection")
+        + shown("busy: broker", result.broker_busy and 100 * result.broker_busy, " %")
+        + shown("generator", result.generator_busy and 100 * result.generator_busy, " %")
+        + (f"  lost {result.lost}" if result.lost else "")
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+"""The brokers that are compared: this appliance and mosquitto, with equal settings.
+
+Both have a password file, the same ACL in force, one TCP and one TLS listener on 127.0.0.1 with the
+same certificate, nothing on disk, and the same window towards a subscriber. All files lie in one
+directory that the caller removes.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import os
+import secrets
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from pathlib import Path
+
+import yaml
+
+from appliance import certs
+from appliance.access import Passwords
+from appliance.bench.client import Client, LoadError, Target
+from appliance.environment import for_other_programs
+
+USER = "bench"
+PASSWORD_VARIABLE = "APPLIANCE_BENCH_PASSWORD"
+ACL = f"""\
+# In force on both brokers.
+topic read $SYS/broker/uptime
+user {USER}
+topic readwrite bench/#
+pattern readwrite clients/%c/#
+"""
+INFLIGHT = 100  # towards a subscriber; mosquitto's default of 20 would stand in the load's way
+PLACES = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
+START_SECONDS = 20.0
+STOP_SECONDS = 10.0
+
+
+class PeerError(Exception):
+    """A process could not be started, or has ended; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What the brokers of one comparison share: the directory with certificates, and the user."""
+
+    directory: Path
+    password: str = field(default_factory=lambda: secrets.token_urlsafe(12), repr=False)
+
+    @property
+    def ca(self) -> Path:
+        """The CA that signed the certificate of both brokers."""
+        return self.directory / "ca.crt"
+
+    def prepare(self) -> None:
+        """Make the certificates."""
+        certs.create_authority(self.directory)
+        certs.issue_server(self.directory, ["localhost"], [ip_address("127.0.0.1")])
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A running broker, with what else works for it."""
+
+    name: str
+    site: Site
+    port: int
+    tls_port: int
+    pids: tuple[int, ...]
+
+    def target(self, tls: bool) -> Target:
+        """Where and how a client connects."""
+        return Target(
+            port=self.tls_port if tls else self.port,
+            tls=ssl.create_default_context(cafile=self.site.ca) if tls else None,
+            username=USER,
+            password=self.site.password.encode(),
+            pids=self.pids,
+        )
+
+    def arguments(self, tls: bool = False) -> list[str]:
+        """The same as options of the load's programs."""
+        shown = ["--user", USER, "--password-env", PASSWORD_VARIABLE]
+        shown += ["--port", str(self.tls_port if tls else self.port)]
+        shown += ["--tls", "--ca", str(self.site.ca)] if tls else []
+        return shown + [option for pid in self.pids for option in ("--pid", str(pid))]
+
+
+def find_mosquitto(command: str | None) -> str | None:
+    """The path of the mosquitto to compare with, None when there is none."""
+    path = os.pathsep.join((os.environ.get("PATH", os.defpath), *PLACES))
+    return shutil.which(command or "mosquitto", path=path)
+
+
+def mosquitto_version(command: str) -> str:
+    """Such as `mosquitto 2.0.11`."""
+    text = subprocess.run(
+        [command, "-h"],
+        capture_output=True,
+        text=True,
+        timeout=STOP_SECONDS,
+        env=for_other_programs(),
+        check=False,
+    ).stdout
+    return text.partition("\n")[0].replace(" version", "") or "mosquitto"
+
+
+@contextlib.contextmanager
+def mosquitto(command: str, site: Site) -> Iterator[Server]:
+    """Run mosquitto; it is stopped in the end. Raises PeerError."""
+    directory = site.directory / "mosquitto"
+    directory.mkdir()
+    (directory / "acl").write_text(ACL)
+    salt = secrets.token_bytes(12)
+    digest = hashlib.pbkdf2_hmac("sha512", site.password.encode(), salt, 101)
+    encoded = [base64.b64encode(part).decode() for part in (salt, digest)]
+    passwords = directory / "passwords"
+    passwords.write_text(f"{USER}:$7$101${'$'.join(encoded)}\n")
+    passwords.chmod(0o600)
+    port, tls_port = free_ports(2)
+    (directory / "mosquitto.conf").write_text(
+        ("user root\n" if os.geteuid() == 0 else "")  # it could not read the directory otherwise
+        + f"""\
+per_listener_settings false
+allow_anonymous false
+password_file {passwords}
+acl_file {directory / "acl"}
+persistence false
+log_dest stderr
+log_type error
+log_type warning
+max_inflight_messages {INFLIGHT}
+set_tcp_nodelay true
+listener {port} 127.0.0.1
+listener {tls_port} 127.0.0.1
+certfile {site.directory / "server.crt"}
+keyfile {site.directory / "server.key"}
+"""
+    )
+    argv = [command, "-c", str(directory / "mosquitto.conf")]
+    with running("mosquitto", argv, for_other_programs(), directory / "log") as process:
+        server = Server("mosquitto", site, port, tls_port, (process.pid,))
+        wait_for(server, process, directory / "log")
+        yield server
+
+
+@contextlib.contextmanager
+def appliance(
+    site: Site, routes: Sequence[Mapping[str, object]], environment: Mapping[str, str]
+) -> Iterator[Server]:
+    """Run this appliance, with a bridge when there are routes; stopped in the end. PeerError."""
+    directory = site.directory / "appliance"
+    directory.mkdir()
+    passwords = Passwords(directory / "users.passwd")
+    passwords.set(USER, site.password)
+    passwords.save()
+    (directory / "acl.conf").write_text(ACL)
+    port, tls_port = free_ports(2)
+    settings = {
+        "robot": "bench",
+        "broker": {
+            "listeners": [
+                {"bind": f"127.0.0.1:{port}"},
+                {"bind": f"127.0.0.1:{tls_port}", "tls": True},
+            ],
+            "users": "users.passwd",
+            "acl": "acl.conf",
+            "tls": {
+                "certificate": str(site.directory / "server.crt"),
+                "key": str(site.directory / "server.key"),
+                "ca": str(site.ca),
+                "client_certificates": "none",
+            },
+            "limits": {"inflight": INFLIGHT},
+        },
+        "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
+        "log": {"level": "warning"},
+    }
+    file = directory / "appliance.yaml"
+    file.write_text(yaml.safe_dump(settings, sort_keys=False))
+    argv = [sys.executable, "-m", "appliance", "run", "--config", str(file)]
+    with running("appliance run", argv, environment, directory / "log") as process:
+        server = Server("appliance", site, port, tls_port, (process.pid,))
+        wait_for(server, process, directory / "log")
+        yield server
+
+
+@contextlib.contextmanager
+def running(
+    name: str, argv: Sequence[str], environment: Mapping[str, str], log: Path
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a program whose output goes to `log`; it is stopped in the end. Raises PeerError."""
+    with log.open("wb") as output:
+        try:
+            process = subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment
+            )
+        except OSError as error:
+            raise PeerError(f"{name} does not start: {error}") from error
+    try:
+        yield process
+        if process.poll() is not None:
+            raise PeerError(f"{name} ended with {process.returncode}: {last_lines(log)}")
+    finally:
+        stop(process)
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    """End a process, by force when it does not follow."""
+    if process.poll() is None:
+        process.terminate()
+    try:
+        process.wait(STOP_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def wait_for(server: Server, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait until the user can connect to both listeners. Raises PeerError."""
+    until = time.monotonic() + START_SECONDS
+    missing = [False, True]
+    while missing:
+        try:
+            with contextlib.closing(Client(server.target(missing[0]), "bench-ready")) as client:
+                client.connected()
+            missing.pop(0)
+        except (OSError, LoadError) as error:
+            if process.poll() is not None:
+                problem = f"ended with {process.returncode}"
+            elif time.monotonic() > until:
+                problem = f"does not answer within {START_SECONDS:g} s ({error})"
+            else:
+                time.sleep(0.05)
+                continue
+            raise PeerError(f"{server.name} {problem}: {last_lines(log)}") from error
+
+
+def last_lines(log: Path) -> str:
+    """The end of what a program said, in one line."""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return " | ".join(lines[-3:]) or "it said nothing"
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of 127.0.0.1 that were free just now; a program that takes no port 0 needs a number."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [int(each.getsockname()[1]) for each in sockets]

@@ -1,0 +1,116 @@
+"""What was measured: a table for people, JSON for machines."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from appliance.bench.cells import Row
+
+HEADINGS = {
+    "cpu_us": "CPU µs a message",
+    "rate": "messages/s",
+    "p50_us": "p50 µs",
+    "p99_us": "p99 µs",
+    "memory_kib": "KiB",
+}
+WIDTH_ELSEWHERE = 200  # of a file or a pipe, which wraps nothing
+
+
+def to_json(rows: Sequence[Row], peer: str | None, seconds: float, repeats: int) -> str:
+    """All figures, ratios and goals, with where and how they were measured."""
+    return json.dumps(
+        {
+            "peer": peer,
+            "seconds": seconds,
+            "repeats": repeats,
+            "cores": os.cpu_count(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "rows": [
+                {
+                    "cell": row.cell.name,
+                    "title": row.cell.title,
+                    "ours": asdict(row.ours) if row.ours else None,
+                    "peer": asdict(row.peer) if row.peer else None,
+                    "ratios": {figure: row.ratio(figure) for figure in HEADINGS},
+                    "goals": dict(row.cell.goals),
+                    "met": row.met,
+                    "problem": row.problem,
+                    "missing": row.missing,
+                }
+                for row in rows
+            ],
+        },
+        indent=2,
+    )
+
+
+def number(value: float | None) -> str:
+    """With as many digits as say something."""
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
+
+
+def table(rows: Sequence[Row], peer: str | None) -> Table:
+    """One line a figure: ours, the peer's, the ratio, the goal. CPU time, the steadiest, first."""
+    result = Table(title=f"appliance and {peer}" if peer else "appliance")
+    result.add_column("cell")
+    result.add_column("figure")
+    result.add_column("appliance", justify="right")
+    if peer:
+        result.add_column(peer.partition(" ")[0], justify="right")
+        result.add_column("ratio", justify="right")
+        result.add_column("goal", justify="right")
+        result.add_column("")
+    for row in rows:
+        title = row.cell.title
+        for figure, heading in HEADINGS.items():
+            ours, theirs = (getattr(each, figure, None) for each in (row.ours, row.peer))
+            if ours is None and theirs is None:
+                continue
+            goal = row.cell.goals.get(figure)
+            # A rate is better when it is higher: turned round, so that more than 1 is always good.
+            ratio = row.ratio(figure)
+            if figure == "rate" and ratio:
+                ratio = 1 / ratio
+            cells = [title, heading, number(ours)]
+            if peer:
+                cells += [number(theirs), f"{ratio:.2f}" if ratio is not None else ""]
+                cells += [f"≥ {goal:g}" if goal else "", verdict(ratio, goal)]
+            result.add_row(*cells)
+            title = ""
+        for name, figures in (("appliance", row.ours), (peer or "", row.peer)):
+            if figures and figures.lost:
+                what = f"{figures.lost} of {figures.messages + figures.lost}"
+                result.add_row(title, f"[red]lost by {name.partition(' ')[0]}[/red]", what)
+                title = ""
+        for note in (row.problem, row.missing):
+            if note:
+                result.add_row(title, f"[red]{escape(note)}[/red]")
+        result.add_section()
+    return result
+
+
+def verdict(ratio: float | None, goal: float | None) -> str:
+    """Whether a goal is met."""
+    if ratio is None or goal is None:
+        return ""
+    return "[green]met[/green]" if ratio >= goal else "[red]not met[/red]"
+
+
+def show(rows: Sequence[Row], peer: str | None) -> None:
+    """The table: on a terminal in its width, elsewhere as Markdown without colours."""
+    console, shown = Console(), table(rows, peer)
+    if not console.is_terminal:
+        console, shown.box = Console(width=WIDTH_ELSEWHERE, no_color=True), box.MARKDOWN
+    console.print(shown)

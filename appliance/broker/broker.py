@@ -1,0 +1,511 @@
+"""The broker: connect · publish · subscribe · unsubscribe · disconnect · tick(now).
+
+Only one thread may call it. It does no I/O: what it sends goes to `Link`s, and `flush` tells the
+network clients among them to write what one received chunk has caused.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from appliance.broker.message import Message
+from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
+from appliance.broker.session import Counters, Ledger, PendingWill, Session
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import (
+    SubscriptionTree,
+    TopicTree,
+    check_filter,
+    check_topic,
+    parse_shared,
+)
+
+log = logging.getLogger(__name__)
+
+#: Topics a session's routes are cached for; a client that publishes to more starts over, so that
+#: a stranger's invented topics cannot grow the cache.
+CACHED_ROUTES = 1024
+
+#: Seconds between two lines in the log about the same full queue.
+FULL_QUEUE_LOG_INTERVAL = 60.0
+
+_ALLOWED = Decision(True, "the appliance itself")
+
+
+class Ticking(Protocol):
+    """A network client, as the broker's clock sees it."""
+
+    def flush(self) -> None:
+        """Write what was sent to it."""
+
+    def abandon(self) -> None:
+        """Close it without writing what was sent to it."""
+
+    def tick(self, now: float) -> None:
+        """Check its keep alive."""
+
+
+@dataclass(slots=True)
+class Route:
+    """What is known about one topic for one publishing session, until the epoch changes."""
+
+    topic: str
+    decision: Decision
+    #: Reason for the client when `decision` is no.
+    refusal: ReasonCode
+    #: session, granted QoS, retain as published, subscription identifiers
+    targets: list[tuple[Session, int, bool, list[int] | None]]
+
+
+class Broker:
+    """All sessions, subscriptions and retained messages, and the rules that join them."""
+
+    def __init__(self, access: Access, store: Store, limits: Limits | None = None) -> None:
+        self.access = access
+        self.store = store
+        self.limits = limits or Limits()
+        self.ledger = Ledger(self.limits, store)
+        self.sessions: dict[str, Session] = {}
+        self.retained: TopicTree[Message] = TopicTree()
+        self.retained_bytes = 0
+        self.observer: Observer | None = None
+        #: Network clients with a connection in the state CONNECTED.
+        self.clients: set[Ticking] = set()
+        #: Network clients with bytes to write.
+        self.unflushed: list[Ticking] = []
+        #: Grows whenever a cached route may be wrong.
+        self.epoch = 0
+        self._subscriptions: SubscriptionTree[tuple[Session, Subscription]] = SubscriptionTree()
+        self._deadlines: list[tuple[float, int, Session]] = []
+        self._order = itertools.count()
+
+    @property
+    def counters(self) -> Counters:
+        """What the broker counts."""
+        return self.ledger.counters
+
+    @property
+    def now(self) -> float:
+        """Seconds of the clock that `tick` was last given."""
+        return self.ledger.now
+
+    @property
+    def subscription_count(self) -> int:
+        """Subscriptions of all sessions."""
+        return len(self._subscriptions)
+
+    # --- sessions ------------------------------------------------------------------------------
+
+    def connect(
+        self,
+        link: Link,
+        identity: Identity,
+        *,
+        clean_start: bool,
+        expiry: int,
+        will: PendingWill | None,
+    ) -> tuple[Session, bool]:
+        """Give an authenticated client its session; returns it and whether it was there before.
+
+        Raises:
+            ProtocolError: 0x85, the client id belongs to another user's session, which is not
+                touched; 0x97, no more sessions are kept.
+        """
+        session = self.sessions.get(identity.client_id)
+        if session is not None:
+            owner = session.identity
+            if owner is None or owner.username != identity.username:
+                raise ProtocolError(
+                    ReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
+                    f"client id '{identity.client_id}' belongs to {session}",
+                )
+            if session.link is not None:  # [MQTT-3.1.4-3], v3.1.1 [MQTT-3.1.4-2]
+                session.close_link(ReasonCode.SESSION_TAKEN_OVER, f"taken over by {identity}")
+            if clean_start or not self._is_alive(session):  # [MQTT-3.1.2-4], 3.1.1 [MQTT-3.1.2-6]
+                self._end(session)
+        # The take-over may have ended it, when it was not to outlive its connection.
+        session = self.sessions.get(identity.client_id)
+        present = session is not None
+        if session is None:
+            if len(self.sessions) >= self.limits.sessions:
+                raise ProtocolError(
+                    ReasonCode.QUOTA_EXCEEDED,
+                    f"{len(self.sessions)} sessions are kept, as many as allowed",
+                )
+            session = Session(identity.client_id, identity, self.ledger)
+            self.sessions[identity.client_id] = session
+        session.identity = identity
+        session.link = link
+        session.expiry = expiry
+        session.ends_at = None
+        session.will = will
+        session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
+        if expiry:
+            self.store.session_saved(session)
+        return session, present
+
+    def connected(self, session: Session) -> None:
+        """The CONNACK was sent: observers may know, and what waits may go."""
+        if self.observer is not None:
+            self.observer.connected(session)
+        session.resend()
+
+    def attach(self, client_id: str, link: Link) -> Session:
+        """A session inside the appliance, with all rights and kept until `detach`."""
+        if client_id in self.sessions:
+            raise ValueError(f"there is a session '{client_id}' already")
+        session = Session(client_id, None, self.ledger)
+        session.link = link
+        self.sessions[client_id] = session
+        return session
+
+    def detach(self, session: Session) -> None:
+        """End a session made by `attach`."""
+        session.link = None
+        self._end(session)
+
+    def disconnect(
+        self, session: Session, link: Link, *, publish_will: bool, expiry: int | None = None
+    ) -> None:
+        """The connection behind `link` ended; nothing happens when another has taken over."""
+        if session.link is not link:
+            return
+        session.link = None
+        session.forget_transient()
+        if expiry is not None:
+            session.expiry = min(expiry, self.limits.session_expiry)
+        if self.observer is not None:
+            self.observer.disconnected(session)
+        will = session.will
+        if not publish_will:
+            session.will = will = None
+        if not session.persistent:
+            self._end(session)
+            return
+        session.ends_at = self.now + session.expiry
+        self._schedule(session.ends_at, session)
+        if will is not None:
+            if will.delay:
+                session.will_at = self.now + will.delay
+                self._schedule(session.will_at, session)
+            else:
+                self._publish_will(session)
+
+    def _end(self, session: Session) -> None:
+        """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
+        if self.sessions.get(session.client_id) is session:
+            del self.sessions[session.client_id]
+        self._publish_will(session)
+        for topic_filter in session.subscriptions:
+            self._subscriptions.remove(topic_filter, session)
+        if session.subscriptions:
+            self.epoch += 1
+        session.subscriptions.clear()
+        session.clear()
+        if session.persistent:
+            self.store.session_removed(session)
+
+    def _publish_will(self, session: Session) -> None:
+        will, session.will, session.will_at = session.will, None, None
+        if will is None:
+            return
+        message = will.message
+        if message.properties and Property.MESSAGE_EXPIRY_INTERVAL in message.properties:
+            message.expires_at = self.now + int(
+                message.properties[Property.MESSAGE_EXPIRY_INTERVAL]  # type: ignore[arg-type]
+            )
+        self.publish(message, session)
+
+    def _is_alive(self, session: Session) -> bool:
+        return session.ends_at is None or session.ends_at > self.now
+
+    # --- publishing ----------------------------------------------------------------------------
+
+    def route(self, session: Session, topic_wire: bytes) -> Route:
+        """Where messages of the session to the topic go, looked up once an epoch.
+
+        Raises:
+            ProtocolError: the topic is not valid; the connection has to end.
+        """
+        if session.epoch != self.epoch or len(session.routes) >= CACHED_ROUTES:
+            session.routes.clear()
+            session.epoch = self.epoch
+        route = session.routes.get(topic_wire)
+        if route is None:
+            route = session.routes[topic_wire] = self._find_route(session, topic_wire)
+        return route
+
+    def _find_route(self, session: Session, topic_wire: bytes) -> Route:
+        try:
+            topic = topic_wire[2:].decode()
+        except UnicodeDecodeError as error:  # [MQTT-1.5.4-1], 3.1.1 [MQTT-1.5.3-1]
+            raise ProtocolError(
+                ReasonCode.MALFORMED_PACKET, f"the topic is not UTF-8: {error}"
+            ) from None
+        try:
+            check_topic(topic)
+        except ValueError as error:
+            raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
+        decision, refusal = self._may_publish(session, topic)
+        targets = self._targets(session, topic) if decision else []
+        return Route(topic, decision, refusal, targets)
+
+    def _may_publish(self, session: Session, topic: str) -> tuple[Decision, ReasonCode]:
+        if session.identity is None:
+            return _ALLOWED, ReasonCode.SUCCESS
+        if topic.count("/") >= self.limits.topic_levels:
+            reason = f"more than {self.limits.topic_levels} levels (broker.limits.topic_levels)"
+            return Decision(False, reason), ReasonCode.TOPIC_NAME_INVALID
+        if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
+            reason = "topics that begin with $ are the broker's own"
+            return Decision(False, reason), ReasonCode.NOT_AUTHORIZED
+        decision = self.access.decide(session.identity, Action.PUBLISH, topic)
+        return decision, ReasonCode.NOT_AUTHORIZED
+
+    def _targets(
+        self, origin: Session, topic: str
+    ) -> list[tuple[Session, int, bool, list[int] | None]]:
+        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1]."""
+        merged: dict[str, tuple[Session, int, bool, list[int] | None]] = {}
+        for session, subscription in self._subscriptions.match(topic):
+            if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
+                continue
+            _, qos, as_published, ids = merged.get(session.client_id, (session, 0, False, None))
+            if subscription.identifier:  # [MQTT-3.3.4-4]
+                ids = [*(ids or []), subscription.identifier]
+            merged[session.client_id] = (
+                session,
+                max(qos, subscription.qos),
+                as_published or subscription.retain_as_published,
+                ids,
+            )
+        return [target for target in merged.values() if self.may_receive(target[0], topic)]
+
+    def may_receive(self, session: Session, topic: str) -> bool:
+        """Whether the rules in force let the session receive the topic's messages."""
+        if session.identity is None:
+            return True
+        return self.access.decide(session.identity, Action.RECEIVE, topic).allowed
+
+    def publish(self, message: Message, origin: Session) -> ReasonCode:
+        """Deliver the message to every session that subscribed to its topic.
+
+        Returns 0x00, 0x10 when nobody did, 0x87 or 0x90 when `origin` may not publish it (told in
+        the log), 0x97 when there was no room for it anywhere.
+
+        Raises:
+            ProtocolError: the topic is not valid.
+        """
+        route = (
+            origin.routes.get(message.topic_wire) if origin.epoch == self.epoch else None
+        ) or self.route(origin, message.topic_wire)
+        if not route.decision:
+            self.refuse_publish(origin, route)
+            return route.refusal
+        if self.observer is not None:
+            self.observer.published(origin, message)
+        if message.retain and not self._retain(message):
+            return ReasonCode.QUOTA_EXCEEDED
+        delivered = full = 0
+        published_qos = message.qos
+        for session, qos, as_published, subscription_ids in route.targets:
+            if qos > published_qos:
+                qos = published_qos
+            if session.deliver(message, qos, message.retain and as_published, subscription_ids):
+                delivered = 1
+            elif qos:
+                full = 1
+                self._tell_full(session)
+        if delivered:
+            return ReasonCode.SUCCESS
+        return ReasonCode.QUOTA_EXCEEDED if full else ReasonCode.NO_MATCHING_SUBSCRIBERS
+
+    def refuse_publish(self, session: Session, route: Route) -> None:
+        """Count and log that the session may not publish to the route's topic."""
+        self.counters.publish_refused += 1
+        log.warning("%s may not publish to '%s': %s", session, route.topic, route.decision.reason)
+
+    def _tell_full(self, session: Session) -> None:
+        if session.full_since is None or self.now - session.full_since >= FULL_QUEUE_LOG_INTERVAL:
+            session.full_since = self.now
+            log.warning(
+                "%s: the queue is full (%d messages, %d bytes); newer messages are dropped",
+                session,
+                len(session.queue),
+                session.bytes,
+            )
+
+    def _retain(self, message: Message) -> bool:
+        old = self.retained.get(message.topic)
+        if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
+            if old is not None:
+                self.retained_bytes -= old.size
+                self.retained.delete(message.topic)
+        else:
+            grown = self.retained_bytes + message.size - (old.size if old is not None else 0)
+            limits = self.limits
+            if grown > limits.retained_bytes or (
+                old is None and len(self.retained) >= limits.retained_messages
+            ):
+                self.counters.publish_dropped += 1
+                log.warning(
+                    "no room to retain '%s': %d messages and %d bytes are retained "
+                    "(broker.limits.retained_messages, broker.limits.retained_bytes)",
+                    message.topic,
+                    len(self.retained),
+                    self.retained_bytes,
+                )
+                return False
+            self.retained_bytes = grown
+            self.retained.set(message.topic, message)
+        self.store.retained(message)
+        if self.observer is not None:
+            self.observer.retained(message)
+        return True
+
+    # --- subscribing ---------------------------------------------------------------------------
+
+    def subscribe(self, session: Session, subscription: Subscription) -> ReasonCode:
+        """Subscribe; returns the granted QoS or the refusal, as it stands in SUBACK."""
+        refusal = self._check_subscription(session, subscription)
+        if refusal is not None:
+            code, reason = refusal
+            log.warning("%s may not subscribe to '%s': %s", session, subscription.filter, reason)
+            return code
+        session.subscriptions[subscription.filter] = subscription
+        self._subscriptions.add(subscription.filter, session, (session, subscription))
+        self.epoch += 1
+        if session.persistent:
+            self.store.subscribed(session, subscription)
+        if self.observer is not None:
+            self.observer.subscribed(session, subscription.filter, subscription.qos)
+        return ReasonCode(subscription.qos)
+
+    def _check_subscription(
+        self, session: Session, subscription: Subscription
+    ) -> tuple[ReasonCode, str] | None:
+        topic_filter = subscription.filter
+        try:
+            check_filter(topic_filter)
+            shared = parse_shared(topic_filter)
+        except ValueError as error:
+            return ReasonCode.TOPIC_FILTER_INVALID, str(error)
+        limits = self.limits
+        if shared is not None:
+            reason = "shared subscriptions are not supported by this version"
+            return ReasonCode.SHARED_SUBSCRIPTIONS_NOT_SUPPORTED, reason
+        if topic_filter.count("/") >= limits.topic_levels:
+            reason = f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
+            return ReasonCode.TOPIC_FILTER_INVALID, reason
+        if session.identity is None:
+            return None
+        if (
+            topic_filter not in session.subscriptions
+            and len(session.subscriptions) >= limits.subscriptions
+        ):
+            reason = f"it has {limits.subscriptions} subscriptions (broker.limits.subscriptions)"
+            return ReasonCode.QUOTA_EXCEEDED, reason
+        decision = self.access.decide(session.identity, Action.SUBSCRIBE, topic_filter)
+        if not decision:
+            return ReasonCode.NOT_AUTHORIZED, decision.reason
+        return None
+
+    def send_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
+        """Send the retained messages that a subscription asks for, behind its SUBACK."""
+        handling = subscription.retain_handling
+        if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
+            return
+        ids = [subscription.identifier] if subscription.identifier else None
+        expired = []
+        for topic, message in self.retained.find(subscription.filter):
+            if message.expires_at is not None and message.expires_at <= self.now:
+                expired.append(message)
+            elif self.may_receive(session, topic):
+                session.replay(message, min(message.qos, subscription.qos), ids)
+        for message in expired:
+            self.retained_bytes -= message.size
+            self.retained.delete(message.topic)
+        session.pump()
+
+    def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:
+        """Unsubscribe; returns 0x00, or 0x11 when there was no such subscription."""
+        if session.subscriptions.pop(topic_filter, None) is None:
+            return ReasonCode.NO_SUBSCRIPTION_EXISTED
+        self._subscriptions.remove(topic_filter, session)
+        self.epoch += 1
+        if session.persistent:
+            self.store.unsubscribed(session, topic_filter)
+        if self.observer is not None:
+            self.observer.unsubscribed(session, topic_filter)
+        return ReasonCode.SUCCESS
+
+    # --- time and rules ------------------------------------------------------------------------
+
+    def rules_changed(self) -> None:
+        """The access rules changed: nothing cached holds, and what waits is checked again."""
+        self.epoch += 1
+        for session in self.sessions.values():
+            if session.identity is not None:
+                self._revoke(session)
+
+    def _revoke(self, session: Session) -> None:
+        def allowed(topic: str) -> bool:
+            return self.may_receive(session, topic)
+
+        dropped = session.revoke(allowed)
+        if dropped:
+            log.info("%s: %d waiting messages may no longer be read", session, dropped)
+
+    def _schedule(self, when: float, session: Session) -> None:
+        heapq.heappush(self._deadlines, (when, next(self._order), session))
+
+    def tick(self, now: float) -> None:
+        """Let time pass: keep alive, wills, sessions. `now` is in seconds and never goes back."""
+        self.ledger.now = now
+        for client in tuple(self.clients):
+            client.tick(now)
+        while self._deadlines and self._deadlines[0][0] <= now:
+            _, _, session = heapq.heappop(self._deadlines)
+            # Entries are never removed early: one that no longer holds is passed over here.
+            if session.link is not None or self.sessions.get(session.client_id) is not session:
+                continue
+            if session.will_at is not None and session.will_at <= now:
+                self._publish_will(session)
+            if session.ends_at is not None and session.ends_at <= now:
+                log.info("%s: the session expired", session)
+                self.counters.sessions_expired += 1
+                self._end(session)
+        self.flush()
+
+    def flush(self) -> None:
+        """Write to every network client what it was sent since the last flush.
+
+        With something staged in the store this waits for its commit: acknowledged means kept.
+        """
+        if self.store.staged:
+            self.store.after_commit(self._write_out)
+        else:
+            self._write_out(True)
+
+    def _write_out(self, kept: bool) -> None:
+        clients, self.unflushed = self.unflushed, []
+        for client in clients:
+            if kept:
+                client.flush()
+            else:
+                client.abandon()
+
+    def close(self, close: Callable[[Session], None]) -> None:
+        """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""
+        for session in list(self.sessions.values()):
+            session.will = None
+            if session.link is not None and session.identity is not None:
+                close(session)
+        self.flush()

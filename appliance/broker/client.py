@@ -1,0 +1,536 @@
+"""A network client's conversation: what each of its packets does, and what it is answered.
+
+Pure like the rest of the broker: bytes come in at `receive`, and go out at `flush` to a `Wire`.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from dataclasses import dataclass
+from typing import Protocol
+
+from appliance.broker.broker import Broker, Route
+from appliance.broker.message import Message
+from appliance.broker.ports import Identity
+from appliance.broker.session import PendingWill, Session
+from appliance.mqtt.codec import Properties, Property
+from appliance.mqtt.connection import (
+    PUBACK,
+    PUBREC,
+    PUBREL,
+    Connection,
+    RawPublish,
+    State,
+)
+from appliance.mqtt.packets import (
+    Auth,
+    Connack,
+    Connect,
+    Disconnect,
+    Packet,
+    Pingreq,
+    Pingresp,
+    Puback,
+    Pubcomp,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Suback,
+    Subscribe,
+    Subscription,
+    Unsuback,
+    Unsubscribe,
+)
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+
+log = logging.getLogger(__name__)
+
+#: Session Expiry Interval that means "never" in CONNECT.
+NEVER = 0xFFFF_FFFF
+
+
+class Wire(Protocol):
+    """The connection under a client, as a listener implements it."""
+
+    #: Where the client is, for the log: "127.0.0.1:54321".
+    address: str
+
+    def authenticate(self, connect: Connect) -> None:
+        """Find out who it is, in the background; `Client.accept` or `Client.refuse` ends it."""
+
+    def write(self, chunks: list[bytes]) -> None:
+        """Write the chunks, one behind the other."""
+
+    def close(self) -> None:
+        """Write what was written so far, then close."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectOptions:
+    """What a CONNECT asked for, as far as it outlives the handshake."""
+
+    keep_alive: int
+    expiry: int
+    window: int
+    maximum_packet_size: int
+
+
+class Client:
+    """One network connection; its `Link` to a session once it has logged in."""
+
+    def __init__(self, broker: Broker, wire: Wire) -> None:
+        self.broker = broker
+        self.wire = wire
+        self.connection = Connection(broker.limits.packet_size, broker.limits.topic_alias)
+        self.writable = True
+        self.session: Session | None = None
+        self._connect: Connect | None = None
+        self._out: list[bytes] = []
+        self._silence = 0.0  # seconds; 0 for none
+        self._heard_at = 0.0
+        self._maximum_packet_size = 0
+        self._version = 0
+        self._closed = False
+
+    def __str__(self) -> str:
+        name = str(self.session) if self.session else "client"
+        return f"{name} at {self.wire.address}"
+
+    # --- bytes in ------------------------------------------------------------------------------
+
+    def receive(self, data: bytes) -> None:
+        """Take in what came from the network and do what it says."""
+        self.broker.counters.bytes_received += len(data)
+        now = self.broker.now
+        try:
+            for event in self.connection.receive_data(data):
+                self._heard_at = now  # complete packets count, dripping bytes do not
+                if type(event) is tuple:
+                    self._on_raw_publish(event)
+                elif type(event) is int:
+                    self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
+                else:
+                    self._on_packet(event)  # type: ignore[arg-type]
+        except ProtocolError as error:
+            self.fail(error)
+
+    def _on_raw_publish(self, event: RawPublish) -> None:
+        """The data path: a PUBLISH without properties."""
+        first, topic_wire, packet_id, payload, head = event
+        broker = self.broker
+        session = self.session
+        assert session is not None
+        counters = broker.counters
+        counters.messages_received += 1
+        counters.publish_received += 1
+        counters.publish_bytes_received += len(payload)
+        # The route is asked for its topic, so that it is decoded and checked once, not each time.
+        route = (
+            session.routes.get(topic_wire) if session.epoch == broker.epoch else None
+        ) or broker.route(session, topic_wire)
+        qos = first >> 1 & 3
+        message = Message(route.topic, payload, qos, bool(first & 1), topic_wire=topic_wire)
+        # What came in is what goes out, to a receiver with the same version, QoS and flags: its
+        # bytes are taken over instead of being encoded again.
+        message.wire[self._version << 8 | first & 0xF7] = (
+            head if not first & 8 else bytes((first & 0xF7,)) + head[1:]
+        )
+        if qos == 2:
+            self._on_publish_qos2(session, packet_id, message, route)
+            return
+        code = broker.publish(message, session)
+        if qos:
+            self._acknowledge(0x40, packet_id, code)
+
+    def _on_publish(self, packet: Publish) -> None:
+        """A PUBLISH that the full decoder has read: with properties, most likely."""
+        session = self.session
+        assert session is not None
+        broker = self.broker
+        counters = broker.counters
+        counters.publish_received += 1
+        counters.publish_bytes_received += len(packet.payload)
+        message = Message(
+            packet.topic,
+            packet.payload,
+            packet.qos,
+            packet.retain,
+            packet.properties,
+            self._expires_at(packet.properties),
+        )
+        if packet.qos == 2:
+            assert packet.packet_id is not None
+            route = broker.route(session, message.topic_wire)
+            self._on_publish_qos2(session, packet.packet_id, message, route)
+            return
+        code = broker.publish(message, session)
+        if packet.qos:
+            assert packet.packet_id is not None
+            self._acknowledge(0x40, packet.packet_id, code)
+
+    def _on_publish_qos2(
+        self, session: Session, packet_id: int, message: Message, route: Route
+    ) -> None:
+        """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
+        code = ReasonCode.SUCCESS
+        if packet_id in session.received:
+            pass  # sent again: PUBREC goes out again [MQTT-4.3.3-12]
+        elif not route.decision:
+            self.broker.refuse_publish(session, route)
+            # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
+            code = route.refusal
+        elif self._version == 5 and len(session.received) >= self.broker.limits.inflight:
+            raise ProtocolError(  # [MQTT-3.3.4-9]
+                ReasonCode.RECEIVE_MAXIMUM_EXCEEDED,
+                f"more than {self.broker.limits.inflight} unfinished QoS 2 messages",
+            )
+        elif not session.hold(packet_id, message):
+            code = ReasonCode.QUOTA_EXCEEDED
+            if self._version != 5:
+                raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
+        elif not route.targets:
+            code = ReasonCode.NO_MATCHING_SUBSCRIBERS
+        self._acknowledge(0x50, packet_id, code)
+
+    def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
+        session = self.session
+        assert session is not None
+        self.broker.counters.messages_received += 1
+        if kind == PUBACK:
+            if not session.puback(packet_id):
+                log.debug("%s: PUBACK %d for nothing in flight", self, packet_id)
+        elif kind == PUBREC:
+            known = session.pubrec(packet_id, code)
+            if code < 0x80 or not known:
+                # An unknown id is answered too, or a client that missed our end would wait forever.
+                reason = ReasonCode.SUCCESS if known else ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
+                self._acknowledge(0x62, packet_id, reason)
+        elif kind == PUBREL:
+            message = session.unhold(packet_id)
+            reason = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
+            if message is not None:
+                reason = ReasonCode.SUCCESS
+                self.broker.publish(message, session)
+            self._acknowledge(0x70, packet_id, reason)
+        elif not session.pubcomp(packet_id):
+            log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
+
+    def _on_packet(self, packet: Packet) -> None:
+        if isinstance(packet, Publish):
+            self.broker.counters.messages_received += 1
+            self._on_publish(packet)
+            return
+        if isinstance(packet, Puback | Pubrec | Pubrel | Pubcomp):
+            self._on_acknowledgement(packet.TYPE << 16, packet.packet_id, packet.reason_code)
+            return
+        self.broker.counters.messages_received += 1
+        if isinstance(packet, Pingreq):
+            self._send(Pingresp())  # [MQTT-3.12.4-1]
+        elif isinstance(packet, Subscribe):
+            self._on_subscribe(packet)
+        elif isinstance(packet, Unsubscribe):
+            self._on_unsubscribe(packet)
+        elif isinstance(packet, Disconnect):
+            self._on_disconnect(packet)
+        elif isinstance(packet, Connect):
+            self._on_connect(packet)
+        elif isinstance(packet, Auth):
+            raise ProtocolError(  # [MQTT-4.12.0-1]
+                ReasonCode.BAD_AUTHENTICATION_METHOD, "it named no authentication method in CONNECT"
+            )
+
+    def _on_subscribe(self, packet: Subscribe) -> None:
+        session = self.session
+        assert session is not None
+        identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
+        identifier = identifiers[0] if isinstance(identifiers, list) else 0
+        codes: list[int] = []
+        granted: list[tuple[Subscription, bool]] = []
+        for subscription in packet.subscriptions:
+            if isinstance(identifier, int):
+                subscription.identifier = identifier
+            is_new = subscription.filter not in session.subscriptions
+            code = self.broker.subscribe(session, subscription)
+            codes.append(code)
+            if code <= ReasonCode.GRANTED_QOS_2:
+                granted.append((subscription, is_new))
+        self._send(Suback(packet.packet_id, codes))  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
+        for subscription, is_new in granted:
+            self.broker.send_retained(session, subscription, is_new)
+
+    def _on_unsubscribe(self, packet: Unsubscribe) -> None:
+        session = self.session
+        assert session is not None
+        codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
+        self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
+
+    def _on_disconnect(self, packet: Disconnect) -> None:
+        expiry = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
+        session = self.session
+        assert session is not None
+        if isinstance(expiry, int) and expiry and not session.expiry:  # [MQTT-3.14.2-2]
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, "a session expiry in DISCONNECT, but none in CONNECT"
+            )
+        log.info("%s disconnected", self)
+        self._leave(
+            publish_will=packet.reason_code != ReasonCode.NORMAL_DISCONNECTION,  # [MQTT-3.14.4-3]
+            expiry=expiry if isinstance(expiry, int) else None,
+        )
+
+    # --- CONNECT -------------------------------------------------------------------------------
+
+    def _on_connect(self, packet: Connect) -> None:
+        self._version = packet.version
+        properties = packet.properties or {}
+        if Property.AUTHENTICATION_METHOD in properties:
+            self.refuse(
+                ReasonCode.BAD_AUTHENTICATION_METHOD, "enhanced authentication is not offered"
+            )
+            return
+        if not packet.client_id and not packet.clean_start and packet.version != 5:
+            # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
+            self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
+            return
+        self._connect = packet
+        # What follows a CONNECT is read only once it is known who sent it.
+        self.connection.paused = True
+        self.wire.authenticate(packet)
+
+    def refuse(self, code: ReasonCode, reason: str) -> None:
+        """Answer CONNECT with the code and close; nothing that came behind it has any effect."""
+        if self._closed:
+            return
+        user = self._connect.username if self._connect else None
+        name = self._connect.client_id if self._connect else ""
+        log.warning(
+            "client '%s' (%s) at %s refused: %s",
+            name,
+            f"user '{user}'" if user is not None else "no user name",
+            self.wire.address,
+            reason,
+        )
+        self.broker.counters.connects_refused += 1
+        self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
+        self._shut()
+
+    def accept(self, username: str | None) -> None:
+        """The client is who it says: open its session, send CONNACK, read on."""
+        packet, self._connect = self._connect, None
+        if self._closed or packet is None:
+            return
+        assigned = None if packet.client_id else f"auto-{secrets.token_hex(12)}"
+        identity = Identity(username, assigned or packet.client_id)
+        options = self._options(packet)
+        try:
+            session, present = self.broker.connect(
+                self,
+                identity,
+                clean_start=packet.clean_start,
+                expiry=options.expiry,
+                will=self._will(packet),
+            )
+        except ProtocolError as error:
+            self._connect = packet
+            self.refuse(error.code, str(error))
+            return
+        session.window = options.window
+        self.session = session
+        self._maximum_packet_size = options.maximum_packet_size
+        self._silence = 1.5 * options.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
+        self._heard_at = self.broker.now
+        self.connection.state = State.CONNECTED
+        counters = self.broker.counters
+        counters.connects += 1
+        self.broker.clients.add(self)
+        counters.clients_maximum = max(counters.clients_maximum, len(self.broker.clients))
+        properties = self._connack_properties(packet, assigned, options)
+        self._send(Connack(present, ReasonCode.SUCCESS, properties))
+        log.info(
+            "%s connected: MQTT %s, keep alive %d s%s",
+            self,
+            "5" if packet.version == 5 else "3.1.1",
+            options.keep_alive,
+            ", session continued" if present else "",
+        )
+        self.broker.connected(session)
+        self.connection.paused = False
+        self.receive(b"")  # what came behind CONNECT
+
+    def _options(self, packet: Connect) -> ConnectOptions:
+        properties = packet.properties or {}
+        limits = self.broker.limits
+        expiry = properties.get(Property.SESSION_EXPIRY_INTERVAL, 0)
+        if packet.version != 5:
+            expiry = 0 if packet.clean_start else limits.session_expiry
+        window = properties.get(Property.RECEIVE_MAXIMUM, 65535)
+        size = properties.get(Property.MAXIMUM_PACKET_SIZE, 0)
+        assert isinstance(expiry, int) and isinstance(window, int) and isinstance(size, int)
+        return ConnectOptions(
+            keep_alive=packet.keep_alive,
+            expiry=min(expiry, limits.session_expiry),
+            window=min(window, limits.inflight),
+            maximum_packet_size=size,
+        )
+
+    def _connack_properties(
+        self, packet: Connect, assigned: str | None, options: ConnectOptions
+    ) -> Properties | None:
+        """What the client must know to keep within the limits, in mosquitto's order."""
+        if packet.version != 5:
+            return None
+        limits = self.broker.limits
+        properties: Properties = {}
+        if limits.topic_alias:
+            properties[Property.TOPIC_ALIAS_MAXIMUM] = limits.topic_alias
+        if assigned is not None:  # [MQTT-3.2.2-16]
+            properties[Property.ASSIGNED_CLIENT_IDENTIFIER] = assigned
+        asked = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL, 0)
+        if asked != options.expiry:
+            properties[Property.SESSION_EXPIRY_INTERVAL] = options.expiry
+        properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size
+        properties[Property.RECEIVE_MAXIMUM] = limits.inflight
+        properties[Property.SHARED_SUBSCRIPTION_AVAILABLE] = 0
+        return properties
+
+    def _will(self, packet: Connect) -> PendingWill | None:
+        will = packet.will
+        if will is None:
+            return None
+        properties = dict(will.properties or {})
+        delay = properties.pop(Property.WILL_DELAY_INTERVAL, 0)
+        assert isinstance(delay, int)
+        message = Message(will.topic, will.payload, will.qos, will.retain, properties or None)
+        return PendingWill(message, delay)
+
+    def _expires_at(self, properties: Properties | None) -> float | None:
+        interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
+        return self.broker.now + interval if isinstance(interval, int) else None
+
+    # --- bytes out: the Link of the session ----------------------------------------------------
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """Send a PUBLISH; its head, packet id and payload are joined only at the flush."""
+        first = 0x30 | qos << 1 | retain
+        if dup:
+            first |= 8
+        version = self._version
+        out = self._out
+        if not out:
+            self.broker.unflushed.append(self)
+        counters = self.broker.counters
+        if self._maximum_packet_size and self._too_large(message, subscription_ids):
+            counters.publish_dropped += 1
+            if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
+                self.session.give_up(packet_id)
+            return
+        if version == 5 and (subscription_ids or message.expires_at is not None):
+            out.append(message.encode_for(first, packet_id, subscription_ids, self.broker.now))
+        else:
+            out.append(message.wire.get(version << 8 | first) or message.head(version, first))
+            if qos:
+                out.append(packet_id.to_bytes(2, "big"))
+                out.append(message.payload if version == 4 else message.tail(5))
+        counters.messages_sent += 1
+        counters.publish_sent += 1
+        counters.publish_bytes_sent += len(message.payload)
+
+    def _too_large(self, message: Message, subscription_ids: list[int] | None) -> bool:
+        size = len(message.encode_for(0x32, 1, subscription_ids, self.broker.now))
+        return size > self._maximum_packet_size
+
+    def pubrel(self, packet_id: int) -> None:
+        """Send a PUBREL."""
+        self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
+
+    def _acknowledge(self, first: int, packet_id: int, code: int) -> None:
+        """Send PUBACK, PUBREC, PUBREL or PUBCOMP in its shortest form."""
+        out = self._out
+        if not out:
+            self.broker.unflushed.append(self)
+        if code and self._version == 5:
+            out.append(bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code)))
+        else:
+            out.append(bytes((first, 2, packet_id >> 8, packet_id & 0xFF)))
+        self.broker.counters.messages_sent += 1
+
+    def _send(self, packet: Packet) -> None:
+        if not self._out:
+            self.broker.unflushed.append(self)
+        self._out.append(packet.encode(self._version or 4))
+        self.broker.counters.messages_sent += 1
+
+    def flush(self) -> None:
+        """Write what was sent since the last flush."""
+        out = self._out
+        if out:
+            self._out = []
+            self.wire.write(out)
+
+    def abandon(self) -> None:
+        """Close without sending what waits: what it would acknowledge could not be kept."""
+        self._out.clear()
+        self.lost()
+
+    def resume_writing(self) -> None:
+        """The network takes bytes again: send what waited."""
+        self.writable = True
+        if self.session is not None:
+            self.session.pump()
+
+    # --- the end -------------------------------------------------------------------------------
+
+    def fail(self, error: ProtocolError) -> None:
+        """The client broke the protocol: tell it why, where it can be told, and close."""
+        log.warning("%s broke the protocol: %s (0x%02X)", self, error, error.code)
+        if self.session is None:
+            # Before CONNECT there is nothing to answer; a CONNECT of an unknown version gets the
+            # refusal in the form that every version can read [MQTT-3.1.2-2].
+            if error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION:
+                self._send(Connack(False, error.code))
+            self._shut()
+        else:
+            self.close(error.code, "")
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
+        if message:
+            log.info("%s: connection closed: %s", self, message)
+        if self._version == 5:
+            self._send(Disconnect(reason))
+        self._leave(publish_will=True)
+
+    def lost(self) -> None:
+        """The connection ended without a DISCONNECT."""
+        if not self._closed:
+            if self.session is not None:
+                log.info("%s: connection lost", self)
+            self._leave(publish_will=True)
+
+    def tick(self, now: float) -> None:
+        """Close a client that was silent for one and a half times its keep alive."""
+        if self._silence and now - self._heard_at > self._silence:
+            self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
+
+    def _leave(self, *, publish_will: bool, expiry: int | None = None) -> None:
+        session = self.session
+        self._shut()
+        if session is not None:
+            self.broker.disconnect(session, self, publish_will=publish_will, expiry=expiry)
+
+    def _shut(self) -> None:
+        self._closed = True
+        self.connection.state = State.CLOSED
+        self.writable = False
+        self.broker.clients.discard(self)
+        self.flush()
+        self.wire.close()

@@ -1,0 +1,166 @@
+"""What the broker needs from outside, as Protocols, and the values that cross the border."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Protocol
+
+from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ReasonCode
+
+if TYPE_CHECKING:
+    from appliance.broker.message import Message
+    from appliance.broker.session import Session
+
+
+class Action(Enum):
+    """What a client wants to do with a topic, or, for SUBSCRIBE, with a topic filter."""
+
+    PUBLISH = "publish"
+    SUBSCRIBE = "subscribe"
+    RECEIVE = "receive"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who an authenticated client is; `username` is None for an anonymous one."""
+
+    username: str | None
+    client_id: str
+
+    def __str__(self) -> str:
+        user = "anonymous" if self.username is None else f"user '{self.username}'"
+        return f"client '{self.client_id}' ({user})"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether something is allowed; `reason` names the rule, for the log."""
+
+    allowed: bool
+    reason: str
+
+    def __bool__(self) -> bool:
+        return self.allowed
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a client does not come in: `code` for the client, `reason` only for the log.
+
+    The client is not told whether the user exists, so its code is NOT_AUTHORIZED for a wrong
+    password, an unknown user and none at all, as mosquitto does.
+    """
+
+    code: ReasonCode
+    reason: str
+
+
+class Access(Protocol):
+    """The access rules in force. `epoch` grows by one whenever they change."""
+
+    epoch: int
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        """Decide at once, without I/O; `topic` is a filter when `action` is SUBSCRIBE."""
+
+
+class Link(Protocol):
+    """The way to the client of a session: a network connection, or the bridge."""
+
+    #: False while the other side takes nothing more; `Session.pump` is called when it does again.
+    writable: bool
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """Send a PUBLISH; `packet_id` is 0 for QoS 0."""
+
+    def pubrel(self, packet_id: int) -> None:
+        """Send a PUBREL."""
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """Tell the client why, where the protocol can, and end the connection."""
+
+
+class Store(Protocol):
+    """Keeps sessions and retained messages through a restart.
+
+    Each method stages a change; what depends on it is sent only after `after_commit` called back.
+    """
+
+    #: True while something is staged and not yet committed.
+    staged: bool
+
+    def after_commit(self, callback: Callable[[bool], None]) -> None:
+        """Call back with True when all that is staged now is kept, with False when it failed."""
+
+    def session_saved(self, session: Session) -> None:
+        """The session was made, or its expiry changed."""
+
+    def session_removed(self, session: Session) -> None:
+        """The session and all that belongs to it ended."""
+
+    def subscribed(self, session: Session, subscription: Subscription) -> None:
+        """The session subscribed, or subscribed anew with other options."""
+
+    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+        """The session unsubscribed."""
+
+    def retained(self, message: Message) -> None:
+        """The message is its topic's retained message now; an empty payload deletes it."""
+
+    def queued(self, session: Session, message: Message, qos: int) -> None:
+        """A QoS 1 or 2 message is owed to the session."""
+
+    def settled(self, session: Session, message: Message) -> None:
+        """A message that was owed is acknowledged, expired or dropped."""
+
+
+class Observer(Protocol):
+    """Told of what happens in the broker: amqtt's plugins listen here."""
+
+    def connected(self, session: Session) -> None:
+        """A client was authenticated and its session is there."""
+
+    def disconnected(self, session: Session) -> None:
+        """The client's connection ended."""
+
+    def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
+        """A subscription was granted."""
+
+    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+        """A subscription ended on the client's wish."""
+
+    def published(self, session: Session, message: Message) -> None:
+        """A client's message was accepted and is about to be delivered."""
+
+    def retained(self, message: Message) -> None:
+        """A retained message was kept, or, with an empty payload, deleted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Bounds of everything that a client can make grow; see `broker.limits` in appliance.yaml."""
+
+    packet_size: int = 16 * 1024 * 1024
+    memory: int = 256 * 1024 * 1024
+    queue_messages: int = 1000
+    queue_bytes: int = 16 * 1024 * 1024
+    inflight: int = 20
+    subscriptions: int = 1000
+    topic_levels: int = 128
+    retained_messages: int = 100_000
+    retained_bytes: int = 64 * 1024 * 1024
+    session_expiry: int = 7 * 24 * 3600
+    topic_alias: int = 10
+    keep_alive: int = 65535
+    sessions: int = 10_000

@@ -1,0 +1,366 @@
+"""A client's session: subscriptions, the inflight window, the bounded queue and packet ids."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from appliance.broker.message import Message
+from appliance.broker.ports import Identity, Limits, Link, Store
+from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ReasonCode
+
+if TYPE_CHECKING:
+    from appliance.broker.broker import Route
+
+#: message, QoS, retain flag, subscription identifiers of the subscriptions that matched
+Delivery: TypeAlias = "tuple[Message, int, bool, list[int] | None]"
+
+
+@dataclass(slots=True)
+class Counters:
+    """What the broker counts; `$SYS` and the metrics are made of it. All grow from its start."""
+
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    messages_received: int = 0
+    messages_sent: int = 0
+    publish_received: int = 0
+    publish_sent: int = 0
+    publish_dropped: int = 0
+    publish_refused: int = 0
+    publish_bytes_received: int = 0
+    publish_bytes_sent: int = 0
+    connects: int = 0
+    connects_refused: int = 0
+    sockets: int = 0
+    sessions_expired: int = 0
+    clients_maximum: int = 0
+
+
+@dataclass(slots=True)
+class Ledger:
+    """What all sessions share: the limits, the counters, the clock and the bytes queued in all."""
+
+    limits: Limits
+    store: Store
+    counters: Counters = field(default_factory=Counters)
+    #: Seconds of the clock that `Broker.tick` was last given.
+    now: float = 0.0
+    queued_bytes: int = 0
+
+
+class PendingWill(NamedTuple):
+    """A will and the seconds that it waits after the connection ended."""
+
+    message: Message
+    delay: int
+
+
+class Session:
+    """The state that the standard keeps for a client id (sections 3.1.1 of 3.1.1, 4.1 of 5.0).
+
+    `identity` is None for a session inside the appliance, which may do everything. `expiry` is the
+    time in seconds that the session is kept after its connection ended.
+    """
+
+    __slots__ = (
+        "_last_packet_id",
+        "bytes",
+        "client_id",
+        "ends_at",
+        "epoch",
+        "expiry",
+        "full_since",
+        "identity",
+        "inflight",
+        "latest",
+        "ledger",
+        "link",
+        "queue",
+        "received",
+        "replays",
+        "routes",
+        "subscriptions",
+        "will",
+        "will_at",
+        "window",
+    )
+
+    def __init__(self, client_id: str, identity: Identity | None, ledger: Ledger) -> None:
+        self.client_id = client_id
+        self.identity = identity
+        self.ledger = ledger
+        self.link: Link | None = None
+        self.expiry = 0
+        self.ends_at: float | None = None
+        self.will: PendingWill | None = None
+        self.will_at: float | None = None
+        self.subscriptions: dict[str, Subscription] = {}
+        #: Sent and not acknowledged, in the order sent; None after PUBREC [MQTT-4.3.3-8].
+        self.inflight: dict[int, Delivery | None] = {}
+        self.window = ledger.limits.inflight
+        #: QoS 1 and 2, waiting for the window or the client.
+        self.queue: deque[Delivery] = deque()
+        #: Retained messages of new subscriptions, waiting likewise; they go before anything newer.
+        self.replays: deque[Delivery] = deque()
+        #: QoS 0, waiting for a slow client: the newest of each topic.
+        self.latest: dict[str, Delivery] = {}
+        #: QoS 2 from the client, waiting for PUBREL.
+        self.received: dict[int, Message] = {}
+        self.bytes = 0
+        #: The clock when the queue filled, for one line in the log each time; None while it is not.
+        self.full_since: float | None = None
+        #: Where this session's messages go, by topic; valid while `epoch` is the broker's.
+        self.routes: dict[bytes, Route] = {}
+        self.epoch = -1
+        self._last_packet_id = 0
+
+    def __str__(self) -> str:
+        return str(self.identity) if self.identity else f"'{self.client_id}'"
+
+    @property
+    def persistent(self) -> bool:
+        """Whether the session outlives its connection."""
+        return self.expiry > 0
+
+    # --- towards the client -------------------------------------------------------------------
+
+    def deliver(
+        self, message: Message, qos: int, retain: bool, subscription_ids: list[int] | None
+    ) -> bool:
+        """Send the message, or keep it for later; False when it was dropped, and counted."""
+        link = self.link
+        if qos:
+            if (
+                link is not None
+                and link.writable
+                and not self.queue
+                and not self.replays
+                and len(self.inflight) < self.window
+            ):
+                if self._has_room(message):
+                    self._send(link, (message, qos, retain, subscription_ids))
+                    return True
+            elif len(self.queue) < self.ledger.limits.queue_messages and self._has_room(message):
+                self._count(message)
+                self.queue.append((message, qos, retain, subscription_ids))
+                if self.persistent:
+                    self.ledger.store.queued(self, message, qos)
+                return True
+            self.ledger.counters.publish_dropped += 1
+            return False
+        if link is None:
+            return False  # QoS 0 is not kept for an absent client, as the standard allows
+        if link.writable and not self.replays:
+            link.publish(message, 0, 0, False, retain, subscription_ids)
+            return True
+        return self._keep_latest((message, 0, retain, subscription_ids))
+
+    def replay(self, message: Message, qos: int, subscription_ids: list[int] | None) -> None:
+        """Send a retained message, behind those before it; the reference is all that it costs."""
+        self.replays.append((message, qos, True, subscription_ids))
+
+    def pump(self) -> None:
+        """Send what waits, as far as the window and the client allow."""
+        link = self.link
+        if link is None:
+            return
+        self._pump_queues(link)
+        self._pump_latest(link)
+
+    def _pump_queues(self, link: Link) -> None:
+        now = self.ledger.now
+        for waiting in (self.replays, self.queue):
+            while waiting and link.writable:
+                delivery = waiting[0]
+                message, qos, retain, subscription_ids = delivery
+                if qos and len(self.inflight) >= self.window:
+                    return
+                waiting.popleft()
+                if waiting is self.queue:
+                    self._uncount(message)
+                if message.expires_at is not None and message.expires_at <= now:
+                    self._settled(message, qos)
+                    self.ledger.counters.publish_dropped += 1
+                elif qos:
+                    self._send(link, delivery)
+                else:
+                    link.publish(message, 0, 0, False, retain, subscription_ids)
+
+    def resend(self) -> None:
+        """Send again what was in flight when the last connection ended [MQTT-4.4.0-1]."""
+        link = self.link
+        assert link is not None
+        for packet_id, delivery in list(self.inflight.items()):
+            if delivery is None:
+                link.pubrel(packet_id)
+            else:
+                message, qos, retain, subscription_ids = delivery
+                link.publish(message, qos, packet_id, True, retain, subscription_ids)
+        self.pump()
+
+    def _send(self, link: Link, delivery: Delivery) -> None:
+        message, qos, retain, subscription_ids = delivery
+        packet_id = self._last_packet_id % 65535 + 1
+        while packet_id in self.inflight:  # [MQTT-2.2.1-3]
+            packet_id = packet_id % 65535 + 1
+        self._last_packet_id = packet_id
+        self.inflight[packet_id] = delivery
+        self.bytes += message.size
+        self.ledger.queued_bytes += message.size
+        if self.expiry:
+            self.ledger.store.queued(self, message, qos)
+        link.publish(message, qos, packet_id, False, retain, subscription_ids)
+
+    def _pump_latest(self, link: Link) -> None:
+        while self.latest and link.writable and not self.replays:
+            topic = next(iter(self.latest))
+            message, _, retain, subscription_ids = self.latest.pop(topic)
+            self._uncount(message)
+            link.publish(message, 0, 0, False, retain, subscription_ids)
+
+    def _keep_latest(self, delivery: Delivery) -> bool:
+        message = delivery[0]
+        replaced = self.latest.pop(message.topic, None)
+        if replaced is not None:
+            self._uncount(replaced[0])
+            self.ledger.counters.publish_dropped += 1
+        if len(self.latest) < self.ledger.limits.queue_messages and self._has_room(message):
+            self._count(message)
+            self.latest[message.topic] = delivery
+            return True
+        self.ledger.counters.publish_dropped += 1
+        return False
+
+    def _has_room(self, message: Message) -> bool:
+        ledger = self.ledger
+        return (
+            self.bytes + message.size <= ledger.limits.queue_bytes
+            and ledger.queued_bytes + message.size <= ledger.limits.memory
+        )
+
+    def _count(self, message: Message) -> None:
+        self.bytes += message.size
+        self.ledger.queued_bytes += message.size
+
+    def _uncount(self, message: Message) -> None:
+        self.bytes -= message.size
+        self.ledger.queued_bytes -= message.size
+
+    def _settled(self, message: Message, qos: int) -> None:
+        if qos and self.expiry:
+            self.ledger.store.settled(self, message)
+
+    # --- acknowledgements of the client --------------------------------------------------------
+
+    def puback(self, packet_id: int) -> bool:
+        """The client has a QoS 1 message; False when none of that id is in flight."""
+        delivery = self.inflight.get(packet_id)
+        if delivery is None or delivery[1] != 1:
+            return False
+        del self.inflight[packet_id]
+        self._release(delivery[0])
+        return True
+
+    def pubrec(self, packet_id: int, code: int) -> bool:
+        """The client has a QoS 2 message, or refused it; False when none of that id is there."""
+        if packet_id not in self.inflight:
+            return False
+        delivery = self.inflight[packet_id]
+        if delivery is None:
+            return True  # PUBREC again: PUBREL goes out again
+        if delivery[1] != 2:
+            return False
+        if code >= 0x80:
+            del self.inflight[packet_id]
+            self._release(delivery[0])
+        else:
+            self.inflight[packet_id] = None
+            self._uncount(delivery[0])
+        return True
+
+    def pubcomp(self, packet_id: int) -> bool:
+        """The QoS 2 exchange is over; False when none of that id waited for it."""
+        if packet_id not in self.inflight or self.inflight[packet_id] is not None:
+            return False
+        del self.inflight[packet_id]
+        if self.queue or self.replays:
+            self.pump()
+        return True
+
+    def _release(self, message: Message) -> None:
+        size = message.size
+        self.bytes -= size
+        self.ledger.queued_bytes -= size
+        if self.expiry:
+            self.ledger.store.settled(self, message)
+        if self.queue or self.replays:
+            self.pump()
+
+    def give_up(self, packet_id: int) -> None:
+        """Take a message out of flight that the client cannot be sent [MQTT-3.1.2-25]."""
+        delivery = self.inflight.pop(packet_id, None)
+        if delivery is not None:
+            self._uncount(delivery[0])
+            self._settled(delivery[0], delivery[1])
+
+    # --- QoS 2 from the client -----------------------------------------------------------------
+
+    def hold(self, packet_id: int, message: Message) -> bool:
+        """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
+        if not self._has_room(message):
+            return False
+        self.received[packet_id] = message
+        self._count(message)
+        return True
+
+    def unhold(self, packet_id: int) -> Message | None:
+        """The message that PUBREL releases, once."""
+        message = self.received.pop(packet_id, None)
+        if message is not None:
+            self._uncount(message)
+        return message
+
+    # --- the session's end, and a change of rules ---------------------------------------------
+
+    def revoke(self, allowed: Callable[[str], bool]) -> int:
+        """Drop what waits and may no longer be received; returns how many messages."""
+        dropped = 0
+        for waiting in (self.queue, self.replays):
+            kept = [delivery for delivery in waiting if allowed(delivery[0].topic)]
+            if len(kept) < len(waiting):
+                dropped += len(waiting) - len(kept)
+                if waiting is self.queue:
+                    for message, qos, _, _ in waiting:
+                        if not allowed(message.topic):
+                            self._uncount(message)
+                            self._settled(message, qos)
+                waiting.clear()
+                waiting.extend(kept)
+        for topic in [topic for topic in self.latest if not allowed(topic)]:
+            self._uncount(self.latest.pop(topic)[0])
+            dropped += 1
+        self.ledger.counters.publish_dropped += dropped
+        return dropped
+
+    def forget_transient(self) -> None:
+        """Drop what does not outlive the connection: QoS 0, and retained messages not yet sent."""
+        for delivery in self.latest.values():
+            self._uncount(delivery[0])
+        self.latest.clear()
+        self.replays = deque(delivery for delivery in self.replays if delivery[1])
+
+    def clear(self) -> None:
+        """Give back what all queues of this session hold."""
+        self.ledger.queued_bytes -= self.bytes
+        self.bytes = 0
+        for waiting in (self.queue, self.replays, self.latest, self.inflight, self.received):
+            waiting.clear()
+
+    def close_link(self, reason: ReasonCode, message: str) -> None:
+        """End the session's connection, if it has one."""
+        if self.link is not None:
+            self.link.close(reason, message)

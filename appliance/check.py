@@ -1,0 +1,145 @@
+"""`appliance check`: reads everything that `run` would use, says what it finds, changes nothing."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+
+from appliance import certs
+from appliance.access import AccessFileError, Acl, Passwords
+from appliance.config import Settings
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was looked at and what is to be said about it; an error keeps `run` from working."""
+
+    level: Literal["ok", "warning", "error"]
+    subject: str
+    text: str
+
+
+def check(settings: Settings) -> Iterator[Finding]:
+    """Everything there is to say about what these settings name, the good news included."""
+    yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
+    parts = [_listeners, _access, _plugins, _bridge]
+    if any(listener.tls for listener in settings.broker.listeners):
+        parts.insert(2, _certificates)
+    for part in parts:
+        with _warnings() as logged:
+            yield from part(settings)
+        yield from logged
+
+
+@contextmanager
+def _warnings() -> Iterator[list[Finding]]:
+    """The warnings that are logged meanwhile, as `run` would log them, as findings."""
+    findings: list[Finding] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: findings.append(  # type: ignore[method-assign]
+        Finding("warning", record.name.removeprefix("appliance."), record.getMessage())
+    )
+    logger = logging.getLogger("appliance")
+    propagate, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)
+    try:
+        yield findings
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagate
+
+
+def _listeners(settings: Settings) -> Iterator[Finding]:
+    for listener in settings.broker.listeners:
+        subject = f"listener {listener.bind}"
+        if listener.tls:
+            yield Finding("ok", subject, "TLS")
+        elif listener.bind.loopback:
+            yield Finding("ok", subject, "without TLS, reached from this computer only")
+        else:
+            text = "without TLS: everyone on the network can read passwords and messages"
+            yield Finding("warning", subject, text)
+    if settings.broker.anonymous:
+        text = "clients without a user name come in, and may do what the ACL gives to everyone"
+        yield Finding("warning", "broker.anonymous", text)
+
+
+def _access(settings: Settings) -> Iterator[Finding]:
+    broker = settings.broker
+    users = rules = None
+    try:
+        users = Passwords.load(broker.users).users()
+    except AccessFileError as error:
+        yield from (Finding("error", "users", str(problem)) for problem in error.problems)
+    try:
+        rules = Acl.load(broker.acl, settings.robot).rules
+    except AccessFileError as error:
+        yield from (Finding("error", "acl", str(problem)) for problem in error.problems)
+    if users:
+        yield Finding("ok", str(broker.users), f"users: {', '.join(users)}")
+    elif users is not None:
+        text = "no users; add one with: appliance user add NAME"
+        yield Finding("warning", str(broker.users), text)
+    if rules is not None:
+        yield Finding("ok", str(broker.acl), f"rules: {len(rules)}")
+    if rules is not None and users is not None and not broker.plugins:  # which may know others
+        for name in sorted({rule.user for rule in rules if rule.user} - set(users)):
+            yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
+
+
+def _certificates(settings: Settings) -> Iterator[Finding]:
+    tls = settings.broker.tls
+    try:
+        # What the listener will do.
+        certs.server_context(tls.certificate, tls.key, tls.ca, tls.client_certificates)
+    except certs.CertificateError as error:
+        yield Finding("error", "tls", str(error))
+        return
+    certificate = x509.load_pem_x509_certificates(tls.certificate.read_bytes())[0]
+    text = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d}, for {_names(certificate)}"
+    yield Finding("ok", str(tls.certificate), text)
+    try:
+        authority = x509.load_pem_x509_certificates(tls.ca.read_bytes())[0]
+        certificate.verify_directly_issued_by(authority)
+    except (OSError, ValueError, TypeError, InvalidSignature):
+        text = f"did not sign {tls.certificate}: clients need the CA that did"
+        yield Finding("warning", str(tls.ca), text)
+
+
+def _names(certificate: x509.Certificate) -> str:
+    try:
+        extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    except x509.ExtensionNotFound:
+        return "no name"
+    return ", ".join(str(name.value) for name in extension.value)
+
+
+def _plugins(settings: Settings) -> Iterator[Finding]:
+    for name in settings.broker.plugins:
+        module = name.rpartition(".")[0]
+        try:
+            found = importlib.util.find_spec(module) is not None
+        except ImportError:
+            found = False
+        if found:
+            yield Finding("ok", f"plugin {name}", "found")
+        else:
+            yield Finding("error", f"plugin {name}", f"there is no Python module {module}")
+
+
+def _bridge(settings: Settings) -> Iterator[Finding]:
+    bridge = settings.bridge
+    if bridge.bus == "none":
+        yield Finding("ok", "bridge", "off: a broker alone")
+    elif importlib.util.find_spec("rclpy") is None:
+        text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
+        yield Finding("warning", "bridge", text)
+    else:
+        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics)}")

@@ -1,0 +1,520 @@
+"""The command `appliance`.
+
+Imports are inside the commands, so that `--help` and `pub` do not wait for what they do not use.
+Exit codes: 0 done, 1 refused or failed (the reason is on standard error), 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from appliance.access import Passwords
+    from appliance.client import Target
+    from appliance.config import Settings
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="The robot's MQTT broker, with the bridge to ROS inside it.",
+)
+user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
+acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
+app.add_typer(user_app, name="user")
+app.add_typer(acl_app, name="acl")
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        "-c",
+        metavar="FILE",
+        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
+    ),
+]
+PasswordFileOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
+]
+GenerateOption = Annotated[
+    bool, typer.Option("--generate", help="Make a random password, and show it once.")
+]
+
+
+class CommandError(Exception):
+    """Told to the user as it is; the command ends with exit code 1."""
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Runs the command and exits with its code; what a user can mend is told in plain words."""
+    try:
+        app(args=arguments, prog_name="appliance")
+    except CommandError as error:
+        typer.secho(f"appliance: {error}", fg="red", err=True)
+    except BrokenPipeError:  # `appliance sub … | head`: the reader has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except OSError as error:
+        what = error.strerror or str(error)
+        what = f"{error.filename}: {what}" if error.filename else what
+        typer.secho(f"appliance: {what}", fg="red", err=True)
+    sys.exit(1)
+
+
+def _load(config: Path | None) -> Settings:
+    from appliance.config import ConfigError, load
+
+    try:
+        return load(config)
+    except ConfigError as error:
+        raise CommandError(f"the configuration cannot be used\n{error}") from None
+
+
+# Setting up, running, checking
+
+
+@app.command()
+def init(
+    directory: Annotated[
+        Path, typer.Option("--dir", metavar="DIR", help="Where everything goes.")
+    ] = Path(),
+    robot: Annotated[
+        str | None, typer.Option(help="The robot's name; else this computer's.")
+    ] = None,
+    user: Annotated[str, typer.Option(help="The first user's name.")] = "operator",
+    demo: Annotated[
+        bool,
+        typer.Option("--demo", help="With routes for the demo robot, and the password in a file."),
+    ] = False,
+) -> None:
+    """Make certificates, a first user, access rules and appliance.yaml; keep what is there."""
+    from appliance.access import AccessFileError
+    from appliance.certs import CertificateError
+    from appliance.config import ConfigError
+    from appliance.init import Credentials, InitError, Step, initialise
+
+    try:
+        for step in initialise(directory, robot=robot, user=user, demo=demo):
+            if isinstance(step, Step):
+                typer.echo(f"{'made' if step.made else 'kept'}  {_shown(step.path)}: {step.text}")
+            elif isinstance(step, Credentials):
+                typer.secho(
+                    f"\nuser {step.user}, password {step.password}\n"
+                    "This is the only time that it is shown.\n",
+                    bold=True,
+                )
+    except (AccessFileError, CertificateError, ConfigError, InitError) as error:
+        raise CommandError(str(error)) from None
+
+
+@app.command()
+def run(
+    config: ConfigOption = None,
+    log_format: Annotated[
+        Literal["human", "json"] | None, typer.Option(help="In place of log.format.")
+    ] = None,
+    log_level: Annotated[
+        Literal["debug", "info", "warning", "error"] | None,
+        typer.Option(help="In place of log.level."),
+    ] = None,
+) -> None:
+    """Run the appliance until SIGINT or SIGTERM."""
+    settings = _load(config)
+    from appliance import app, logs
+
+    log = settings.log
+    logs.setup(log_level or log.level, log.levels, log_format or log.format)
+    with _start_errors():
+        raise typer.Exit(app.run(settings))
+
+
+@contextmanager
+def _start_errors() -> Iterator[None]:
+    """What keeps the appliance from starting and a user can mend, as a CommandError."""
+    from appliance.access import AccessFileError
+    from appliance.certs import CertificateError
+
+    try:
+        yield
+    except (AccessFileError, CertificateError) as error:
+        raise CommandError(str(error)) from None
+
+
+@app.command()
+def check(
+    config: ConfigOption = None,
+    show: Annotated[
+        bool, typer.Option("--show", help="Also print every setting in force, secrets masked.")
+    ] = False,
+) -> None:
+    """Read everything that `run` would use, say what is found, and change nothing."""
+    settings = _load(config)
+    from appliance.check import check as find
+    from appliance.config import describe
+
+    colours = {"ok": "green", "warning": "yellow", "error": "red"}
+    failed = False
+    for finding in find(settings):
+        typer.secho(f"{finding.level:<8}", fg=colours[finding.level], nl=False)
+        typer.echo(f"{finding.subject}: {finding.text}")
+        failed |= finding.level == "error"
+    if show:
+        import yaml
+
+        typer.echo("\n" + yaml.safe_dump(describe(settings), sort_keys=False), nl=False)
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def demo(config: ConfigOption = None) -> None:
+    """Run the appliance beside a demo robot, and print what to type to see and drive it."""
+    settings = _load(config)
+    from appliance import logs, tour
+
+    logs.setup(settings.log.level, settings.log.levels, settings.log.format)
+    try:
+        with _start_errors():
+            raise typer.Exit(tour.run(settings))
+    except tour.TourError as error:
+        raise CommandError(str(error)) from None
+
+
+@app.command()
+def bench(
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    cell: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this cell; may be repeated.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="How long each cell is measured.")] = 3.0,
+    peer: Annotated[
+        str | None, typer.Option(metavar="PATH", help="The mosquitto to compare with.")
+    ] = None,
+) -> None:
+    """Measure this broker, and mosquitto beside it where it is installed."""
+    from appliance import bench
+
+    raise typer.Exit(bench.main(cell or None, seconds, peer, as_json))
+
+
+# Users
+
+
+@user_app.command("add")
+def user_add(
+    name: str,
+    config: ConfigOption = None,
+    password_file: PasswordFileOption = None,
+    generate: GenerateOption = False,
+) -> None:
+    """Add a user; the password is asked for unless an option says where it comes from."""
+    with _users(config, new=True) as users:
+        if name in users.users():
+            raise CommandError(
+                f"there is a user {name!r} already; `appliance user passwd` changes it"
+            )
+        _set_password(users, name, password_file, generate)
+    typer.echo(f"user {name} added to {_shown(users.path)}")
+
+
+@user_app.command("passwd")
+def user_passwd(
+    name: str,
+    config: ConfigOption = None,
+    password_file: PasswordFileOption = None,
+    generate: GenerateOption = False,
+) -> None:
+    """Change a user's password."""
+    with _users(config) as users:
+        if name not in users.users():
+            raise CommandError(_no_user(name, users))
+        _set_password(users, name, password_file, generate)
+    typer.echo(f"password of user {name} changed")
+
+
+@user_app.command("remove")
+def user_remove(name: str, config: ConfigOption = None) -> None:
+    """Remove a user."""
+    with _users(config) as users:
+        try:
+            users.remove(name)
+        except KeyError:
+            raise CommandError(_no_user(name, users)) from None
+        users.save()
+    typer.echo(f"user {name} removed")
+
+
+@user_app.command("list")
+def user_list(config: ConfigOption = None) -> None:
+    """Print the users' names, one a line."""
+    with _users(config) as users:
+        for name in users.users():
+            typer.echo(name)
+
+
+@contextmanager
+def _users(config: Path | None, *, new: bool = False) -> Iterator[Passwords]:
+    """The users file; what is wrong with it, or with writing it, is a CommandError."""
+    settings = _load(config)
+    from appliance.access import AccessFileError, Passwords
+
+    path = settings.broker.users
+    try:
+        users = Passwords(path) if new and not path.exists() else Passwords.load(path)
+        yield users
+    except AccessFileError as error:
+        raise CommandError(str(error)) from None
+
+
+def _no_user(name: str, users: Passwords) -> str:
+    return f"there is no user {name!r} in {_shown(users.path)}"
+
+
+def _set_password(users: Passwords, name: str, file: str | None, generate: bool) -> None:
+    if generate and file:
+        raise typer.BadParameter("--generate and --password-file exclude each other")
+    if generate:
+        from appliance.init import generate_password
+
+        password = generate_password()
+    elif file:
+        password = _read_password(file)
+    elif sys.stdin.isatty():
+        password = typer.prompt(f"Password of {name}", hide_input=True, confirmation_prompt=True)
+    else:
+        raise CommandError("no terminal to ask on; use --generate or --password-file")
+    try:
+        users.set(name, password)
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+    users.save()
+    if generate:
+        typer.echo(f"password {password}")
+
+
+def _read_password(file: str) -> str:
+    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
+    return text.split("\n", 1)[0].rstrip("\r")
+
+
+# Access
+
+
+@acl_app.command("explain")
+def acl_explain(
+    user: Annotated[str, typer.Argument(help="The user's name; '' for a client without one.")],
+    topic: Annotated[str, typer.Argument(help="A topic, or a filter with + and #.")],
+    client_id: Annotated[
+        str, typer.Option(help="For rules with %c; else one that no rule speaks of.")
+    ] = "",
+    config: ConfigOption = None,
+) -> None:
+    """Say what a user may do with a topic, and which rule of which file decides it."""
+    settings = _load(config)
+    from appliance.access import AccessFileError, Acl
+    from appliance.broker.ports import Identity
+
+    try:
+        acl = Acl.load(settings.broker.acl, settings.robot)
+        explanation = acl.explain(Identity(user or None, client_id), topic)
+    except AccessFileError as error:
+        raise CommandError(str(error)) from None
+    except ValueError as error:
+        raise typer.BadParameter(f"{topic!r}: {error}") from None
+    typer.echo(str(explanation))
+
+
+# Client
+
+HostOption = Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")]
+PortOption = Annotated[
+    int | None, typer.Option("--port", "-p", help="Else the TLS listener's of the configuration.")
+]
+CaOption = Annotated[
+    Path | None,
+    typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
+]
+UserOption = Annotated[
+    str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
+]
+ClientPasswordOption = Annotated[
+    str | None,
+    typer.Option(
+        "--password-file",
+        metavar="FILE",
+        help="Its first line is the password; else APPLIANCE_PASSWORD; else it is asked for.",
+    ),
+]
+VersionOption = Annotated[
+    Literal["5", "311"], typer.Option("--mqtt-version", "-V", help="MQTT 5 or 3.1.1.")
+]
+InsecureOption = Annotated[
+    bool,
+    typer.Option("--insecure", help="Do not check who the broker is. Never with a real password."),
+]
+ClientIdOption = Annotated[
+    str, typer.Option("--id", "-i", help="The client id; else a random one.")
+]
+
+
+@app.command()
+def pub(
+    topic: str,
+    message: Annotated[
+        str | None, typer.Option("--message", "-m", help="The payload; else standard input.")
+    ] = None,
+    file: Annotated[
+        Path | None, typer.Option("--file", "-f", metavar="FILE", help="The payload's file.")
+    ] = None,
+    lines: Annotated[
+        bool, typer.Option("--lines", "-l", help="Each line of standard input is a message.")
+    ] = False,
+    qos: Annotated[
+        int, typer.Option("--qos", "-q", min=0, max=2, help="From 1 on, a refusal is told.")
+    ] = 1,
+    retain: Annotated[bool, typer.Option("--retain", "-r", help="Keep it on the broker.")] = False,
+    host: HostOption = "localhost",
+    port: PortOption = None,
+    ca: CaOption = None,
+    user: UserOption = None,
+    password_file: ClientPasswordOption = None,
+    client_id: ClientIdOption = "",
+    mqtt_version: VersionOption = "5",
+    insecure: InsecureOption = False,
+    config: ConfigOption = None,
+) -> None:
+    """Publish a message."""
+    if (message is not None) + (file is not None) + lines > 1:
+        raise typer.BadParameter("--message, --file and --lines exclude each other")
+    payloads: Iterable[bytes]
+    if lines:
+        payloads = (line.rstrip(b"\r\n") for line in sys.stdin.buffer)
+    elif file is not None:
+        payloads = [file.read_bytes()]
+    else:
+        payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
+    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    from appliance import client
+
+    try:
+        client.publish(target, topic, payloads, qos, retain)
+    except client.ClientError as error:
+        raise CommandError(str(error)) from None
+
+
+@app.command()
+def sub(
+    filters: Annotated[list[str], typer.Argument(metavar="FILTER...")],
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="The topic before each payload.")
+    ] = False,
+    count: Annotated[
+        int | None, typer.Option("--count", "-C", min=1, help="End after so many messages.")
+    ] = None,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", "-W", min=0, help="End after so many seconds (1 if too few)."),
+    ] = None,
+    qos: Annotated[int, typer.Option("--qos", "-q", min=0, max=2)] = 0,
+    host: HostOption = "localhost",
+    port: PortOption = None,
+    ca: CaOption = None,
+    user: UserOption = None,
+    password_file: ClientPasswordOption = None,
+    client_id: ClientIdOption = "",
+    mqtt_version: VersionOption = "5",
+    insecure: InsecureOption = False,
+    config: ConfigOption = None,
+) -> None:
+    """Subscribe, and print what comes, a message a line."""
+    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    from appliance import client
+
+    try:
+        received = client.subscribe(
+            target,
+            filters,
+            qos,
+            sys.stdout.buffer,
+            verbose=verbose,
+            count=count,
+            timeout=timeout,
+        )
+    except client.ClientError as error:
+        raise CommandError(str(error)) from None
+    if count is not None and received < count:
+        raise CommandError(f"{received} of {count} messages came within {timeout:g} s")
+
+
+def _target(
+    config: Path | None,
+    host: str,
+    port: int | None,
+    ca: Path | None,
+    user: str | None,
+    password_file: str | None,
+    client_id: str,
+    version: Literal["5", "311"],
+    insecure: bool,
+) -> Target:
+    """Where to connect and as whom; what no option says is taken from the configuration, if any."""
+    from paho.mqtt.enums import MQTTProtocolVersion
+
+    from appliance.client import Target
+    from appliance.config import SEARCH_PATH
+
+    # Without a configuration it is a client on some other computer: the options say everything.
+    if config or (port is None and ca is None and any(path.is_file() for path in SEARCH_PATH)):
+        broker = _load(config).broker
+        ports = [listener.bind.port for listener in broker.listeners if listener.tls]
+        port = port or (ports[0] if ports else None)
+        ca = ca or broker.tls.ca
+    if user is None:
+        password = None
+    elif password_file:
+        password = _read_password(password_file)
+    elif "APPLIANCE_PASSWORD" in os.environ:
+        password = os.environ["APPLIANCE_PASSWORD"]
+    elif sys.stdin.isatty():
+        password = typer.prompt(f"Password of {user}", hide_input=True)
+    else:
+        raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
+    protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
+    return Target(host, port or 8883, ca, user, password, client_id, protocol, insecure)
+
+
+def _shown(path: Path) -> str:
+    """The path as a user of this folder would type it."""
+    try:
+        return str(path.absolute().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            typer.echo(f"appliance {version('ros-mqtt-appliance')}")
+        except PackageNotFoundError:
+            typer.echo("appliance, run from its source without being installed")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of `appliance` itself."""

@@ -1,0 +1,209 @@
+"""`appliance pub` and `appliance sub`: the command line's own MQTT client, on paho-mqtt and TLS."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from appliance.logs import VISIBLE
+
+ANSWER_TIMEOUT = 10.0  # seconds to wait for the broker's answer to a packet that needs one
+NOT_LINE_ENDS = {code: text for code, text in VISIBLE.items() if code not in (0x09, 0x0A)}
+
+
+class ClientError(Exception):
+    """The broker could not be reached, or refused; the message says what and why."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Which broker to talk to, how its certificate is checked, and as whom."""
+
+    host: str
+    port: int
+    ca: Path | None
+    username: str | None
+    password: str | None
+    client_id: str = ""
+    version: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv5
+    insecure: bool = False
+
+    @property
+    def address(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def publish(target: Target, topic: str, payloads: Iterable[bytes], qos: int, retain: bool) -> None:
+    """Publishes each payload and waits for its acknowledgement. Raises ClientError."""
+    connection = Connection(target)
+    try:
+        for payload in payloads:
+            connection.publish(topic, payload, qos, retain)
+    finally:
+        connection.close()
+
+
+def subscribe(
+    target: Target,
+    filters: list[str],
+    qos: int,
+    output: BinaryIO,
+    *,
+    verbose: bool = False,
+    count: int | None = None,
+    timeout: float | None = None,
+) -> int:
+    """Writes messages to `output`, one a line, and returns how many there were.
+
+    Ends after `count` messages or `timeout` seconds, whichever is first; without either it goes on
+    until interrupted. Raises ClientError, also when the broker ends the connection.
+    """
+    received = 0
+    safe = output.isatty()
+
+    def show(message: paho.MQTTMessage) -> None:
+        nonlocal received
+        if count is not None and received >= count:
+            return
+        received += 1
+        line = message.topic.encode() + b" " + message.payload if verbose else message.payload
+        if safe:  # a payload must not send commands to the terminal
+            line = line.decode(errors="backslashreplace").translate(NOT_LINE_ENDS).encode()
+        output.write(line + b"\n")
+        output.flush()
+
+    connection = Connection(target, show)
+    try:
+        connection.subscribe(filters, qos)
+        deadline = None if timeout is None else time.monotonic() + timeout
+        connection.run(lambda: count is not None and received >= count, deadline)
+    finally:
+        connection.close()
+    return received
+
+
+class Connection:
+    """One connection, driven by the caller's thread; every failure is a ClientError."""
+
+    def __init__(
+        self, target: Target, on_message: Callable[[paho.MQTTMessage], None] = lambda message: None
+    ) -> None:
+        self._target = target
+        self._answer: ReasonCode | None = None
+        self._granted: list[ReasonCode] | None = None
+        self._published: dict[int, ReasonCode] = {}
+        self._ended: ReasonCode | None = None
+        self._client = client = paho.Client(
+            CallbackAPIVersion.VERSION2, target.client_id, protocol=target.version
+        )
+        client.username_pw_set(target.username, target.password)
+        client.on_connect = lambda c, u, flags, reason, p: setattr(self, "_answer", reason)
+        client.on_disconnect = lambda c, u, flags, reason, p: setattr(self, "_ended", reason)
+        client.on_subscribe = lambda c, u, mid, reasons, p: setattr(self, "_granted", reasons)
+        client.on_publish = lambda c, u, mid, reason, p: self._published.update({mid: reason})
+        client.on_message = lambda c, u, message: on_message(message)
+        client.tls_set_context(_tls(target))
+        client.tls_insecure_set(target.insecure)
+        self._connect()
+
+    def _connect(self) -> None:
+        target = self._target
+        try:
+            self._client.connect(target.host, target.port, keepalive=60)
+        except ssl.SSLCertVerificationError as error:
+            trusted = f"by {target.ca}" if target.ca else "by this computer's own list of CAs"
+            raise ClientError(
+                f"the certificate of {target.address} is not trusted {trusted}: "
+                f"{error.verify_message}. Name the ca.crt that this appliance's `init` made with "
+                "--ca, and connect by a name that the certificate has."
+            ) from None
+        except socket.gaierror:
+            raise ClientError(f"there is no computer called {target.host!r}") from None
+        except ssl.SSLError as error:
+            reason = (error.reason or str(error)).lower().replace("_", " ")
+            raise ClientError(f"no TLS with {target.address}: {reason}") from None
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise ClientError(f"{target.address} cannot be reached: {reason}") from None
+        self._wait(lambda: self._answer is not None, "the login")
+        if self._answer is not None and self._answer.is_failure:
+            who = f"user {target.username!r}" if target.username else "a client without user name"
+            raise ClientError(f"{target.address} refused {who}: {self._answer}")
+
+    def publish(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:
+        """Publishes, and returns when the broker has taken it (QoS 0: when it was sent)."""
+        try:
+            message = self._client.publish(topic, payload, qos, retain)
+        except ValueError as error:
+            raise ClientError(f"{topic!r} cannot be published: {error}") from None
+        self._wait(lambda: message.mid in self._published, "a message")
+        reason = self._published.pop(message.mid)
+        if reason.is_failure:
+            raise ClientError(f"{topic!r} was refused: {reason}")
+
+    def subscribe(self, filters: list[str], qos: int) -> None:
+        """Subscribes to all of the filters. Raises ClientError that names those refused."""
+        options = [(name, SubscribeOptions(qos=qos)) for name in filters]
+        try:
+            if self._target.version == MQTTProtocolVersion.MQTTv5:
+                self._client.subscribe(options)
+            else:
+                self._client.subscribe([(name, qos) for name in filters])
+        except ValueError as error:
+            raise ClientError(f"{', '.join(filters)}: {error}") from None
+        self._wait(lambda: self._granted is not None, "the subscription")
+        refused = [
+            f"{name!r} was refused: {reason}"
+            for name, reason in zip(filters, self._granted or [], strict=False)
+            if reason.is_failure
+        ]
+        if refused:
+            raise ClientError("; ".join(refused))
+
+    def run(self, done: Callable[[], bool], deadline: float | None = None) -> bool:
+        """Works until `done()` or the deadline (monotonic clock); returns `done()`."""
+        while not done():
+            left = 1.0 if deadline is None else min(1.0, deadline - time.monotonic())
+            if left <= 0:
+                return False
+            code = self._client.loop(left)
+            if done():
+                break
+            if self._ended is not None or code != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                known = self._ended is not None and self._ended.value >= 0x80
+                why = str(self._ended) if known else "without giving a reason"
+                raise ClientError(f"{self._target.address} ended the connection: {why}")
+        return True
+
+    def _wait(self, done: Callable[[], bool], what: str) -> None:
+        if not self.run(done, time.monotonic() + ANSWER_TIMEOUT):
+            raise ClientError(f"{self._target.address} gave no answer to {what}")
+
+    def close(self) -> None:
+        """Says goodbye and closes; harmless when the connection is gone already."""
+        self._client.disconnect()
+
+
+def _tls(target: Target) -> ssl.SSLContext:
+    if target.insecure:
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        return context
+    try:
+        # With a CA given, only that one counts: a public one has no say about a robot.
+        return ssl.create_default_context(cafile=str(target.ca) if target.ca else None)
+    except ssl.SSLError:
+        raise ClientError(f"{target.ca} is not a CA certificate in PEM form") from None
+    except OSError as error:
+        raise ClientError(f"{target.ca} cannot be read: {error.strerror}") from None

@@ -1,0 +1,550 @@
+"""appliance.yaml: read, checked as a whole, and turned into typed settings.
+
+Every problem is found in one go and told with its file, line and key; nothing is guessed. Sizes and
+durations carry their unit, paths are relative to the file, `${NAME}` and `${NAME:-default}` take
+environment variables, and values that look like secrets are masked wherever settings are printed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import ErrorDetails
+
+from appliance.document import Document, KeyPath, Problem
+
+SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
+"""Where the configuration is looked for when no file is named; the first that exists is used."""
+
+PACKET_SIZE_MAX = 268_435_455
+"""The largest Remaining Length that MQTT can say (section 1.5.5: four bytes of 7 bits)."""
+
+SIZE_UNITS = {"B": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
+DURATION_UNITS = {"ms": 1, "s": 1000, "min": 60_000, "h": 3_600_000, "d": 86_400_000}  # in ms
+
+_QUANTITY = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]+)")
+_SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
+_URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
+MASK = "********"
+
+
+# Errors
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; `problems` has everything that is wrong with it."""
+
+    def __init__(self, problems: list[Problem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = problems
+
+
+# Values with units
+
+
+def parse_size(value: object) -> int:
+    """Bytes from `64 KiB`, `16 MiB` or a plain number of bytes. Raises ValueError."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value
+    return round(_quantity(value, SIZE_UNITS, "a size such as 64 KiB or 16 MiB"))
+
+
+def parse_duration(value: object) -> float:
+    """Seconds from `500 ms`, `10 s`, `5 min`, `1 h` or `7 d`. Raises ValueError."""
+    return _quantity(value, DURATION_UNITS, "a duration such as 500 ms, 10 s or 5 min") / 1000
+
+
+def _quantity(value: object, units: Mapping[str, int], wanted: str) -> float:
+    match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    if match is None:
+        raise ValueError(f"must be {wanted}")
+    number, unit = match.groups()
+    if unit not in units:
+        raise ValueError(f"unknown unit {unit!r}; use {_either(list(units))}")
+    return float(number) * units[unit]
+
+
+def format_size(value: int) -> str:
+    """The shortest exact way to write so many bytes: `16 MiB`."""
+    return _in_units(value, SIZE_UNITS)
+
+
+def format_duration(seconds: float) -> str:
+    """The shortest exact way to write so many seconds, to the millisecond: `5 min`."""
+    return _in_units(round(seconds * 1000), DURATION_UNITS)
+
+
+def _in_units(value: int, units: Mapping[str, int]) -> str:
+    unit = max((u for u in units if value % units[u] == 0), key=lambda u: units[u] if value else 0)
+    return f"{value // units[unit]} {unit}"
+
+
+class Bind(NamedTuple):
+    """An address to listen on. An empty host is every address of this computer; port 0 any port."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this computer can reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def parse_bind(value: object) -> Bind:
+    """`host:port`, `[::1]:port` or `:port`. Raises ValueError."""
+    if isinstance(value, Bind):
+        return value
+    text = value if isinstance(value, str) else ""
+    match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^\s:\[\]]*)):(\d{1,5})", text)
+    if match is None:
+        raise ValueError('must be "host:port", "[::1]:port" or ":port"')
+    port = int(match[3])
+    if port > 65535:
+        raise ValueError(f"there is no port {port}")
+    return Bind(match[1] or match[2], port)
+
+
+def _parse_seconds(value: object, info: ValidationInfo) -> float:
+    # In a file a duration has a unit; in code, where the type says so, plain seconds do.
+    if info.context is None and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    return parse_duration(value)
+
+
+def _parse_path(value: object, info: ValidationInfo) -> Path:
+    if not isinstance(value, (str, Path)) or not str(value):
+        raise ValueError("must be a path")
+    base: Path = (info.context or {}).get("directory", Path())
+    return (base / value).absolute()
+
+
+def _parse_qos(value: object) -> int | None:
+    if value is None or value == "auto":
+        return None
+    if isinstance(value, int) and not isinstance(value, bool) and value in (0, 1, 2):
+        return value
+    raise ValueError("must be 0, 1, 2 or auto")
+
+
+def _parse_retain(value: object) -> bool | None:
+    if value is None or value == "auto":
+        return None
+    if isinstance(value, bool):
+        return value
+    raise ValueError("must be true, false or auto")
+
+
+def _parse_keep(value: object) -> int | Literal["latest"]:
+    if value == "latest":
+        return "latest"
+    if isinstance(value, int) and not isinstance(value, bool) and value > 0:
+        return value
+    raise ValueError("must be latest, or how many messages to keep (1 or more)")
+
+
+def _check_robot(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", value):
+        raise ValueError(
+            "must be one level of an MQTT topic: a letter or digit, "
+            "then up to 63 letters, digits, '_', '-' or '.'"
+        )
+    return value
+
+
+def _check_ros_name(value: str) -> str:
+    if not value.startswith("/"):
+        raise ValueError("must be a full ROS name that begins with '/'")
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", value):
+        raise ValueError(
+            "is not a ROS name: each part is a letter or '_', then letters, digits, '_'"
+        )
+    return value
+
+
+def _check_node(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
+        raise ValueError("must be a letter or '_', then letters, digits or '_'")
+    return value
+
+
+def _check_namespace(value: str) -> str:
+    return value if value == "/" else _check_ros_name(value)
+
+
+def _check_ros_type(value: str) -> str:
+    if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", value):
+        return value
+    short = re.fullmatch(r"([A-Za-z]\w*)/([A-Za-z]\w*)", value)
+    hint = f"; did you mean '{short[1]}/msg/{short[2]}'?" if short else ""
+    raise ValueError(f"must be package/msg/Type, such as geometry_msgs/msg/Twist{hint}")
+
+
+def _check_topic_template(value: str) -> str:
+    plain = value.replace("{robot}", "r").replace("{ros}", "/r")
+    if not plain or any(char in plain for char in "+#\0"):
+        raise ValueError("must be an MQTT topic without '+' and '#'")
+    if "{" in plain or "}" in plain:
+        raise ValueError("knows the placeholders {robot} and {ros} only")
+    if plain.startswith("$"):
+        raise ValueError("must not begin with '$': those topics are the broker's own")
+    return value
+
+
+def _check_plugins(value: object) -> object:
+    if not isinstance(value, dict):
+        return value
+    for name in value:
+        if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", name):
+            raise ValueError(
+                f"{name!r} must be the full path of a plugin class: package.module.Class"
+            )
+    # A plugin without settings is written with nothing after its colon.
+    return {name: {} if settings is None else settings for name, settings in value.items()}
+
+
+def _check_bus(value: object) -> object:
+    if value == "ros1":
+        raise ValueError("ros1 is not in this version; use ros2 or none")
+    return value
+
+
+def _or_auto(value: object) -> object:
+    return "auto" if value is None else value
+
+
+Size = Annotated[int, BeforeValidator(parse_size), PlainSerializer(format_size, when_used="json")]
+Duration = Annotated[
+    float, BeforeValidator(_parse_seconds), PlainSerializer(format_duration, when_used="json")
+]
+Address = Annotated[Bind, PlainValidator(parse_bind), PlainSerializer(str, when_used="json")]
+# Defaults of paths are validated as well: that is what makes them relative to the file.
+FilePath = Annotated[Path, PlainValidator(_parse_path), Field(validate_default=True)]
+Qos = Annotated[int | None, PlainValidator(_parse_qos), PlainSerializer(_or_auto, when_used="json")]
+Retain = Annotated[
+    bool | None, PlainValidator(_parse_retain), PlainSerializer(_or_auto, when_used="json")
+]
+Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
+Count = Annotated[int, Field(ge=1)]
+Encoding = Literal["json", "text", "cdr"]
+Direction = Literal["mqtt", "ros", "both"]
+Level = Literal["debug", "info", "warning", "error"]
+
+
+# Settings
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+def _section() -> Any:
+    # An empty mapping that is validated, and not a ready section: so its paths see the context.
+    return Field(default={}, validate_default=True)
+
+
+class Listener(_Section):
+    """One address that clients connect to, with or without TLS."""
+
+    bind: Address
+    tls: bool = False
+
+
+class Tls(_Section):
+    """The server's certificate, and the CA whose client certificates are accepted."""
+
+    certificate: FilePath = Path("certs/server.crt")
+    key: FilePath = Path("certs/server.key")
+    ca: FilePath = Path("certs/ca.crt")
+    client_certificates: Literal["none", "optional", "required"] = "optional"
+
+
+class Limits(_Section):
+    """What one client, and all together, may use. Sizes in bytes, times in seconds."""
+
+    connections: Count = 1000
+    packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
+    memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
+    queue_messages: Count = 1000
+    queue_bytes: Annotated[Size, Field(ge=1)] = 16 << 20
+    inflight: Annotated[int, Field(ge=1, le=65535)] = 20
+    subscriptions: Count = 1000
+    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 128
+    retained_messages: Annotated[int, Field(ge=0)] = 100_000
+    retained_bytes: Annotated[Size, Field(ge=0)] = 64 << 20
+    connect_timeout: Annotated[Duration, Field(gt=0)] = 10.0
+    session_expiry: Annotated[Duration, Field(ge=0, lt=0xFFFF_FFFF)] = 7 * 86400.0
+    keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 65535.0
+    topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
+
+
+class Broker(_Section):
+    """The MQTT broker: where it listens, who may come in, what may be used up."""
+
+    listeners: list[Listener] = Field(
+        default=[
+            Listener(bind=Bind("0.0.0.0", 8883), tls=True),
+            Listener(bind=Bind("127.0.0.1", 1883)),
+        ],
+        min_length=1,
+    )
+    users: FilePath = Path("users.passwd")
+    acl: FilePath = Path("acl.conf")
+    anonymous: bool = False
+    tls: Tls = _section()
+    limits: Limits = _section()
+    sys_interval: Annotated[Duration, Field(ge=0)] = 10.0
+    plugins: Annotated[
+        dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)
+    ] = {}
+
+
+class RouteDefaults(_Section):
+    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto."""
+
+    encoding: Encoding = "json"
+    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    qos: Qos = None
+    retain: Retain = None
+    keep: Keep = "latest"
+
+
+class TopicRoute(RouteDefaults):
+    """One ROS topic that is carried to MQTT, from MQTT, or both ways."""
+
+    ros: Annotated[str, AfterValidator(_check_ros_name)]
+    to: Direction
+    type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
+    mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+
+    def topic(self, robot: str) -> str:
+        """The MQTT topic of this route on that robot."""
+        return self.mqtt.replace("{ros}", self.ros).replace("{robot}", robot)
+
+
+class Bridge(_Section):
+    """The way between the robot's bus and the broker."""
+
+    bus: Annotated[Literal["ros2", "none"], BeforeValidator(_check_bus)] = "ros2"
+    node: Annotated[str, AfterValidator(_check_node)] = "appliance"
+    namespace: Annotated[str, AfterValidator(_check_namespace)] = "/"
+    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    defaults: RouteDefaults = _section()
+    topics: list[TopicRoute] = []
+
+    @field_validator("topics")
+    @classmethod
+    def _take_defaults(cls, topics: list[TopicRoute], info: ValidationInfo) -> list[TopicRoute]:
+        defaults = info.data.get("defaults")
+        if defaults is None:  # they are wrong themselves, and that is told
+            return topics
+        shared = {name: getattr(defaults, name) for name in RouteDefaults.model_fields}
+        return [
+            route.model_copy(
+                update={k: v for k, v in shared.items() if k not in route.model_fields_set}
+            )
+            for route in topics
+        ]
+
+
+class Log(_Section):
+    """What is logged and how; `levels` has a level for each logger named, such as appliance.ros."""
+
+    level: Level = "info"
+    format: Literal["human", "json"] = "human"
+    levels: dict[str, Level] = {}
+
+
+class Settings(_Section):
+    """All of appliance.yaml."""
+
+    robot: Annotated[str, AfterValidator(_check_robot)] = "robot"
+    broker: Broker = _section()
+    bridge: Bridge = _section()
+    log: Log = _section()
+    _file: Path | None = PrivateAttr(default=None)
+
+    @property
+    def file(self) -> Path | None:
+        """The file these settings were read from; None when they were made in code."""
+        return self._file
+
+
+# Reading
+
+
+def find(path: Path | None = None) -> Path:
+    """The configuration file to use: `path`, else the first of SEARCH_PATH. Raises ConfigError."""
+    for candidate in (path,) if path else SEARCH_PATH:
+        if candidate.is_file():
+            return candidate
+    missing = path or SEARCH_PATH[0]
+    places = "no such file" if path else f"not found, nor {SEARCH_PATH[1]}"
+    raise ConfigError([Problem(missing, 0, "", f"{places}; `appliance init` writes one")])
+
+
+def load(path: Path | None = None) -> Settings:
+    """The settings of that file, or of the first of SEARCH_PATH. Raises ConfigError."""
+    file = find(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
+        raise ConfigError([Problem(file, 0, "", f"cannot be read: {reason}")]) from None
+    return loads(text, file)
+
+
+def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:
+    """The settings in `text`; `file` names it in errors and is what paths are relative to."""
+    document = Document(text, file, os.environ if environment is None else environment)
+    problems = document.problems
+    try:
+        settings = Settings.model_validate(
+            document.values, context={"directory": file.absolute().parent}
+        )
+    except ValidationError as error:
+        for detail in error.errors(include_url=False):
+            if detail["loc"] not in document.faulty:
+                path = detail["loc"]
+                problems.append(document.problem(path, _explain(detail, document.written(path))))
+    else:
+        problems += [document.problem(path, what) for path, what in _cross_check(settings)]
+        settings._file = file.absolute()
+    if problems:
+        raise ConfigError(sorted(problems, key=lambda problem: problem.line))
+    return settings
+
+
+def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
+    seen: dict[Bind, int] = {}
+    for number, listener in enumerate(settings.broker.listeners):
+        first = seen.setdefault(listener.bind, number)
+        if first != number and listener.bind.port:
+            path = ("broker", "listeners", number, "bind")
+            yield path, f"broker.listeners[{first}] listens there already"
+    routes: dict[tuple[str, str], int] = {}
+    for number, route in enumerate(settings.bridge.topics):
+        first = routes.setdefault((route.ros, route.topic(settings.robot)), number)
+        if first != number:
+            yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
+
+
+_PLAIN = {
+    "missing": "is needed",
+    "string_type": "must be text (in quotes, when it looks like a number or a yes or no)",
+    "int_type": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+    "list_type": "must be a list",
+    "dict_type": "must be keys with values",
+    "model_type": "must be keys with values",
+}
+_BOUNDS = {
+    "greater_than": ("gt", "must be more than"),
+    "greater_than_equal": ("ge", "must be at least"),
+    "less_than": ("lt", "must be less than"),
+    "less_than_equal": ("le", "must be at most"),
+}
+
+
+def _explain(detail: ErrorDetails, written: str | None) -> str:
+    """One of pydantic's errors in this project's words, with what was written, masked."""
+    kind, path, context = detail["type"], detail["loc"], detail.get("ctx", {})
+    if kind == "extra_forbidden":
+        known = list(_section_at(path[:-1]).model_fields)
+        return f"unknown key{_did_you_mean(str(path[-1]), known) or '; known: ' + ', '.join(known)}"
+    if kind == "missing":
+        return _PLAIN[kind]
+    if kind == "value_error":
+        what = str(context["error"])
+    elif kind == "literal_error":
+        choices = re.findall(r"'([^']*)'", context["expected"])
+        what = f"must be {_either(choices)}{_did_you_mean(str(detail['input']), choices)}"
+    elif kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        what = f"{words} {_with_unit(context[name], path)}"
+    elif kind == "too_short":
+        what = f"must have at least {context['min_length']}"
+    else:
+        what = _PLAIN.get(kind, detail["msg"])
+    return what if written is None else f"{what} (it says {mask(path, written)!r})"
+
+
+def _section_at(path: KeyPath) -> type[BaseModel]:
+    """The model that describes the mapping at that path."""
+
+    def models(annotation: Any) -> Iterator[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield annotation
+        for argument in get_args(annotation):
+            yield from models(argument)
+
+    section: type[BaseModel] = Settings
+    for part in path:
+        if isinstance(part, str):
+            section = next(models(section.model_fields[part].annotation))
+    return section
+
+
+def _with_unit(value: float, path: KeyPath) -> str:
+    *around, name = path
+    for item in _section_at(tuple(around)).model_fields[str(name)].metadata:
+        if item == BeforeValidator(parse_size):
+            return format_size(int(value))
+        if item == BeforeValidator(_parse_seconds):
+            return format_duration(value)
+    return f"{value:g}"
+
+
+def _did_you_mean(word: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _either(words: Sequence[str]) -> str:
+    return " or ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
+
+
+# Printing
+
+
+def mask(path: KeyPath, value: Any) -> Any:
+    """The value as it may be printed: masked when its key or its form says that it is a secret."""
+    if isinstance(value, Mapping):
+        return {key: mask((*path, key), inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [mask(path, inner) for inner in value]
+    if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
+        return MASK
+    return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def describe(settings: Settings) -> dict[str, Any]:
+    """Every setting in force as plain values, in the form of appliance.yaml, secrets masked."""
+    described: dict[str, Any] = mask((), settings.model_dump(mode="json"))
+    return described

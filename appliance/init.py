@@ -1,0 +1,188 @@
+"""`appliance init`: everything a new appliance needs, and nothing over what is there already."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import socket
+import string
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from appliance import certs, config
+from appliance.access import Passwords, check_username
+
+PASSWORD_FILE = "user.password"
+_PASSWORD_LENGTH = 20  # of 62 characters each: 119 bits
+
+CONFIGURATION = """\
+# What is left out has a safe default. Every key, its default and why it is there:
+# the appliance.yaml at the top of this project. `appliance check` names every mistake.
+
+robot: {robot}          # the first level of all its MQTT topics
+
+bridge:
+  topics: []
+  # A route each, for example:
+  #  - {{ros: /odom, to: mqtt, rate: 10}}
+  #  - {{ros: /cmd_vel, to: ros, type: geometry_msgs/msg/Twist}}
+"""
+
+DEMO_CONFIGURATION = """\
+# The demo's configuration, made by `appliance init --demo`. What is left out has a safe default.
+
+robot: {robot}
+
+broker:
+  listeners:
+    - bind: 0.0.0.0:${{APPLIANCE_PORT:-8883}}
+      tls: true
+    - bind: 127.0.0.1:${{APPLIANCE_PLAIN_PORT:-1883}}
+
+bridge:
+  topics:
+    - {{ros: /odom, to: mqtt, rate: 10}}
+    - {{ros: /battery, to: mqtt}}
+    - {{ros: /scan, to: mqtt, rate: 2}}
+    - {{ros: /chatter, to: mqtt}}
+    - {{ros: /cmd_vel, to: ros, type: geometry_msgs/msg/Twist}}
+"""
+
+ACCESS = """\
+# Who may read and write which topics, in mosquitto's grammar; what nothing here allows is refused.
+# {{robot}} stands for the robot's name. Ask why with: appliance acl explain USER TOPIC
+
+user {user}
+topic read {{robot}}/#
+topic read $SYS/#
+topic write {{robot}}/cmd_vel
+"""
+
+
+class InitError(Exception):
+    """Something could not be made; the message says what and what to do."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One file: whether it was made now or kept as it was, and what to know about it."""
+
+    path: Path
+    made: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """The first user, with the password that is shown this once."""
+
+    user: str
+    password: str
+
+
+def robot_name(text: str) -> str:
+    """The nearest name that may be one level of a topic: `r2 d2!` becomes `r2-d2`."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-_.")[:64].rstrip("-_.")
+    return name or "robot"
+
+
+def generate_password() -> str:
+    """A random password of letters and digits, which no shell and no URL misreads."""
+    alphabet = string.ascii_letters + string.digits
+    return "".join(secrets.choice(alphabet) for _ in range(_PASSWORD_LENGTH))
+
+
+def initialise(
+    directory: Path, *, robot: str | None = None, user: str = "operator", demo: bool = False
+) -> Iterator[Step | Credentials]:
+    """Makes what is missing in `directory`, telling each step as it is done.
+
+    Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
+    made until then is good and stays.
+    """
+    try:
+        check_username(user)
+    except ValueError as error:
+        raise InitError(str(error)) from None
+    directory.mkdir(parents=True, exist_ok=True)
+    file = directory / "appliance.yaml"
+    name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
+    text = (DEMO_CONFIGURATION if demo else CONFIGURATION).format(robot=name)
+    made = _write_new(file, text)
+    settings = config.load(file)
+    if robot and not made and settings.robot != name:
+        raise InitError(f"{file} has robot: {settings.robot}; change it there")
+    yield Step(file, made, f"configuration of robot {settings.robot!r}")
+    yield from _certificates(settings)
+    made = _write_new(settings.broker.acl, ACCESS.format(user=user))
+    yield Step(settings.broker.acl, made, "access rules")
+    # Last, so that the password is the last thing shown.
+    yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
+
+
+def _certificates(settings: config.Settings) -> Iterator[Step]:
+    tls = settings.broker.tls
+    directory = tls.certificate.parent
+    authority, readme = directory / "ca.crt", directory / "README.md"
+    ours = (directory / "server.crt", directory / "server.key", authority)
+    if tls.certificate.exists() and tls.key.exists():
+        yield Step(tls.certificate, False, "the server's certificate")
+        return
+    if (tls.certificate, tls.key, tls.ca) != ours:
+        raise InitError(
+            f"{tls.certificate} and {tls.key} are not both there, and broker.tls does not name the "
+            "files that this command makes (server.crt, server.key, ca.crt in one directory)"
+        )
+    made = not authority.exists()
+    if made:
+        certs.create_authority(directory, settings.robot)
+    yield Step(authority, made, "this appliance's own CA, for every client")
+    names, addresses = certs.local_names()
+    certs.issue_server(directory, names, addresses)
+    known = ", ".join([*names, *map(str, addresses)])
+    yield Step(tls.certificate, True, f"the server's certificate, for {known}")
+    if not readme.exists():
+        certs.write_readme(directory)
+        yield Step(readme, True, "what each of these files is, and who may have it")
+
+
+def _users(
+    settings: config.Settings, user: str, password_file: Path | None
+) -> Iterator[Step | Credentials]:
+    path = settings.broker.users
+    if path.exists():
+        yield Step(path, False, f"users: {', '.join(Passwords.load(path).users())}")
+        return
+    password = generate_password()
+    users = Passwords(path)
+    users.set(user, password)
+    if password_file is not None:  # before the users file, or an interruption would lose it
+        password_file.unlink(missing_ok=True)
+        _write_new(password_file, password + "\n", mode=0o600)
+    users.save()
+    yield Step(path, True, f"users: {user}")
+    if password_file is not None:
+        yield Step(password_file, True, f"the password of {user}, for the demo")
+    yield Credentials(user, password)
+
+
+def _write_new(path: Path, text: str, mode: int = 0o644) -> bool:
+    """Writes the file, safe on disk, unless it is there; returns whether it was written."""
+    if path.exists():
+        return False
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Whole or not at all: half a file of an interrupted run would be kept by the next one.
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with os.fdopen(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode), "w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.link(draft, path)  # unlike a rename, this never replaces what came meanwhile
+    except FileExistsError:
+        return False
+    finally:
+        draft.unlink(missing_ok=True)
+    return True

@@ -1,0 +1,246 @@
+"""One connection's bytes: framing, size limits, topic aliases and the table of legal packet orders.
+
+A `Connection` is given what came in and yields what was said; it does no I/O and knows no clock.
+Three kinds of event come out of it:
+
+* a `Packet`, decoded;
+* a `RawPublish`, a PUBLISH without properties that is taken apart but not wrapped: the data path;
+* an `int`, ``type << 16 | packet id``: an acknowledgement without reason code or properties.
+
+The two short forms save an object and a property table a message. What they leave out is what the
+standard says is absent, and `tests/mqtt/test_connection.py` holds them against the full decoder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from enum import Enum
+from typing import TypeAlias
+
+from appliance.mqtt.codec import PacketType, Property, decode_varint
+from appliance.mqtt.packets import Connect, Packet, Publish, decode_packet
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import check_topic
+
+#: header byte, topic with its two length bytes, packet id (0 for QoS 0), payload,
+#: and the bytes from the header to the end of the topic (QoS 0: to the end of the packet).
+RawPublish: TypeAlias = tuple[int, bytes, int, bytes, bytes]
+Event: TypeAlias = "Packet | RawPublish | int"
+
+#: The largest CONNECT that is read: five strings of 65,535 bytes and some properties. A stranger
+#: gets no more memory than this, whatever packet size is allowed to clients that have logged in.
+MAXIMUM_CONNECT = 384 * 1024
+
+PUBACK = PacketType.PUBACK << 16
+PUBREC = PacketType.PUBREC << 16
+PUBREL = PacketType.PUBREL << 16
+PUBCOMP = PacketType.PUBCOMP << 16
+
+# First byte of an acknowledgement -> its event without the packet id.
+_ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
+
+
+class State(Enum):
+    """Where a connection is in its life."""
+
+    NEW = "before CONNECT"
+    AUTHENTICATING = "before CONNACK"
+    CONNECTED = "connected"
+    CLOSED = "closed"
+
+
+# What a client may send, and when; an absent entry is the error 0x82.
+# [MQTT-3.1.0-1], [MQTT-3.1.0-2]
+_LEGAL: dict[State, frozenset[PacketType]] = {
+    State.NEW: frozenset({PacketType.CONNECT}),
+    State.AUTHENTICATING: frozenset({PacketType.AUTH}),
+    State.CONNECTED: frozenset(
+        {
+            PacketType.PUBLISH,
+            PacketType.PUBACK,
+            PacketType.PUBREC,
+            PacketType.PUBREL,
+            PacketType.PUBCOMP,
+            PacketType.SUBSCRIBE,
+            PacketType.UNSUBSCRIBE,
+            PacketType.PINGREQ,
+            PacketType.DISCONNECT,
+            PacketType.AUTH,
+        }
+    ),
+    State.CLOSED: frozenset(),
+}
+
+
+class Connection:
+    """The server's end of one MQTT connection, as bytes.
+
+    `maximum_packet_size` bounds a whole packet, in bytes, once the client has logged in;
+    `topic_alias_maximum` is what CONNACK announces to a version 5 client.
+    """
+
+    def __init__(self, maximum_packet_size: int, topic_alias_maximum: int) -> None:
+        self.maximum_packet_size = maximum_packet_size
+        self.topic_alias_maximum = topic_alias_maximum
+        self.state = State.NEW
+        self.version = 0
+        #: Set by the owner: nothing more is yielded until `receive_data` is called without it.
+        self.paused = False
+        self._chunks: list[bytes] = []
+        self._have = 0
+        self._need = 0
+        self._aliases: dict[int, str] = {}
+
+    @property
+    def buffered(self) -> int:
+        """Bytes that were received and not yet taken apart."""
+        return self._have
+
+    def receive_data(self, data: bytes) -> Iterator[Event]:
+        """Yield what `data`, behind what came before it, completes.
+
+        A generator, so that what one packet changes (refused, paused, closed) holds for the next.
+        It must be run to its end, or `keep` the connection closed.
+
+        Raises:
+            ProtocolError: the bytes or their order are wrong; the connection is `State.CLOSED`.
+        """
+        # A packet cut into many chunks is joined once, when it is whole: joining at every chunk
+        # would copy a 16 MiB packet a hundred times over.
+        if self._have:
+            self._chunks.append(data)
+            self._have += len(data)
+            if self._have < self._need or self.paused:
+                return
+            data = b"".join(self._chunks)
+            self._chunks.clear()
+            self._have = 0
+        try:
+            pos = yield from self._parse(data)
+        except ProtocolError:
+            self.state = State.CLOSED
+            raise
+        if pos < len(data) and self.state is not State.CLOSED:
+            self._chunks.append(data[pos:] if pos else data)
+            self._have = len(data) - pos
+
+    def _parse(self, buf: bytes) -> Generator[Event, None, int]:
+        """Yield the whole packets in `buf` and return the position reached."""
+        pos = 0
+        end = len(buf)
+        self._need = 0
+        acknowledgements = _ACKNOWLEDGEMENTS
+        while end - pos >= 2 and not self.paused and self.state is not State.CLOSED:
+            first = buf[pos]
+            length = buf[pos + 1]
+            body = pos + 2
+            if length > 0x7F:
+                try:
+                    length, body = self._remaining_length(buf, pos)
+                except IndexError:
+                    break
+            stop = body + length
+            if self.state is not State.CONNECTED:
+                self._check_order(first, stop - pos)
+            if stop - pos > self.maximum_packet_size:
+                raise ProtocolError(
+                    ReasonCode.PACKET_TOO_LARGE,
+                    f"a packet of {stop - pos} bytes, more than the limit of "
+                    f"{self.maximum_packet_size} (broker.limits.packet_size)",
+                )
+            if stop > end:
+                self._need = stop - pos
+                break
+
+            if self.state is not State.CONNECTED:
+                yield self._decode(first, buf[body:stop])
+            elif 0x30 <= first <= 0x3D and length > 4:
+                # The data path: PUBLISH, taken apart by index.
+                topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
+                qos = first & 0x06
+                payload = topic_end + 2 if qos else topic_end
+                if self.version == 5:
+                    # Only an empty property table stays on this path.
+                    if payload < stop and buf[payload] == 0:
+                        payload += 1
+                    else:
+                        payload = end + 1
+                if payload > stop or topic_end == body + 2 or qos == 6 or (first & 8 and not qos):
+                    yield self._publish(first, buf[body:stop])
+                elif qos:
+                    packet_id = buf[topic_end] << 8 | buf[topic_end + 1]
+                    if not packet_id:
+                        yield self._publish(first, buf[body:stop])
+                    yield (
+                        first,
+                        buf[body:topic_end],
+                        packet_id,
+                        buf[payload:stop],
+                        buf[pos:topic_end],
+                    )
+                else:
+                    yield first, buf[body:topic_end], 0, buf[payload:stop], buf[pos:stop]
+            elif length == 2 and first in acknowledgements and (buf[body] or buf[body + 1]):
+                yield acknowledgements[first] | buf[body] << 8 | buf[body + 1]
+            elif first >> 4 == PacketType.PUBLISH:
+                yield self._publish(first, buf[body:stop])
+            else:
+                self._check_order(first, stop - pos)
+                yield self._decode(first, buf[body:stop])
+            pos = stop
+        return pos
+
+    def _remaining_length(self, buf: bytes, pos: int) -> tuple[int, int]:
+        """The length of a packet and where its body begins; IndexError when bytes are missing."""
+        # [MQTT-1.5.5-1]: at most four bytes. Those that are there are checked before more come.
+        if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
+            raise IndexError
+        return decode_varint(buf, pos + 1)
+
+    def _check_order(self, first: int, size: int) -> None:
+        try:
+            kind = PacketType(first >> 4)
+        except ValueError:
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, "packet type 0 is reserved") from None
+        if kind not in _LEGAL[self.state]:
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, f"a {kind.name} may not come {self.state.value}"
+            )
+        if self.state is State.NEW and size > MAXIMUM_CONNECT:
+            raise ProtocolError(
+                ReasonCode.PACKET_TOO_LARGE,
+                f"a CONNECT of {size} bytes, more than the limit of {MAXIMUM_CONNECT}",
+            )
+
+    def _decode(self, first: int, body: bytes) -> Packet:
+        packet = decode_packet(first, body, self.version)
+        if isinstance(packet, Connect):
+            self.version = packet.version
+            self.state = State.AUTHENTICATING
+        return packet
+
+    def _publish(self, first: int, body: bytes) -> Publish:
+        """The full decoder for a PUBLISH, with its alias resolved and its topic checked."""
+        packet = decode_packet(first, body, self.version)
+        assert isinstance(packet, Publish)
+        properties = packet.properties
+        alias = properties.pop(Property.TOPIC_ALIAS, None) if properties else None
+        if isinstance(alias, int):
+            if alias > self.topic_alias_maximum:  # [MQTT-3.3.2-9]
+                raise ProtocolError(
+                    ReasonCode.TOPIC_ALIAS_INVALID,
+                    f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
+                )
+            if packet.topic:
+                self._aliases[alias] = packet.topic
+            elif alias in self._aliases:
+                packet.topic = self._aliases[alias]
+            else:
+                raise ProtocolError(
+                    ReasonCode.PROTOCOL_ERROR, f"topic alias {alias} was never given a topic"
+                )
+        try:
+            check_topic(packet.topic)  # [MQTT-3.3.2-2], [MQTT-4.7.3-1]
+        except ValueError as error:
+            raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
+        return packet

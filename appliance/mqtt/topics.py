@@ -1,0 +1,315 @@
+"""Topic names and filters (section 4.7 of both standards): the one validator, matcher and trees.
+
+A topic is split at `/` into levels, an empty level is a level like any other. In a filter `+`
+stands for one level and a final `#` for the level above it and everything below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from typing import Final, Generic, TypeVar
+
+V = TypeVar("V")
+
+MAX_TOPIC: Final = 65_535
+"""The greatest length, in bytes, of a topic or a filter: what a string of MQTT can hold."""
+
+_SHARE: Final = "$share/"
+
+
+def check_topic(topic: str) -> None:
+    """Raises a ValueError that says why `topic` is no topic name (section 4.7)."""
+    _check_string(topic, "topic")
+    if "+" in topic or "#" in topic:  # [MQTT-3.3.2-2] [MQTT-4.7.1-1] v5 [MQTT-4.7.0-1]
+        raise ValueError("a topic must not hold + or #")
+
+
+def check_filter(filter: str) -> None:
+    """Raises a ValueError that says why `filter` is no topic filter (section 4.7).
+
+    For a shared subscription call `parse_shared` first: `$share/…` is not looked into here.
+    """
+    _check_string(filter, "topic filter")
+    if "+" not in filter and "#" not in filter:
+        return
+    levels = filter.split("/")
+    last = len(levels) - 1
+    for index, level in enumerate(levels):
+        if "#" in level and (level != "#" or index != last):  # [MQTT-4.7.1-2] v5 [MQTT-4.7.1-1]
+            raise ValueError("# must be a whole level, and the last one")
+        if "+" in level and level != "+":  # [MQTT-4.7.1-3] v5 [MQTT-4.7.1-2]
+            raise ValueError("+ must be a whole level")
+
+
+def _check_string(text: str, what: str) -> None:
+    if not text:  # [MQTT-4.7.3-1]
+        raise ValueError(f"a {what} must not be empty")
+    if "\0" in text:  # [MQTT-4.7.3-2]
+        raise ValueError(f"a {what} must not hold U+0000")
+    # No character takes more than four bytes, so a short text need not be encoded to be measured.
+    if len(text) > MAX_TOPIC // 4 and len(text.encode()) > MAX_TOPIC:  # [MQTT-4.7.3-3]
+        raise ValueError(f"a {what} must not be longer than {MAX_TOPIC} bytes")
+
+
+def parse_shared(filter: str) -> tuple[str, str] | None:
+    """The group and the filter of `$share/{group}/{filter}`; None for any other filter.
+
+    ValueError when it is a shared subscription that is not valid (5.0 section 4.8.2).
+    """
+    if not filter.startswith(_SHARE):
+        return None
+    group, slash, inner = filter[len(_SHARE) :].partition("/")
+    if not group:  # v5 [MQTT-4.8.2-1]
+        raise ValueError("a shared subscription needs a group: $share/{group}/{filter}")
+    if "+" in group or "#" in group:  # v5 [MQTT-4.8.2-2]
+        raise ValueError("the group of a shared subscription must not hold + or #")
+    if not slash:  # v5 [MQTT-4.8.2-2]
+        raise ValueError("a shared subscription needs a filter: $share/{group}/{filter}")
+    check_filter(inner)
+    return group, inner
+
+
+def matches(filter: str, topic: str) -> bool:
+    """Whether a valid `filter` matches a valid `topic` (section 4.7)."""
+    if filter == topic:
+        return True
+    if topic[:1] == "$" and filter[:1] in ("+", "#"):  # [MQTT-4.7.2-1]
+        return False
+    wanted = filter.split("/")
+    levels = topic.split("/")
+    if wanted[-1] == "#":
+        wanted.pop()  # What is left must match the beginning: `a/#` matches `a` too.
+        if len(levels) < len(wanted):
+            return False
+    elif len(levels) != len(wanted):
+        return False
+    return all(want in ("+", level) for want, level in zip(wanted, levels, strict=False))
+
+
+def overlaps(a: str, b: str) -> bool:
+    """Whether some topic matches both filters `a` and `b`, both valid."""
+    if _dollar_apart(a, b) or _dollar_apart(b, a):
+        return False
+    levels_a, open_a = _shape(a)
+    levels_b, open_b = _shape(b)
+    if len(levels_a) > len(levels_b) and not open_b:
+        return False
+    if len(levels_b) > len(levels_a) and not open_a:
+        return False
+    return all(x == y or "+" in (x, y) for x, y in zip(levels_a, levels_b, strict=False))
+
+
+def covers(a: str, b: str) -> bool:
+    """Whether filter `a` matches every topic that filter `b` matches, both valid."""
+    if _dollar_apart(a, b):
+        return False
+    levels_a, open_a = _shape(a)
+    levels_b, open_b = _shape(b)
+    if open_a:
+        if len(levels_a) > len(levels_b):
+            return False
+    elif open_b or len(levels_a) != len(levels_b):
+        return False
+    return all(x in ("+", y) for x, y in zip(levels_a, levels_b, strict=False))
+
+
+def _dollar_apart(wild: str, other: str) -> bool:
+    """`wild` begins with a wildcard and `other` with `$`: they share no topic [MQTT-4.7.2-1]."""
+    return wild[:1] in ("+", "#") and other[:1] == "$"
+
+
+def _shape(filter: str) -> tuple[list[str], bool]:
+    """A filter as the levels that a topic must at least have, and whether it may have more.
+
+    A topic is never empty, so `#` asks for one level, and `/#` (whose parent is the empty topic)
+    for two: `+/#` and `#` match the same topics, and so do `/#` and `/+/#`.
+    """
+    levels = filter.split("/")
+    if levels[-1] != "#":
+        return levels, False
+    levels.pop()
+    if levels in ([], [""]):
+        levels.append("+")
+    return levels, True
+
+
+class _FilterNode(Generic[V]):
+    __slots__ = ("children", "values")
+
+    def __init__(self) -> None:
+        self.children: dict[str, _FilterNode[V]] = {}
+        self.values: dict[Hashable, V] = {}
+
+
+class SubscriptionTree(Generic[V]):
+    """Filters, each with values by key, found by a topic: a trie whose edges are levels.
+
+    Looking a topic up visits the nodes that match a beginning of it, each once, so the cost
+    does not depend on the subscriptions to other topics. Filters and topics are valid ones.
+    """
+
+    def __init__(self) -> None:
+        self._root: _FilterNode[V] = _FilterNode()
+        self._size = 0
+
+    def __len__(self) -> int:
+        """How many pairs of filter and key there are."""
+        return self._size
+
+    def add(self, filter: str, key: Hashable, value: V) -> bool:
+        """Sets the value of `key` under `filter`; returns whether there was none before."""
+        node = self._root
+        for level in filter.split("/"):
+            child = node.children.get(level)
+            if child is None:
+                child = node.children[level] = _FilterNode()
+            node = child
+        new = key not in node.values
+        node.values[key] = value
+        self._size += new
+        return new
+
+    def remove(self, filter: str, key: Hashable) -> bool:
+        """Removes `key` from `filter`; returns whether it was there."""
+        path: list[tuple[_FilterNode[V], str]] = []
+        node = self._root
+        for level in filter.split("/"):
+            path.append((node, level))
+            child = node.children.get(level)
+            if child is None:
+                return False
+            node = child
+        if key not in node.values:
+            return False
+        del node.values[key]
+        self._size -= 1
+        while path and not node.values and not node.children:
+            node, level = path.pop()
+            del node.children[level]
+        return True
+
+    def match(self, topic: str) -> list[V]:
+        """The values of all filters that match `topic`; a key with two such filters is in twice."""
+        found: list[V] = []
+        # The nodes reached so far. A node has one parent, so none can be reached twice.
+        nodes = [self._root]
+        wild = topic[:1] != "$"  # [MQTT-4.7.2-1]: no wildcard for the first level of a $ topic.
+        for level in topic.split("/"):
+            reached: list[_FilterNode[V]] = []
+            for node in nodes:
+                children = node.children
+                child = children.get(level)
+                if child is not None:
+                    reached.append(child)
+                if wild:
+                    child = children.get("+")
+                    if child is not None:
+                        reached.append(child)
+                    child = children.get("#")
+                    if child is not None:
+                        found.extend(child.values.values())
+            if not reached:
+                return found
+            nodes = reached
+            wild = True
+        for node in nodes:
+            found.extend(node.values.values())
+            child = node.children.get("#")  # `a/#` matches `a` too.
+            if child is not None:
+                found.extend(child.values.values())
+        return found
+
+
+class _TopicNode(Generic[V]):
+    __slots__ = ("children", "entry")
+
+    def __init__(self) -> None:
+        self.children: dict[str, _TopicNode[V]] = {}
+        self.entry: tuple[str, V] | None = None
+
+
+class TopicTree(Generic[V]):
+    """Topics, each with one value, found by a filter: what retained messages need.
+
+    Topics and filters are valid ones.
+    """
+
+    def __init__(self) -> None:
+        self._root: _TopicNode[V] = _TopicNode()
+        self._size = 0
+
+    def __len__(self) -> int:
+        """How many topics have a value."""
+        return self._size
+
+    def set(self, topic: str, value: V) -> None:
+        """Sets the value of `topic`."""
+        node = self._root
+        for level in topic.split("/"):
+            child = node.children.get(level)
+            if child is None:
+                child = node.children[level] = _TopicNode()
+            node = child
+        self._size += node.entry is None
+        node.entry = (topic, value)
+
+    def get(self, topic: str) -> V | None:
+        """The value of `topic`, or None."""
+        node = self._root
+        for level in topic.split("/"):
+            child = node.children.get(level)
+            if child is None:
+                return None
+            node = child
+        return node.entry[1] if node.entry is not None else None
+
+    def delete(self, topic: str) -> bool:
+        """Forgets `topic`; returns whether it had a value."""
+        path: list[tuple[_TopicNode[V], str]] = []
+        node = self._root
+        for level in topic.split("/"):
+            path.append((node, level))
+            child = node.children.get(level)
+            if child is None:
+                return False
+            node = child
+        if node.entry is None:
+            return False
+        node.entry = None
+        self._size -= 1
+        while path and node.entry is None and not node.children:
+            node, level = path.pop()
+            del node.children[level]
+        return True
+
+    def find(self, filter: str) -> Iterator[tuple[str, V]]:
+        """The topics that match `filter` with their values, one at a time as they are asked for.
+
+        The tree may change between two of them; it is then open whether what was set or deleted
+        meanwhile is in the rest.
+        """
+        levels = filter.split("/")
+        # What is still to be looked at: a node, and how many levels of the filter lead to it.
+        stack = [(self._root, 0)]
+        while stack:
+            node, depth = stack.pop()
+            if depth == len(levels):
+                if node.entry is not None:
+                    yield node.entry
+                continue
+            level = levels[depth]
+            if level == "#":
+                if node.entry is not None:
+                    yield node.entry
+                next_depth = depth  # `#` is good for all levels below.
+            elif level == "+":
+                next_depth = depth + 1
+            else:
+                child = node.children.get(level)
+                if child is not None:
+                    stack.append((child, depth + 1))
+                continue
+            hide_dollar = node is self._root  # [MQTT-4.7.2-1]
+            for name, child in reversed(node.children.items()):
+                if not (hide_dollar and name.startswith("$")):
+                    stack.append((child, next_depth))

@@ -1,0 +1,145 @@
+"""Whole arrays and wide strings, read and written at once: what generated code calls.
+
+As generated code does, these take only what is exactly right, and raise anything else than a
+ConversionError when it is not.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Callable
+from math import nan
+from typing import Any
+
+import pybase64
+
+from appliance.ros.definitions import PRIMITIVES, Primitive
+
+HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian, no options
+
+# From so many numbers on, numpy's detour is shorter than making Python numbers.
+_WORTH_NUMPY = 32
+
+_BOOLS = frozenset({bool})
+_INTEGERS = frozenset({int})
+_NUMBERS = frozenset({int, float})
+_NUMBERS_AND_NULL = frozenset({int, float, type(None)})
+
+
+def _octets(value: Any) -> bytes:
+    """uint8[] and its like: base64 in JSON, bytes from `careful.accept`."""
+    if value.__class__ is str:
+        return pybase64.b64decode(value, validate=True)
+    if value.__class__ is bytes:
+        return bytes(value)
+    raise TypeError
+
+
+def _write_wide_string(value: str) -> bytes:
+    units = value.encode("utf-16-le")
+    return struct.pack(f"<{len(units) // 2}I", *memoryview(units).cast("H"))
+
+
+def _read_wide_string(b: bytes, q: int, count: int) -> str:
+    if q + count * 4 > len(b):
+        raise IndexError
+    units = struct.unpack_from(f"<{count}I", b, q)
+    return struct.pack(f"<{count}H", *units).decode("utf-16-le")
+
+
+def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
+    """The function that writes a whole list of numbers."""
+    code, pack = primitive.code, struct.pack
+
+    def write_floats(values: Any) -> bytes:
+        if values.__class__ is not list:
+            raise TypeError
+        try:
+            # conjugate gives a float as it is, and refuses all else: the cheapest test there is.
+            return pack(f"<{len(values)}{code}", *map(float.conjugate, values))
+        except TypeError:
+            if not _NUMBERS_AND_NULL.issuperset(map(type, values)):
+                raise
+        return pack(f"<{len(values)}{code}", *[nan if x is None else x for x in values])
+
+    def write_exactly(values: Any) -> bytes:
+        if values.__class__ is not list or not types.issuperset(map(type, values)):
+            raise TypeError
+        return pack(f"<{len(values)}{code}", *values)
+
+    types = _BOOLS if primitive.name == "bool" else _INTEGERS
+    return write_floats if primitive.is_float else write_exactly
+
+
+def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int], Any]:
+    """The function that reads `count` numbers at `q`, all checked to be there."""
+    code, size, unpack_from = primitive.code, primitive.size, struct.unpack_from
+
+    def read_octets(b: bytes, q: int, count: int) -> str:
+        end = q + count
+        if end > len(b):
+            raise IndexError
+        return pybase64.b64encode_as_string(b[q:end])
+
+    def read_list(b: bytes, q: int, count: int) -> list[Any]:
+        if q + count * size > len(b):
+            raise IndexError
+        return list(unpack_from(f"<{count}{code}", b, q))
+
+    if primitive.is_octet:
+        return read_octets
+    frombuffer = _frombuffer() if with_numpy and primitive.name != "bool" else None
+    if frombuffer is None:
+        return read_list
+
+    def read_array(b: bytes, q: int, count: int) -> Any:
+        if count < least:
+            return read_list(b, q, count)
+        end = q + count * size
+        if end > len(b):
+            raise IndexError
+        # A slice, because the numbers in it are aligned in memory as well.
+        return frombuffer(b[q:end], code)
+
+    least = 1 if code == "f" else _WORTH_NUMPY
+    return read_array
+
+
+def _frombuffer() -> Callable[[bytes, str], Any] | None:
+    """numpy's, where there is numpy (every rclpy brings it), on a little-endian machine."""
+    if sys.byteorder != "little":
+        return None
+    try:
+        from numpy import frombuffer
+    except ImportError:
+        return None
+    return frombuffer
+
+
+def _readers(with_numpy: bool) -> dict[str, Any]:
+    return {f"read_{p.name}": _reader(p, with_numpy) for p in PRIMITIVES.values()}
+
+
+def readers(with_numpy: bool) -> dict[str, Any]:
+    """What decoders call. With numpy, long arrays come as numpy's, else as lists."""
+    return {
+        "LITTLE_ENDIAN": HEADER[:2],
+        "base64": pybase64.b64encode_as_string,
+        "read_wide_string": _read_wide_string,
+        **{f"read_{p.name}": _reader(p, with_numpy) for p in PRIMITIVES.values()},
+    }
+
+
+# What encoders call.
+WRITERS: dict[str, Any] = {
+    "HEADER": HEADER,
+    "ZEROS": bytes(8),
+    "BOOLS": _BOOLS,
+    "INTEGERS": _INTEGERS,
+    "NUMBERS": _NUMBERS,
+    "join": b"".join,
+    "octets": _octets,
+    "write_wide_string": _write_wide_string,
+    **{f"write_{p.name}": _writer(p) for p in PRIMITIVES.values() if not p.is_octet},
+}

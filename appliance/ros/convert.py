@@ -1,0 +1,172 @@
+"""ROS messages as MQTT payloads: JSON and text, to and from ROS's own serialized bytes (CDR).
+
+    converters = Converters(load_description)
+    twist = converters.get("geometry_msgs/msg/Twist")
+    twist.to_json(cdr)      # b'{"linear":{"x":0.5,...
+    twist.from_json(b'{"linear": {"x": 0.5}}')     # CDR
+
+No message object is made on the way: code generated once a type (generate.py) goes straight from
+one to the other, and the slow way (careful.py) takes over for what is not exactly as expected.
+The encoding `cdr` needs nothing from here.
+
+JSON, beyond what the word says:
+
+- uint8[], byte[] and char[] are base64; on input a list of numbers will do;
+- NaN and infinities are null; null is NaN on input, so an infinity comes back as NaN;
+- 64-bit integers are integers, which JavaScript reads as the nearest double;
+- a missing field takes its default; an unknown one is an error; of duplicates the last counts;
+- a builtin_interfaces/Time may be given as "now".
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from typing import Any
+
+import orjson
+
+from appliance.ros.careful import ConversionError, accept, decode
+from appliance.ros.definitions import Primitive, String, TypeDescription, WideString
+from appliance.ros.generate import MISFIT, generate
+
+__all__ = ["ConversionError", "Converter", "Converters", "compile_converter"]
+
+# orjson writes a float32 of a numpy array with the fewest digits that tell it from its neighbours.
+# Readers of JSON take digits for a double, and a double for a float32 once more: of all float32
+# there is one that this leads to its neighbour (each of the 2**31 was tried).
+_TWICE_ROUNDED = b"7.038531e-26"
+
+_INTEGER = re.compile(r"\s*([+-]?[0-9]{1,20})\s*\Z", re.ASCII)
+_FLOAT = re.compile(
+    r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|[+-]?inf(?:inity)?|nan)\s*\Z",
+    re.ASCII | re.IGNORECASE,
+)
+_BOOLS = {"true": True, "false": False}
+
+
+class Converter:
+    """Converts messages of one type. All methods raise ConversionError and nothing else.
+
+    `has_text` tells whether the type can go as text; `source` is the generated code, for reading.
+    """
+
+    def __init__(self, description: TypeDescription, now: Callable[[], int]) -> None:
+        self.description = description
+        self._now = now
+        self._decode, self._decode_plain, self._encode, self.source = generate(description)
+        self._text_type = _text_type(description)
+
+    @property
+    def has_text(self) -> bool:
+        return self._text_type is not None
+
+    def to_json(self, cdr: bytes) -> bytes:
+        """The JSON of a serialized message, in either byte order."""
+        try:
+            payload = orjson.dumps(self._decode(cdr), option=orjson.OPT_SERIALIZE_NUMPY)
+        except MISFIT:
+            return orjson.dumps(decode(self.description, cdr))
+        if _TWICE_ROUNDED in payload:
+            return orjson.dumps(self._decode_plain(cdr))
+        return payload
+
+    def from_json(self, payload: bytes) -> bytes:
+        """The serialized message, in little endian, of its JSON."""
+        try:
+            value = orjson.loads(payload)
+        except orjson.JSONDecodeError as error:
+            raise ConversionError("", f"not JSON: {error}") from None
+        try:
+            return self._encode(value)
+        except MISFIT:
+            return self.from_dict(value)
+
+    def to_dict(self, cdr: bytes) -> dict[str, Any]:
+        """What `to_json` writes, as Python values: lists, floats (NaN among them), base64."""
+        try:
+            return self._decode_plain(cdr)
+        except MISFIT:
+            return decode(self.description, cdr)
+
+    def from_dict(self, value: object) -> bytes:
+        """The serialized message of Python values, by the same rules as JSON; bytes for uint8[]
+        will do too."""
+        return self._encode(accept(self.description, value, self._now))
+
+    def to_text(self, cdr: bytes) -> bytes:
+        """The text of a message whose only field is `data`: true and false, the digits of a
+        number (nan, inf, -inf), the characters of a string."""
+        self._text_field()
+        data = self.to_dict(cdr)["data"]
+        if isinstance(data, bool):
+            return b"true" if data else b"false"
+        return str(data).encode()
+
+    def from_text(self, payload: bytes) -> bytes:
+        """The serialized message of its text. White space around numbers and bools is ignored."""
+        type_ = self._text_field()
+        try:
+            text = payload.decode()
+        except UnicodeDecodeError:
+            raise ConversionError("data", "not UTF-8") from None
+        return self.from_dict({"data": _parse(type_, text)})
+
+    def _text_field(self) -> Primitive | String | WideString:
+        if self._text_type is None:
+            raise ConversionError(
+                "",
+                f"{self.description.name} cannot go as text: only a type whose one field is "
+                "`data`, a number, bool or string",
+            )
+        return self._text_type
+
+
+def compile_converter(
+    description: TypeDescription, now: Callable[[], int] = time.time_ns
+) -> Converter:
+    """The converter of a type. `now` gives nanoseconds since the epoch, for `"now"`."""
+    return Converter(description, now)
+
+
+class Converters:
+    """A converter a type, compiled when it is first asked for.
+
+    `load` gives the description of a type's name, or raises; so does `get` then.
+    """
+
+    def __init__(
+        self, load: Callable[[str], TypeDescription], now: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._load = load
+        self._now = now
+        self._converters: dict[str, Converter] = {}
+
+    def get(self, type_name: str) -> Converter:
+        """The converter of a type by its name, `std_msgs/msg/String`."""
+        converter = self._converters.get(type_name)
+        if converter is None:
+            # Two threads may both come here: one converter is then as good as the other.
+            converter = compile_converter(self._load(type_name), self._now)
+            self._converters[type_name] = converter
+        return converter
+
+
+def _text_type(description: TypeDescription) -> Primitive | String | WideString | None:
+    if len(description.fields) != 1 or description.fields[0].name != "data":
+        return None
+    type_ = description.fields[0].type
+    return type_ if isinstance(type_, (Primitive, String, WideString)) else None
+
+
+def _parse(type_: Primitive | String | WideString, text: str) -> object:
+    """The value of a text; what is not one is left as it is, for `accept` to refuse."""
+    if not isinstance(type_, Primitive):
+        return text
+    if type_.name == "bool":
+        return _BOOLS.get(text.strip(), text)
+    match = (_FLOAT if type_.is_float else _INTEGER).match(text)
+    if match is None:
+        return text
+    return float(match.group(1)) if type_.is_float else int(match.group(1))

@@ -1,0 +1,244 @@
+"""What a message type is made of, in words of our own.
+
+The converters work from a `TypeDescription`; where it comes from is the bus adapter's business.
+`describe` makes one from a ROS 2 message class (Humble, Jazzy, Kilted), of which it touches only
+`SLOT_TYPES`, `get_fields_and_field_types()` and a fresh instance for the fields' defaults.
+ROS 1, or a test, writes descriptions directly.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+# Names end up in generated source (generate.py), so nothing but an identifier may pass.
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+_TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv|action)/)?([A-Za-z]\w*)\Z", re.ASCII)
+
+TIME = "builtin_interfaces/msg/Time"
+
+
+class UnknownTypeError(LookupError):
+    """No such message type is installed here, or it has a field that ROS itself cannot carry."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A bool, number, byte or char: `code` is its `struct` code, `size` its bytes in CDR."""
+
+    name: str
+    code: str
+    size: int
+
+    @property
+    def is_octet(self) -> bool:
+        """uint8, byte and char: arrays of them are base64 in JSON."""
+        return self.code == "B"
+
+    @property
+    def is_float(self) -> bool:
+        return self.code in "fd"
+
+
+PRIMITIVES = {
+    name: Primitive(name, code, size)
+    for name, code, size in (
+        ("bool", "?", 1),
+        ("byte", "B", 1),
+        ("char", "B", 1),
+        ("int8", "b", 1),
+        ("uint8", "B", 1),
+        ("int16", "h", 2),
+        ("uint16", "H", 2),
+        ("int32", "i", 4),
+        ("uint32", "I", 4),
+        ("int64", "q", 8),
+        ("uint64", "Q", 8),
+        ("float32", "f", 4),
+        ("float64", "d", 8),
+    )
+}
+
+
+@dataclass(frozen=True)
+class String:
+    """UTF-8; `bound` counts bytes, as IDL does."""
+
+    bound: int | None = None
+
+
+@dataclass(frozen=True)
+class WideString:
+    """UTF-16; `bound` counts its 16-bit units."""
+
+    bound: int | None = None
+
+
+@dataclass(frozen=True)
+class Array:
+    """Exactly `length` items."""
+
+    item: ItemType
+    length: int
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Any number of items, at most `bound`."""
+
+    item: ItemType
+    bound: int | None = None
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field. `default` is what a message has when it says nothing: None for the type's zero,
+    else a bool, number, str, list of these, or bytes for arrays of uint8, byte and char."""
+
+    name: str
+    type: FieldType
+    default: Any = None
+
+    def __post_init__(self) -> None:
+        if not _FIELD_NAME.match(self.name):
+            raise UnknownTypeError(f"{self.name!r} cannot be the name of a field")
+
+
+@dataclass(frozen=True)
+class TypeDescription:
+    """A message type: its full name (`geometry_msgs/msg/Twist`) and its fields in wire order."""
+
+    name: str
+    fields: tuple[Field, ...]
+
+
+ItemType = Primitive | String | WideString | TypeDescription
+FieldType = ItemType | Array | Sequence
+
+
+def least_size(type_: FieldType) -> int:
+    """The fewest bytes that a value takes in CDR, padding not counted: at least 1.
+
+    A count in a hostile message is held against it before anything is allocated.
+    """
+    if isinstance(type_, Primitive):
+        return type_.size
+    if isinstance(type_, Array):
+        return type_.length * least_size(type_.item)
+    if isinstance(type_, TypeDescription):
+        # An empty structure is one byte on the wire.
+        return sum(least_size(field.type) for field in type_.fields) or 1
+    return 4
+
+
+# --- ROS 2 message classes ------------------------------------------------------------------
+
+# The names of IDL's basic types; ROS 2's `char` is uint8 already when it arrives here.
+_BASIC_TYPES = {
+    "boolean": "bool",
+    "octet": "byte",
+    "float": "float32",
+    "double": "float64",
+    "short": "int16",
+    "unsigned short": "uint16",
+    "long": "int32",
+    "unsigned long": "uint32",
+    "long long": "int64",
+    "unsigned long long": "uint64",
+}
+
+
+def describe(message_class: type, load: Callable[[str], type]) -> TypeDescription:
+    """The description of a ROS 2 message class; `load` gives the classes of nested types.
+
+    Raises UnknownTypeError for a field of a type that rclpy has no support for (wchar, long
+    double), and whatever `load` raises.
+    """
+    package, kind = message_class.__module__.split(".")[:2]
+    name = f"{package}/{kind}/{message_class.__name__}"
+    names = message_class.get_fields_and_field_types()  # type: ignore[attr-defined]
+    example = message_class()
+    fields = []
+    slots = message_class.SLOT_TYPES  # type: ignore[attr-defined]
+    for field_name, slot in zip(names, slots, strict=True):
+        type_ = _field_type(slot, load, f"{name}.{field_name}")
+        fields.append(Field(field_name, type_, _plain(type_, getattr(example, field_name))))
+    return TypeDescription(name, tuple(fields))
+
+
+def _field_type(slot: Any, load: Callable[[str], type], where: str) -> FieldType:
+    """A `rosidl_parser.definition` type in our words. It is told by its class's name, so that
+    rosidl_parser need not be imported."""
+    kind = type(slot).__name__
+    if kind == "Array":
+        return Array(_item_type(slot.value_type, load, where), slot.size)
+    if kind == "BoundedSequence":
+        return Sequence(_item_type(slot.value_type, load, where), slot.maximum_size)
+    if kind == "UnboundedSequence":
+        return Sequence(_item_type(slot.value_type, load, where))
+    return _item_type(slot, load, where)
+
+
+def _item_type(slot: Any, load: Callable[[str], type], where: str) -> ItemType:
+    kind = type(slot).__name__
+    if kind == "BasicType":
+        primitive = PRIMITIVES.get(_BASIC_TYPES.get(slot.typename, slot.typename))
+        if primitive is None:
+            raise UnknownTypeError(f"{where} has the type {slot.typename}, which is not supported")
+        return primitive
+    if kind == "NamespacedType":
+        return describe(load("/".join(slot.namespaced_name())), load)
+    if kind in ("UnboundedString", "BoundedString"):
+        return String(getattr(slot, "maximum_size", None))
+    if kind in ("UnboundedWString", "BoundedWString"):
+        return WideString(getattr(slot, "maximum_size", None))
+    raise UnknownTypeError(f"{where} has the type {kind}, which is not supported")
+
+
+def _plain(type_: FieldType, value: Any) -> Any:
+    """A default as `Field.default` has it, from what rclpy keeps it in."""
+    if isinstance(type_, (Array, Sequence)):
+        if isinstance(type_.item, TypeDescription):
+            return None
+        if isinstance(type_.item, Primitive) and type_.item.is_octet:
+            # A list of bytes of length one (byte), or an array of one or the other kind (uint8).
+            return b"".join(value) if isinstance(value, list) else value.tobytes()
+        return value if isinstance(value, list) else value.tolist()
+    if isinstance(type_, TypeDescription):
+        return None
+    if isinstance(type_, Primitive) and type_.is_octet and not isinstance(value, int):
+        return ord(value)
+    return value
+
+
+def import_message(name: str) -> type:
+    """The message class of a name: `std_msgs/msg/String`, `std_msgs/String`, and the parts of
+    services and actions, `std_srvs/srv/Trigger_Request`, `pkg/action/Fibonacci_Goal`.
+
+    Raises UnknownTypeError saying what is missing.
+    """
+    match = _TYPE_NAME.match(name)
+    if match is None:
+        raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
+    package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
+    try:
+        module = import_module(f"{package}.{kind}")
+    except ImportError as error:
+        raise UnknownTypeError(f"no {name}: the package {package} is not installed here") from error
+    found = getattr(module, type_name, None)
+    if found is None and "_" in type_name:
+        # The packages do not export an action's Goal, Result and Feedback: beside their action.
+        owner = getattr(module, type_name.partition("_")[0], None)
+        found = getattr(sys.modules.get(getattr(owner, "__module__", "")), type_name, None)
+    if not isinstance(found, type) or not hasattr(found, "SLOT_TYPES"):
+        raise UnknownTypeError(f"no {name}: the package {package} has no such {kind} type")
+    return found
+
+
+def load_description(name: str) -> TypeDescription:
+    """The description of an installed ROS 2 type. Raises UnknownTypeError."""
+    return describe(import_message(name), import_message)

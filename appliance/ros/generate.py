@@ -1,0 +1,608 @@
+"""Python source for one message type: `decode` and `encode`, straight between CDR and values.
+
+What can be known beforehand is worked out here, once a type: neighbouring numbers are read and
+written by one precompiled `struct.Struct` (a *run*), nested messages are laid flat, and padding is
+part of the run. CDR aligns a number to its size, counted from the end of the four bytes of header.
+While the position modulo 8 is known, a run has one layout; after a string it has up to eight, and
+the position picks one of them.
+
+Generated code never takes what careful.py would refuse. It need not take all else: it raises one of
+`MISFIT`, and the caller goes the careful way, which mends or names what was wrong.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from appliance.ros.arrays import HEADER, WRITERS, readers
+from appliance.ros.definitions import (
+    PRIMITIVES,
+    Array,
+    FieldType,
+    ItemType,
+    Primitive,
+    Sequence,
+    String,
+    TypeDescription,
+    WideString,
+    least_size,
+)
+
+# What generated code raises when a message is not exactly as expected.
+MISFIT = (
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+    struct.error,
+)
+
+# Longer arrays are not worth a name for each of their items.
+_LONGEST_ROW = 64
+
+_COUNT = PRIMITIVES["uint32"]
+_PADDING = Primitive("padding", "x", 1)
+
+
+class Generated(NamedTuple):
+    """The two functions of a type, and their source. `decode_plain` gives lists where `decode`
+    gives numpy arrays, which orjson writes faster and, of float32, in half the digits."""
+
+    decode: Callable[[bytes], dict[str, Any]]
+    decode_plain: Callable[[bytes], dict[str, Any]]
+    encode: Callable[[Any], bytes]
+    source: str
+
+
+def generate(description: TypeDescription) -> Generated:
+    """Generates and compiles the converters of a type."""
+    decoder, encoder = _Decoder(), _Encoder()
+    source = decoder.function(description) + "\n\n" + encoder.function(description)
+    code = compile(source, f"<converters of {description.name}>", "exec")
+    fast = {**decoder.constants, **readers(with_numpy=True)}
+    plain = {**decoder.constants, **readers(with_numpy=False)}
+    encoding = {**encoder.constants, **WRITERS}
+    for namespace in (fast, plain, encoding):
+        exec(code, namespace)
+    return Generated(fast["decode"], plain["decode"], encoding["encode"], source)
+
+
+# --- where we are ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1)."""
+
+    modulus: int
+    rest: int
+
+    def align(self, size: int) -> Phase:
+        if size > self.modulus:
+            return Phase(size, 0)
+        return self.advance(-self.rest % size)
+
+    def advance(self, count: int) -> Phase:
+        return Phase(self.modulus, (self.rest + count) % self.modulus)
+
+    def join(self, other: Phase) -> Phase:
+        """What is known when it may be this or the other."""
+        modulus = min(self.modulus, other.modulus)
+        while self.rest % modulus != other.rest % modulus:
+            modulus //= 2
+        return Phase(modulus, self.rest % modulus)
+
+
+_ANYWHERE = Phase(1, 0)
+
+
+def _after(type_: FieldType, phase: Phase) -> Phase:
+    """What is known of the position behind a value, given what is known before it."""
+    if isinstance(type_, Primitive):
+        return phase.align(type_.size).advance(type_.size)
+    if isinstance(type_, String):
+        return _ANYWHERE
+    if isinstance(type_, WideString):
+        return Phase(4, 0)
+    if isinstance(type_, TypeDescription):
+        for field in type_.fields:
+            phase = _after(field.type, phase)
+        return phase if type_.fields else phase.advance(1)
+    if isinstance(type_, Sequence):
+        phase = phase.align(4).advance(4)
+        return phase.join(_after(type_.item, _loop_phase(type_.item, phase)))
+    if isinstance(type_.item, Primitive):
+        return phase.align(type_.item.size).advance(type_.item.size * type_.length)
+    return _after(type_.item, _loop_phase(type_.item, phase))
+
+
+def _loop_phase(item: FieldType, phase: Phase) -> Phase:
+    """What is known at the beginning of every round of a loop over items."""
+    phase = phase.align(_first_size(item))
+    while (joined := phase.join(_after(item, phase))) != phase:
+        phase = joined
+    return phase
+
+
+def _first_size(type_: FieldType) -> int:
+    """What the very first number of a value is aligned to."""
+    if isinstance(type_, Primitive):
+        return type_.size
+    if isinstance(type_, Array):
+        return _first_size(type_.item)
+    if isinstance(type_, TypeDescription):
+        return _first_size(type_.fields[0].type) if type_.fields else 1
+    return 4
+
+
+def _is_row(type_: FieldType) -> bool:
+    """An array that is part of a run. Not float32: numpy writes these with half the digits."""
+    return (
+        isinstance(type_, Array)
+        and isinstance(type_.item, Primitive)
+        and (type_.item.is_octet or (type_.length <= _LONGEST_ROW and type_.item.code != "f"))
+    )
+
+
+def _is_run(type_: FieldType) -> bool:
+    """The whole value is part of a run."""
+    if isinstance(type_, TypeDescription):
+        return all(_is_run(field.type) for field in type_.fields)
+    return isinstance(type_, Primitive) or _is_row(type_)
+
+
+def _run_size(type_: FieldType, rest: int) -> int:
+    """The bytes of a value that is part of a run, from a position that is `rest` modulo 8."""
+    if isinstance(type_, TypeDescription):
+        size = 0 if type_.fields else 1
+        for field in type_.fields:
+            size += _run_size(field.type, rest + size)
+        return size
+    item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
+    assert isinstance(item, Primitive)
+    return -rest % item.size + count * item.size
+
+
+# --- the two generators ---------------------------------------------------------------------
+
+
+class _Part(NamedTuple):
+    """A part of a run: `length` numbers, or as many bytes. `text` is the names that they are read
+    into, or the expression that is written; empty for padding."""
+
+    primitive: Primitive
+    length: int
+    text: str
+
+    @property
+    def code(self) -> str:
+        if self.primitive.is_octet and self.length > 1:
+            return f"{self.length}s"
+        return self.primitive.code * self.length
+
+    @property
+    def size(self) -> int:
+        return self.primitive.size * self.length
+
+
+class _Generator:
+    """What reading and writing have in common: lines, names, the run and the position.
+
+    The position is an index into the message with its header: the number `_offset`, plus the
+    variable `q` once something of unknown length has been passed, plus `_terms`, expressions that
+    have yet to be added to `q`.
+    """
+
+    def __init__(self) -> None:
+        self.constants: dict[str, Any] = {}
+        self._lines: list[str] = []
+        self._indent = 1
+        self._names = 0
+        self._run: list[_Part] = []
+        self._phase = Phase(8, 0)
+        self._variable = False
+        self._offset = len(HEADER)
+        self._terms: list[str] = []
+
+    def _line(self, text: str) -> None:
+        self._lines.append("    " * self._indent + text)
+
+    @contextmanager
+    def _block(self, head: str) -> Iterator[None]:
+        self._line(head)
+        self._indent += 1
+        yield
+        self._indent -= 1
+
+    def _name(self, hint: str) -> str:
+        self._names += 1
+        return f"{hint}_{self._names}"
+
+    def _settle(self) -> None:
+        """Makes `q` the position."""
+        terms = [*self._terms]
+        if self._offset:
+            terms.append(str(self._offset))
+        if terms:
+            self._line(f"q {'+=' if self._variable else '='} {' + '.join(terms)}")
+        self._variable, self._offset, self._terms = True, 0, []
+
+    def _position(self) -> str:
+        """An expression for the position: `16`, `q`, `q + 8`."""
+        if self._terms:
+            self._settle()
+        if not self._variable:
+            return str(self._offset)
+        return f"q + {self._offset}" if self._offset else "q"
+
+    def _end_run(self, method: str) -> tuple[str, str]:
+        """Defines the constant that reads or writes the run, and passes it: the constant's name,
+        and what picks the layout of a run that has several, else nothing."""
+        layouts: dict[int, struct.Struct] = {}
+        for rest in range(self._phase.rest, 8, self._phase.modulus):
+            position, codes = rest, "<"
+            for part in self._run:
+                padding = -position % part.primitive.size
+                codes += "x" * padding + part.code
+                position += padding + part.size
+            # The header makes an index four more than the position that is aligned.
+            layouts[(rest + len(HEADER)) % 8] = struct.Struct(codes)
+        for part in self._run:
+            self._phase = self._phase.align(part.primitive.size).advance(part.size)
+        self._run = []
+        name = self._name("R")
+        first, *others = layouts.values()
+        if all(other.format == first.format for other in others):
+            self.constants[name] = getattr(first, method)
+            self._offset += first.size
+            return name, ""
+        self._settle()
+        unused = struct.Struct("<")
+        every = [layouts.get(index, unused) for index in range(8)]
+        self.constants[name] = tuple(getattr(layout, method) for layout in every)
+        self.constants[f"SIZE_{name}"] = tuple(layout.size for layout in every)
+        phase = self._name("phase")
+        self._line(f"{phase} = q & 7")
+        self._terms.append(f"SIZE_{name}[{phase}]")
+        return name, f"[{phase}]"
+
+    def _is_aligned(self, size: int) -> bool:
+        return self._phase.modulus >= size and self._phase.rest % size == 0
+
+    def _stride(self, item: FieldType) -> int | None:
+        """The bytes from one item to the next, if all of them have the same layout, with the
+        first of them where we are."""
+        phase = _loop_phase(item, self._phase)
+        if not _is_run(item) or _after(item, phase) != phase:
+            return None
+        sizes = {_run_size(item, rest) for rest in range(phase.rest, 8, phase.modulus)}
+        return sizes.pop() if len(sizes) == 1 else None
+
+
+class _Decoder(_Generator):
+    """Writes `decode(b)`: the value of the message `b`."""
+
+    def function(self, description: TypeDescription) -> str:
+        self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
+        value = self._value(description, "message")
+        self._flush()
+        self._line(f"return {value}")
+        return "\n".join(["def decode(b):", *self._lines, ""])
+
+    def _value(self, type_: FieldType, hint: str) -> str:
+        """The expression for a value, good after the next flush, and lines before it."""
+        if isinstance(type_, Primitive):
+            return self._number(type_, hint)
+        if isinstance(type_, TypeDescription):
+            return self._structure(type_)
+        if isinstance(type_, String):
+            return self._string(hint)
+        if isinstance(type_, WideString):
+            return self._wide_string(hint)
+        if isinstance(type_, Array):
+            return self._array(type_, hint)
+        return self._sequence(type_, hint)
+
+    def _structure(self, description: TypeDescription) -> str:
+        if not description.fields:
+            self._run.append(_Part(_PADDING, 1, ""))
+        fields = description.fields
+        return "{" + ", ".join(f"{f.name!r}: {self._value(f.type, f.name)}" for f in fields) + "}"
+
+    def _number(self, primitive: Primitive, hint: str) -> str:
+        name = self._name(hint)
+        self._run.append(_Part(primitive, 1, name))
+        return name
+
+    def _flush(self) -> None:
+        if not self._run:
+            return
+        names = [part.text for part in self._run if part.text]
+        target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
+        position = self._position()
+        name, layout = self._end_run("unpack_from")
+        self._line(f"{target}{name}{layout}(b, {'q' if layout else position})")
+
+    def _string(self, hint: str) -> str:
+        size = self._number(_COUNT, f"{hint}_size")
+        self._flush()
+        self._settle()
+        name, end = self._name(hint), self._name("end")
+        self._line(f"{end} = q + {size} - 1")
+        # Behind the message this is an IndexError. A string without even its NUL passes: the byte
+        # looked at is then the last of its size, which is 0.
+        self._line(f"if b[{end}]: raise ValueError")
+        self._line(f"{name} = b[q:{end}].decode()")
+        self._terms.append(size)
+        self._phase = _ANYWHERE
+        return name
+
+    def _wide_string(self, hint: str) -> str:
+        count = self._number(_COUNT, f"{hint}_count")
+        self._flush()
+        name = self._name(hint)
+        self._line(f"{name} = read_wide_string(b, {self._position()}, {count})")
+        self._terms.append(f"{count} * 4")
+        self._phase = Phase(4, 0)
+        return name
+
+    def _array(self, array: Array, hint: str) -> str:
+        item, length = array.item, array.length
+        if not isinstance(item, Primitive):
+            self._flush()
+            return self._loop(item, str(length), hint)
+        if item.is_octet:
+            name = self._name(hint)
+            self._run.append(_Part(item, length, name))
+            return f"base64({name})" if length > 1 else f"base64(bytes([{name}]))"
+        if _is_row(array):
+            return "[" + ", ".join(self._number(item, hint) for _ in range(length)) + "]"
+        self._flush()
+        return self._numbers(item, str(length), hint)
+
+    def _sequence(self, sequence: Sequence, hint: str) -> str:
+        item = sequence.item
+        count = self._number(_COUNT, f"{hint}_count")
+        self._flush()
+        if sequence.bound is not None:
+            self._line(f"if {count} > {sequence.bound}: raise ValueError")
+        empty = self._phase
+        if isinstance(item, Primitive):
+            value = self._numbers(item, count, hint)
+        else:
+            value = self._loop(item, count, hint)
+        self._phase = self._phase.join(empty)
+        return value
+
+    def _align(self, size: int, count: str) -> None:
+        """Passes the padding before items, of which there may be none."""
+        if not self._is_aligned(size):
+            self._settle()
+            self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) % {size}")
+            self._phase = self._phase.align(size)
+
+    def _numbers(self, primitive: Primitive, count: str, hint: str) -> str:
+        self._align(primitive.size, count)
+        name = self._name(hint)
+        self._line(f"{name} = read_{primitive.name}(b, {self._position()}, {count})")
+        self._terms.append(f"{count} * {primitive.size}")
+        self._phase = _loop_phase(primitive, self._phase)
+        return name
+
+    def _loop(self, item: ItemType, count: str, hint: str) -> str:
+        self._align(_first_size(item), count)
+        items = self._name(hint)
+        self._settle()
+        stride = self._stride(item)
+        self._phase = _loop_phase(item, self._phase)
+        if stride is not None:
+            value = self._value(item, hint)
+            names = "".join(f"{part.text}, " for part in self._run if part.text)
+            name, _ = self._end_run("iter_unpack")
+            end = self._name("end")
+            self._line(f"{end} = q + {count} * {stride}")
+            self._line(f"if {end} > len(b): raise ValueError")
+            self._line(f"{items} = [{value} for ({names}) in {name}(b[q:{end}])]")
+            self._line(f"q = {end}")
+            self._offset = 0
+            return items
+        if not count.isdigit():
+            # Looked at before anything is allocated.
+            self._line(f"if {count} * {least_size(item)} > len(b): raise ValueError")
+        self._line(f"{items} = []")
+        with self._block(f"for _ in range({count}):"):
+            value = self._value(item, hint)
+            self._flush()
+            self._line(f"{items}.append({value})")
+            self._settle()
+        return items
+
+
+class _Encoder(_Generator):
+    """Writes `encode(message)`: the message in CDR, little endian."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # The header is the beginning of the first run.
+        self._run = [_Part(PRIMITIVES["uint8"], len(HEADER), "HEADER")]
+        self._phase = Phase(8, 8 - len(HEADER))
+        self._offset = 0
+        self._pieces: list[str] = []  # expressions for bytes
+        self._spilled = False
+
+    def function(self, description: TypeDescription) -> str:
+        self._value(description, "message", "message")
+        self._flush()
+        if self._spilled:
+            self._spill()
+            self._line("return join(w)")
+        elif len(self._pieces) == 1:
+            self._line(f"return {self._pieces[0]}")
+        else:
+            self._line(f"return join(({', '.join(self._pieces)}))")
+        return "\n".join(["def encode(message):", *self._lines, ""])
+
+    def _value(self, type_: FieldType, source: str, hint: str) -> None:
+        """Checks and writes what the expression `source` gives."""
+        if isinstance(type_, TypeDescription):
+            self._structure(type_, source, hint)
+        elif isinstance(type_, Primitive):
+            name = self._assign(hint, source)
+            # JSON has true and false but once each, and struct would take them for numbers.
+            if type_.name == "bool":
+                self._line(f"if {name} is not True and {name} is not False: raise TypeError")
+            else:
+                self._line(f"if {name} is True or {name} is False: raise TypeError")
+            self._run.append(_Part(type_, 1, name))
+        elif isinstance(type_, String):
+            self._string(type_, source, hint)
+        elif isinstance(type_, WideString):
+            name = self._assign(hint, f"write_wide_string({source})")
+            self._bound(f"len({name}) // 4", type_.bound)
+            self._run.append(_Part(_COUNT, 1, f"len({name}) // 4"))
+            self._bytes(name, Phase(4, 0))
+        elif isinstance(type_, Array):
+            self._array(type_, source, hint)
+        else:
+            self._sequence(type_, source, hint)
+
+    def _assign(self, hint: str, source: str) -> str:
+        name = self._name(hint)
+        self._line(f"{name} = {source}")
+        return name
+
+    def _bound(self, size: str, bound: int | None) -> None:
+        if bound is not None:
+            self._line(f"if {size} > {bound}: raise ValueError")
+
+    def _flush(self) -> None:
+        if not self._run:
+            return
+        texts = ", ".join(part.text for part in self._run if part.text)
+        name, layout = self._end_run("pack")
+        self._pieces.append(f"{name}{layout}({texts})")
+
+    def _bytes(self, name: str, phase: Phase) -> None:
+        """Writes bytes, behind the run."""
+        self._flush()
+        self._pieces.append(name)
+        self._terms.append(f"len({name})")
+        self._phase = phase
+
+    def _spill(self) -> None:
+        """Hands over the pieces so far: a loop begins or ends, or the message ends."""
+        pieces = ", ".join(self._pieces)
+        if not self._spilled:
+            self._line(f"w = [{pieces}]")
+        elif len(self._pieces) == 1:
+            self._line(f"w.append({pieces})")
+        elif self._pieces:
+            self._line(f"w += ({pieces})")
+        self._spilled, self._pieces = True, []
+
+    def _structure(self, description: TypeDescription, source: str, hint: str) -> None:
+        name = source if source.isidentifier() else self._assign(hint, source)
+        fields = description.fields
+        if not fields:
+            self._line(f"if {name} != {{}}: raise TypeError")
+            self._run.append(_Part(_PADDING, 1, ""))
+            return
+        # As many as there are, and each of them found below: none unknown, none missing.
+        self._line(f"if len({name}) != {len(fields)}: raise KeyError")
+        for field in fields:
+            self._value(field.type, f"{name}[{field.name!r}]", field.name)
+
+    def _string(self, string: String, source: str, hint: str) -> None:
+        name = self._assign(hint, f"{source}.encode()")
+        self._line(f"if 0 in {name}: raise ValueError")
+        self._bound(f"len({name})", string.bound)
+        self._run.append(_Part(_COUNT, 1, f"len({name}) + 1"))
+        self._bytes(name, _ANYWHERE)
+        self._run.append(_Part(_PADDING, 1, ""))  # its NUL
+
+    def _array(self, array: Array, source: str, hint: str) -> None:
+        item, length = array.item, array.length
+        if not isinstance(item, Primitive):
+            name = self._list(hint, source)
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._flush()
+            self._loop(item, name)
+        elif item.is_octet:
+            name = self._assign(hint, f"octets({source})")
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._run.append(_Part(item, length, name if length > 1 else f"{name}[0]"))
+        elif _is_row(array):
+            name = self._list(hint, source)
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._line(
+                f"if not {_python_types(item)}.issuperset(map(type, {name})): raise TypeError"
+            )
+            self._run.append(_Part(item, length, f"*{name}"))
+        else:
+            name = self._assign(hint, f"write_{item.name}({source})")
+            self._line(f"if len({name}) != {length * item.size}: raise ValueError")
+            self._flush()
+            self._numbers(item, name)
+
+    def _sequence(self, sequence: Sequence, source: str, hint: str) -> None:
+        item = sequence.item
+        if isinstance(item, Primitive):
+            write = "octets" if item.is_octet else f"write_{item.name}"
+            name = self._assign(hint, f"{write}({source})")
+            count = f"len({name}) // {item.size}" if item.size > 1 else f"len({name})"
+        else:
+            name = self._list(hint, source)
+            count = f"len({name})"
+        self._bound(count, sequence.bound)
+        self._run.append(_Part(_COUNT, 1, count))
+        self._flush()
+        empty = self._phase
+        if isinstance(item, Primitive):
+            self._numbers(item, name)
+        else:
+            self._loop(item, name)
+        self._phase = self._phase.join(empty)
+
+    def _list(self, hint: str, source: str) -> str:
+        name = self._assign(hint, source)
+        self._line(f"if {name}.__class__ is not list: raise TypeError")
+        return name
+
+    def _align(self, size: int, items: str) -> None:
+        """Writes the padding before items, of which there may be none."""
+        if not self._is_aligned(size):
+            self._settle()
+            padding = self._assign("padding", f"ZEROS[:(4 - q) % {size}] if {items} else b''")
+            self._bytes(padding, self._phase.align(size))
+
+    def _numbers(self, primitive: Primitive, name: str) -> None:
+        self._align(primitive.size, name)
+        self._bytes(name, _loop_phase(primitive, self._phase))
+
+    def _loop(self, item: ItemType, items: str) -> None:
+        self._align(_first_size(item), items)
+        self._spill()
+        stride = self._stride(item)
+        self._phase = _loop_phase(item, self._phase)
+        self._settle()
+        element = self._name("item")
+        with self._block(f"for {element} in {items}:"):
+            self._value(item, element, "item")
+            self._flush()
+            self._spill()
+            if stride is None:
+                self._settle()
+        if stride is not None:
+            self._offset = 0
+            self._terms.append(f"len({items}) * {stride}")
+
+
+def _python_types(primitive: Primitive) -> str:
+    """The constant with the Python types that `primitive` is written from."""
+    return "BOOLS" if primitive.name == "bool" else "NUMBERS" if primitive.is_float else "INTEGERS"

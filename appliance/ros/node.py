@@ -1,0 +1,334 @@
+"""The node that the bridge is on the robot's bus: what a bus adapter fulfils, and its fake twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Protocol
+
+from appliance.ros.definitions import UnknownTypeError
+
+
+class BusError(Exception):
+    """The bus refused; the message says what and why."""
+
+
+class Reliability(Enum):
+    """Whether a lost sample is sent again (REP 2003)."""
+
+    BEST_EFFORT = "best effort"
+    RELIABLE = "reliable"
+
+
+class Durability(Enum):
+    """Whether a late subscriber is given the last samples (REP 2003)."""
+
+    VOLATILE = "volatile"
+    TRANSIENT_LOCAL = "transient local"
+
+
+@dataclass(frozen=True, slots=True)
+class QosProfile:
+    """The QoS of one end of a topic; `depth` is in samples, 0 where it is not known."""
+
+    reliability: Reliability = Reliability.RELIABLE
+    durability: Durability = Durability.VOLATILE
+    depth: int = 10
+
+    def satisfies(self, requested: QosProfile) -> bool:
+        """Whether a publisher with this profile is matched with a subscription's `requested`."""
+        return (
+            self.reliability is Reliability.RELIABLE
+            or requested.reliability is Reliability.BEST_EFFORT
+        ) and (
+            self.durability is Durability.TRANSIENT_LOCAL
+            or requested.durability is Durability.VOLATILE
+        )
+
+    def __str__(self) -> str:
+        depth = f", depth {self.depth}" if self.depth else ""
+        return f"{self.reliability.value}, {self.durability.value}{depth}"
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A publisher or subscription that another node has on a topic.
+
+    `node` is that node's full name, `type` as in `std_msgs/msg/String`, `type_hash` as in
+    `RIHS01_…` (REP 2011), None where the bus does not tell.
+    """
+
+    node: str
+    type: str
+    qos: QosProfile
+    type_hash: str | None = None
+
+
+class RosSubscription(Protocol):
+    """A subscription of this node."""
+
+    def destroy(self) -> None:
+        """End it: the callback is not called again. On the ROS thread."""
+
+
+class RosPublisher(Protocol):
+    """A publisher of this node."""
+
+    def publish(self, cdr: bytes) -> None:
+        """Publish a serialized message; from any thread. Raises BusError."""
+
+    def destroy(self) -> None:
+        """End it; `publish` raises BusError from now on. On the ROS thread."""
+
+
+class RosNode(Protocol):
+    """A node on the robot's bus, with a thread of its own: the ROS thread.
+
+    `start`, `stop` and `RosPublisher.publish` may be called from any thread, all else only from
+    inside the callbacks, which are called on the ROS thread.
+    """
+
+    #: The node's full name, such as `/appliance`.
+    name: str
+
+    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        """Join the bus in the background and return at once.
+
+        `poll` is called when the node is there and then 5 to 10 times a second: the time to look
+        at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
+        node ends by itself; nothing is called after it.
+        """
+
+    def stop(self) -> None:
+        """Leave the bus and wait until the ROS thread has ended; may be called twice."""
+
+    def topics(self) -> dict[str, list[str]]:
+        """The types of each topic that has an endpoint, this node's own included."""
+
+    def count(self, topic: str) -> tuple[int, int]:
+        """How many publishers and subscriptions there are, own ones included; the cheapest look."""
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """The publishers of other nodes."""
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """The subscriptions of other nodes."""
+
+    def load(self, type_name: str) -> type[Any]:
+        """The message class of `std_msgs/msg/String`. Raises UnknownTypeError."""
+
+    def subscribe_raw(
+        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+    ) -> RosSubscription:
+        """Call `callback` with each message, as CDR. Raises BusError, UnknownTypeError."""
+
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
+        """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
+
+
+# The twin
+
+
+@dataclass(eq=False, slots=True)
+class FakePeer:
+    """An endpoint of another node on a FakeNode's bus; a subscription fills `received`."""
+
+    bus: FakeNode
+    topic: str
+    endpoint: Endpoint
+    received: list[bytes] = field(default_factory=list)
+    latched: list[bytes] = field(default_factory=list)
+
+    def publish(self, cdr: bytes) -> None:
+        """Publish to all subscriptions that match; transient local ones keep the last samples."""
+        if self.endpoint.qos.durability is Durability.TRANSIENT_LOCAL:
+            self.latched = [*self.latched, cdr][-(self.endpoint.qos.depth or 1) :]
+        self.bus.deliver(self.topic, self.endpoint, cdr)
+
+    def remove(self) -> None:
+        """The other node ends this endpoint, or vanishes."""
+        for peers in (self.bus.remote_publishers, self.bus.remote_subscribers):
+            if self in peers:
+                peers.remove(self)
+        self.bus.spin()
+
+
+@dataclass(eq=False, slots=True)
+class FakeSubscription:
+    """A subscription of a FakeNode."""
+
+    bus: FakeNode
+    topic: str
+    endpoint: Endpoint
+    callback: Callable[[bytes], None]
+
+    def destroy(self) -> None:
+        self.bus.subscriptions.remove(self)
+
+
+@dataclass(eq=False, slots=True)
+class FakePublisher:
+    """A publisher of a FakeNode; with `error` set, publishing is refused."""
+
+    bus: FakeNode
+    topic: str
+    endpoint: Endpoint
+    error: str | None = None
+    destroyed: bool = False
+
+    def publish(self, cdr: bytes) -> None:
+        if self.error or self.destroyed:
+            raise BusError(self.error or "the publisher has been destroyed")
+        self.bus.deliver(self.topic, self.endpoint, cdr)
+
+    def destroy(self) -> None:
+        self.destroyed = True
+        self.bus.own_publishers.remove(self)
+
+
+class FakeNode:
+    """A RosNode on a bus of its own, without threads: everything happens in the caller's.
+
+    Other nodes' endpoints are added and removed by hand, and each time the bridge gets its look at
+    the graph at once. Messages reach subscriptions whose QoS and type match, own ones included, as
+    on a real bus. `types` are the types that can be loaded; None: any, as an empty class.
+    """
+
+    def __init__(self, name: str = "/appliance", types: Mapping[str, type[Any]] | None = None):
+        self.name = name
+        self.types = types
+        self.running = False
+        self.remote_publishers: list[FakePeer] = []
+        self.remote_subscribers: list[FakePeer] = []
+        self.subscriptions: list[FakeSubscription] = []
+        self.own_publishers: list[FakePublisher] = []
+        self._poll: Callable[[], None] | None = None
+        self._failed: Callable[[str], None] | None = None
+
+    # The other nodes, and the test's hands
+
+    def add_publisher(
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile | None = None,
+        *,
+        node: str = "/other",
+        type_hash: str | None = None,
+    ) -> FakePeer:
+        """Another node gets a publisher."""
+        peer = FakePeer(self, topic, Endpoint(node, type_name, qos or QosProfile(), type_hash))
+        self.remote_publishers.append(peer)
+        self.spin()
+        return peer
+
+    def add_subscriber(
+        self, topic: str, type_name: str, qos: QosProfile | None = None, *, node: str = "/other"
+    ) -> FakePeer:
+        """Another node subscribes."""
+        peer = FakePeer(self, topic, Endpoint(node, type_name, qos or QosProfile()))
+        self.remote_subscribers.append(peer)
+        self.spin()
+        return peer
+
+    def spin(self) -> None:
+        """Let the bridge look at the graph."""
+        if self.running and self._poll:
+            self._poll()
+
+    def fail(self, reason: str) -> None:
+        """The node ends by itself."""
+        self.running = False
+        if self._failed:
+            self._failed(reason)
+
+    def deliver(self, topic: str, publisher: Endpoint, cdr: bytes) -> None:
+        """Hand a message to the subscriptions that match."""
+
+        def matches(other_topic: str, other: Endpoint) -> bool:
+            return (
+                other_topic == topic
+                and other.type == publisher.type
+                and publisher.qos.satisfies(other.qos)
+            )
+
+        for peer in list(self.remote_subscribers):
+            if matches(peer.topic, peer.endpoint):
+                peer.received.append(cdr)
+        for subscription in list(self.subscriptions):
+            if matches(subscription.topic, subscription.endpoint):
+                subscription.callback(cdr)
+
+    # RosNode
+
+    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        self._poll = poll
+        self._failed = failed
+        self.running = True
+        poll()
+
+    def stop(self) -> None:
+        self.running = False
+        self.subscriptions.clear()
+        for publisher in list(self.own_publishers):
+            publisher.destroy()
+
+    def topics(self) -> dict[str, list[str]]:
+        found: dict[str, set[str]] = {}
+        for topic, endpoint in (*self._all_publishers(), *self._all_subscribers()):
+            found.setdefault(topic, set()).add(endpoint.type)
+        return {topic: sorted(types) for topic, types in found.items()}
+
+    def count(self, topic: str) -> tuple[int, int]:
+        return (
+            sum(name == topic for name, _ in self._all_publishers()),
+            sum(name == topic for name, _ in self._all_subscribers()),
+        )
+
+    def _all_publishers(self) -> list[tuple[str, Endpoint]]:
+        return [(end.topic, end.endpoint) for end in self.remote_publishers] + [
+            (end.topic, end.endpoint) for end in self.own_publishers
+        ]
+
+    def _all_subscribers(self) -> list[tuple[str, Endpoint]]:
+        return [(end.topic, end.endpoint) for end in self.remote_subscribers] + [
+            (end.topic, end.endpoint) for end in self.subscriptions
+        ]
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        return [peer.endpoint for peer in self.remote_publishers if peer.topic == topic]
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        return [peer.endpoint for peer in self.remote_subscribers if peer.topic == topic]
+
+    def load(self, type_name: str) -> type[Any]:
+        if self.types is None:
+            return type(type_name.rpartition("/")[2], (), {})
+        if type_name not in self.types:
+            package = type_name.partition("/")[0]
+            raise UnknownTypeError(f"no {type_name}: the package {package} is not installed here")
+        return self.types[type_name]
+
+    def subscribe_raw(
+        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+    ) -> FakeSubscription:
+        self.load(type_name)
+        own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback)
+        self.subscriptions.append(own)
+        if qos.durability is Durability.TRANSIENT_LOCAL:
+            for peer in self.remote_publishers:
+                if (
+                    peer.topic == topic
+                    and peer.endpoint.type == type_name
+                    and peer.endpoint.qos.satisfies(qos)
+                ):
+                    for cdr in peer.latched:
+                        callback(cdr)
+        return own
+
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> FakePublisher:
+        self.load(type_name)
+        own = FakePublisher(self, topic, Endpoint(self.name, type_name, qos))
+        self.own_publishers.append(own)
+        return own

@@ -1,0 +1,56 @@
+"""What QoS to use, given the endpoints found on a topic: pure (CONVENTIONS, QoS)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
+
+#: ROS's own default, and enough for a reader that looks often.
+DEPTH = 10
+
+#: Publishers' depths add up to no more than this: a stalled reader holds so many samples.
+MAX_DEPTH = 100
+
+
+def subscription_qos(publishers: Sequence[Endpoint], keep: int = 1) -> QosProfile:
+    """What to subscribe with, to be matched with all of `publishers` and lose the least.
+
+    Without publishers: best effort and volatile, which matches whatever appears. `keep` is how many
+    samples the route wants to queue; the middleware holds at least as many.
+    """
+    reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
+    latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
+    # A topic without keys has one history for all its publishers: for every one to find room for
+    # what it keeps (/tf_static has many that keep one sample each), their depths add up. A depth
+    # that discovery did not tell counts as one.
+    wanted = sum(max(1, end.qos.depth) for end in publishers)
+    return QosProfile(
+        Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,
+        Durability.TRANSIENT_LOCAL if publishers and latched else Durability.VOLATILE,
+        max(keep, DEPTH, min(wanted, MAX_DEPTH)),
+    )
+
+
+def publisher_qos(subscribers: Sequence[Endpoint], keep: int = 1) -> QosProfile:
+    """What to publish with, to be matched with all of `subscribers`.
+
+    Reliable is matched with every subscription. Transient local would be too, but it hands the last
+    message, which may be an old command, to whoever subscribes late: only where one asks for it.
+    """
+    latched = any(end.qos.durability is Durability.TRANSIENT_LOCAL for end in subscribers)
+    return QosProfile(
+        Reliability.RELIABLE,
+        Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
+        max(keep, DEPTH),
+    )
+
+
+def mqtt_qos(profile: QosProfile) -> int:
+    """The MQTT QoS of a ROS topic's messages: best effort is 0, reliable 1."""
+    return 1 if profile.reliability is Reliability.RELIABLE else 0
+
+
+def mqtt_retain(profile: QosProfile) -> bool:
+    """Whether a ROS topic's messages are retained on MQTT: transient local ones are."""
+    return profile.durability is Durability.TRANSIENT_LOCAL

@@ -1,0 +1,319 @@
+"""The node on ROS 2: the only file that imports rclpy, and that only when the node starts."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from appliance.ros.definitions import import_message
+from appliance.ros.node import BusError, Durability, Endpoint, QosProfile, Reliability
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at the graph, of which rclpy does not tell changes.
+POLL_INTERVAL = 0.15
+
+_PROFILE = Path(__file__).parent.parent / "fastdds.xml"
+_PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+
+
+def available() -> tuple[bool, str]:
+    """Whether a node can be started here, and if not, one line that says why and what to do.
+
+    Imports nothing. A middleware that is asked for and not there is found out here because rcl
+    would end the whole process over it.
+    """
+    if find_spec("rclpy") is None:
+        return False, (
+            "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
+            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
+        )
+    wanted = os.environ.get("RMW_IMPLEMENTATION")
+    installed = sorted(set(_resources("rmw_typesupport")) - {"rmw_implementation"})
+    if wanted and installed and wanted not in installed:
+        return False, (
+            f"RMW_IMPLEMENTATION is {wanted}, which is not installed here; there is "
+            f"{', '.join(installed)}. Install it, or unset RMW_IMPLEMENTATION"
+        )
+    return True, ""
+
+
+def _resources(kind: str) -> Iterator[str]:
+    """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
+    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    for prefix in (*prefixes, sys.prefix):
+        folder = Path(prefix, "share", "ament_index", "resource_index", kind)
+        if folder.is_dir():
+            yield from (entry.name for entry in folder.iterdir())
+
+
+def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
+    """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
+
+    The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
+    `ROS_LOCALHOST_ONLY`.
+    """
+    if (
+        not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
+        or "FASTDDS_BUILTIN_TRANSPORTS" in environment
+        or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
+        or any(variable in environment for variable in _PROFILE_VARIABLES)
+        or any(Path(file).exists() for file in _PROFILE_FILES)
+    ):
+        return False
+    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
+    is_old = "fastrtps" in _resources("packages")
+    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(_PROFILE)
+    return True
+
+
+class Ros2Node:
+    """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
+
+    def __init__(
+        self, name: str = "appliance", namespace: str = "/", domain_id: int | None = None
+    ) -> None:
+        """`domain_id` None takes ROS_DOMAIN_ID, as every ROS node does.
+
+        Other nodes are told from this one by their full name, which ROS wants to be unique.
+        """
+        self.name = f"{namespace.rstrip('/')}/{name}"
+        self._base_name = name
+        self._namespace = namespace
+        self._domain_id = domain_id
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._rclpy: Any = None
+        self._context: Any = None
+        self._node: Any = None
+        self._executor: Any = None
+
+    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        is_available, reason = available()
+        if not is_available:
+            failed(reason)
+            return
+        use_fastdds_profile(os.environ)
+        # Not a daemon: one that is alive when Python ends aborts the process.
+        self._thread = threading.Thread(target=self._run, args=(poll, failed), name="ros")
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        reason = ""
+        try:
+            self._join()
+            self._spin(poll)
+        except Exception as error:
+            # The thread's end, whatever ended it: it must be told, and the bus be left in order.
+            log.debug("the ROS thread ended", exc_info=True)
+            reason = f"{type(error).__name__}: {error}"
+        finally:
+            self._leave()
+        if reason:
+            failed(reason)
+
+    def _join(self) -> None:
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.node import Node
+        from rclpy.signals import SignalHandlerOptions
+
+        self._rclpy = rclpy
+        self._context = Context()
+        rclpy.init(
+            args=[],
+            context=self._context,
+            domain_id=self._domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node = Node(
+            self._base_name,
+            namespace=self._namespace,
+            context=self._context,
+            # What this node logs would be a message on a topic that may itself be bridged.
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._executor = _new_executor(self._context)
+        self._executor.add_node(self._node)
+
+    def _spin(self, poll: Callable[[], None]) -> None:
+        from rclpy.executors import ExternalShutdownException
+        from rclpy.task import Future
+
+        poll()
+        never: Any = Future(executor=self._executor)
+        try:
+            while not self._stopping.is_set():
+                # A finite time-out also mends EventsExecutor, whose endless wait overflows.
+                self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
+                poll()
+        except ExternalShutdownException:
+            if not self._stopping.is_set():
+                raise
+
+    def _leave(self) -> None:
+        if self._executor is not None:
+            self._executor.shutdown()
+        if self._node is not None:
+            self._node.destroy_node()
+        if self._context is not None:
+            self._rclpy.try_shutdown(context=self._context)
+        self._executor = self._node = self._context = None
+
+    # The graph
+
+    def topics(self) -> dict[str, list[str]]:
+        return dict(self._node.get_topic_names_and_types())
+
+    def count(self, topic: str) -> tuple[int, int]:
+        handle = self._node.handle  # the node's own methods would expand and check the name again
+        with handle:
+            return handle.get_count_publishers(topic), handle.get_count_subscribers(topic)
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        return self._others(self._node.get_publishers_info_by_topic(topic))
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        return self._others(self._node.get_subscriptions_info_by_topic(topic))
+
+    def _others(self, found: list[Any]) -> list[Endpoint]:
+        endpoints = [_endpoint(info) for info in found]
+        return [endpoint for endpoint in endpoints if endpoint.node != self.name]
+
+    def load(self, type_name: str) -> type[Any]:
+        return import_message(type_name)
+
+    # Subscriptions and publishers
+
+    def subscribe_raw(
+        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+    ) -> _Subscription:
+        message_class = import_message(type_name)
+        events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
+        with _as_bus_error():
+            own = self._node.create_subscription(
+                message_class, topic, callback, _to_rclpy(qos), raw=True, event_callbacks=events
+            )
+        return _Subscription(self._node, own)
+
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
+        message_class = import_message(type_name)
+        events = _event_callbacks().PublisherEventCallbacks(use_default_callbacks=False)
+        with _as_bus_error():
+            own = self._node.create_publisher(
+                message_class, topic, _to_rclpy(qos), event_callbacks=events
+            )
+        return _Publisher(self._node, own)
+
+
+class _Subscription:
+    def __init__(self, node: Any, own: Any) -> None:
+        self._node = node
+        self._own = own
+
+    def destroy(self) -> None:
+        self._node.destroy_subscription(self._own)
+
+
+class _Publisher:
+    def __init__(self, node: Any, own: Any) -> None:
+        self._node = node
+        self._own = own
+        self._publish = own.publish
+        self._refusals = _errors()
+
+    def publish(self, cdr: bytes) -> None:
+        try:
+            self._publish(cdr)
+        except self._refusals as error:  # the transport is full, or the node is gone
+            raise BusError(str(error)) from error
+
+    def destroy(self) -> None:
+        self._node.destroy_publisher(self._own)
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    implementation = import_module("rclpy.impl.implementation_singleton").rclpy_implementation
+    return implementation.RCLError, implementation.InvalidHandle
+
+
+@contextmanager
+def _as_bus_error() -> Iterator[None]:
+    from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
+
+    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException)
+    try:
+        yield
+    except refusals + _errors() as error:
+        raise BusError(str(error)) from error
+
+
+def _new_executor(context: Any) -> Any:
+    """EventsExecutor costs an eighth of the others, and exists from ROS 2 Jazzy on."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+def _event_callbacks() -> Any:
+    """The module of the event callback classes, which are always given empty: rclpy's defaults only
+    write to the log, and with EventsExecutor destroying an endpoint that has some can crash."""
+    try:
+        return import_module("rclpy.event_handler")
+    except ImportError:  # ROS 2 Humble
+        return import_module("rclpy.qos_event")
+
+
+def _endpoint(info: Any) -> Endpoint:
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    profile = info.qos_profile
+    type_hash = str(getattr(info, "topic_type_hash", ""))  # from ROS 2 Iron on
+    return Endpoint(
+        f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+        info.topic_type,
+        QosProfile(
+            Reliability.BEST_EFFORT
+            if profile.reliability == ReliabilityPolicy.BEST_EFFORT
+            else Reliability.RELIABLE,
+            Durability.TRANSIENT_LOCAL
+            if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            else Durability.VOLATILE,
+            profile.depth,
+        ),
+        type_hash if type_hash.startswith("RIHS") else None,
+    )
+
+
+def _to_rclpy(qos: QosProfile) -> Any:
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        depth=qos.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT
+        if qos.reliability is Reliability.BEST_EFFORT
+        else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if qos.durability is Durability.TRANSIENT_LOCAL
+        else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,263 @@
+"""The command `appliance`: what it prints, how it ends, and that nobody sees a traceback."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance import cli
+from appliance.access import Passwords
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that was set up with `init`, as the current one."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert run("init", "--robot", "r2", "--user", "alice") == 0
+    return tmp_path
+
+
+@pytest.fixture
+def output(here: Path, capsys: pytest.CaptureFixture[str]) -> pytest.CaptureFixture[str]:
+    capsys.readouterr()
+    return capsys
+
+
+def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+
+
+def test_help_is_there_at_once_and_for_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    for command in ("init", "run", "check", "user", "acl", "pub", "sub", "bench", "demo"):
+        assert f" {command} " in text
+        assert run(command, "--help") == 0
+
+
+def test_a_command_loads_only_what_it_needs() -> None:
+    code = """
+import sys
+from appliance import cli
+try: cli.main(["--help"])
+except SystemExit: pass
+heavy = {"amqtt", "asyncio", "cryptography", "paho", "pydantic", "rclpy", "uvloop", "yaml"}
+print(*sorted(heavy & set(sys.modules)), file=sys.stderr)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stderr.strip() == ""
+
+
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("rnu") == 2
+    assert run("run", "--log-format", "xml") == 2
+    assert run("pub", "a", "-m", "x", "-f", "y") == 2
+    assert run("sub") == 2
+
+
+def test_init_tells_the_password_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    directory = str(tmp_path / "x")
+    assert run("init", "--dir", directory, "--user", "alice") == 0
+    text = capsys.readouterr().out
+    password = text.partition("user alice, password ")[2].split()[0]
+    assert Passwords.load(tmp_path / "x/users.passwd").verify("alice", password.encode())
+    assert text.index("password ") > text.rindex("made ")
+    assert run("init", "--dir", directory) == 0
+    text = capsys.readouterr().out
+    assert "user alice, password" not in text
+    assert "made" not in text
+
+
+def test_init_in_a_place_that_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert run("init", "--dir", str(tmp_path / "file/x")) == 1
+    assert "Not a directory" in capsys.readouterr().err
+
+
+def test_check_of_what_init_made(output: pytest.CaptureFixture[str]) -> None:
+    assert run("check") == 0
+    text = output.readouterr().out
+    assert "error" not in text
+    assert "users: alice" in text
+    assert "rules: 3" in text
+
+
+def test_check_changes_nothing(here: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in here.rglob("*")}
+    run("check", "--show")
+    assert {path: path.stat().st_mtime_ns for path in here.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "finding"),
+    [
+        ("users.passwd", "alice:secret\n", "users.passwd:1:7: a plain password is not accepted"),
+        ("users.passwd", None, "users.passwd: there is no such file"),
+        ("acl.conf", "user alice\ntopci read #\n", "acl.conf:2:1: "),
+        ("certs/server.crt", "nothing", "server.crt is not a certificate in PEM form"),
+        ("certs/server.key", None, "server.key"),
+    ],
+)
+def test_check_finds(
+    here: Path,
+    output: pytest.CaptureFixture[str],
+    file: str,
+    content: str | None,
+    finding: str,
+) -> None:
+    (here / file).unlink()
+    if content is not None:
+        (here / file).write_text(content)
+    assert run("check") == 1
+    errors = [line for line in output.readouterr().out.splitlines() if line.startswith("error")]
+    assert len(errors) == 1
+    assert finding in errors[0]
+
+
+def test_check_of_a_key_of_another_certificate(
+    here: Path, output: pytest.CaptureFixture[str]
+) -> None:
+    other = here / "other"
+    assert run("init", "--dir", str(other)) == 0
+    (here / "certs/server.key").write_bytes((other / "certs/server.key").read_bytes())
+    output.readouterr()
+    assert run("check") == 1
+    assert "is not the key of" in output.readouterr().out
+
+
+def test_check_warns(here: Path, output: pytest.CaptureFixture[str]) -> None:
+    (here / "appliance.yaml").write_text(
+        "robot: r2\nbroker: {anonymous: true, listeners: [{bind: ':1883'}],"
+        " plugins: {no_such.module.Plugin: {password: hunter2}}}"
+    )
+    with (here / "acl.conf").open("a") as acl:
+        acl.write("user bob\ntopic #\n")
+    (here / "users.passwd").chmod(0o644)
+    assert run("check", "--show") == 1
+    text = output.readouterr().out
+    assert "warning listener :1883: without TLS: everyone" in text
+    assert "warning broker.anonymous" in text
+    assert "is open to every user of this computer" in text
+    assert "error   plugin no_such.module.Plugin: there is no Python module" in text
+    assert "hunter2" not in text
+
+
+def test_a_wrong_configuration_is_told_as_a_whole(
+    here: Path, output: pytest.CaptureFixture[str]
+) -> None:
+    (here / "appliance.yaml").write_text("robt: r2\nlog: {level: loud}\n")
+    for command in (["check"], ["run"], ["user", "list"], ["acl", "explain", "a", "b"]):
+        assert run(*command) == 1
+        error = output.readouterr().err
+        assert "appliance.yaml:1: robt: unknown key; did you mean 'robot'?" in error
+        assert "appliance.yaml:2: log.level: must be debug" in error
+
+
+def test_no_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("run", "-c", "none.yaml") == 1
+    assert "none.yaml: no such file; `appliance init` writes one" in capsys.readouterr().err
+
+
+def test_users(
+    here: Path, output: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "password").write_text("first\nnot this line\n")
+    assert run("user", "add", "bob", "--password-file", "password") == 0
+    assert Passwords.load(here / "users.passwd").verify("bob", b"first")
+    assert run("user", "add", "bob", "--generate") == 1
+    assert "there is a user 'bob' already" in output.readouterr().err
+
+    typed(monkeypatch, "second\r\n")
+    assert run("user", "passwd", "bob", "--password-file", "-") == 0
+    assert Passwords.load(here / "users.passwd").verify("bob", b"second")
+
+    output.readouterr()
+    assert run("user", "passwd", "bob", "--generate") == 0
+    password = output.readouterr().out.split()[1]
+    assert Passwords.load(here / "users.passwd").verify("bob", password.encode())
+
+    assert run("user", "list") == 0
+    assert output.readouterr().out == "alice\nbob\n"
+    assert run("user", "remove", "bob") == 0
+    for command in ("remove", "passwd"):
+        assert run("user", command, "bob") == 1
+        assert "there is no user 'bob' in users.passwd" in output.readouterr().err
+
+
+def test_passwords_that_cannot_be(
+    here: Path, output: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed(monkeypatch, "\n")
+    assert run("user", "add", "bob") == 1
+    assert "no terminal to ask on" in output.readouterr().err
+    assert run("user", "add", "bob", "--password-file", "-") == 1
+    assert "must not be empty" in output.readouterr().err
+    assert run("user", "add", "b:b", "--generate") == 1
+    assert run("user", "add", "bob", "--generate", "--password-file", "x") == 2
+    assert run("user", "add", "bob", "--password-file", "none") == 1
+    assert Passwords.load(here / "users.passwd").users() == ["alice"]
+
+
+def test_the_first_user_of_a_new_file(here: Path) -> None:
+    (here / "users.passwd").unlink()
+    assert run("user", "list") == 1
+    assert run("user", "add", "bob", "--generate") == 0
+    assert Passwords.load(here / "users.passwd").users() == ["bob"]
+
+
+def test_acl_explain(output: pytest.CaptureFixture[str]) -> None:
+    assert run("acl", "explain", "alice", "r2/odom") == 0
+    text = output.readouterr().out
+    assert "read       allowed  acl.conf:5: topic read r2/#" in text
+    assert "write      refused" in text
+    assert run("acl", "explain", "", "r2/#") == 0
+    assert "subscribe  refused" in output.readouterr().out
+    assert run("acl", "explain", "alice", "r2/#/x") == 2
+
+
+def test_the_client_needs_a_password(
+    output: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("APPLIANCE_PASSWORD", raising=False)
+    typed(monkeypatch, "")
+    assert run("sub", "r2/#", "-u", "alice") == 1
+    assert "no password; use --password-file or APPLIANCE_PASSWORD" in output.readouterr().err
+
+
+def test_the_client_takes_what_is_not_said_from_the_configuration(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "appliance.yaml").write_text(
+        "broker: {listeners: [{bind: ':1'}, {bind: ':2', tls: true}]}"
+    )
+    monkeypatch.setenv("APPLIANCE_PASSWORD", "secret")
+
+    def target(**options: str | int | Path | None) -> object:
+        given = {"config": None, "port": None, "ca": None, "user": "alice"} | options
+        return cli._target(
+            **given, host="h", password_file=None, client_id="", version="5", insecure=False
+        )
+
+    from appliance.client import Target
+
+    assert target() == Target("h", 2, here / "certs/ca.crt", "alice", "secret")
+    assert target(port=3) == Target("h", 3, None, "alice", "secret")
+    config = here / "appliance.yaml"
+    assert target(port=3, config=config) == Target("h", 3, here / "certs/ca.crt", "alice", "secret")

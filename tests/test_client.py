@@ -1,0 +1,185 @@
+"""`appliance pub` and `sub` against an independent broker: mosquitto, with TLS."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from appliance import certs, cli
+
+MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
+pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
+PATIENCE = 10.0  # seconds for what takes milliseconds
+
+
+@dataclass(frozen=True)
+class Peer:
+    directory: Path
+    port: int
+
+    def arguments(self, command: str, *arguments: str, user: str = "alice") -> list[str]:
+        login = ["-u", user, "--password-file", str(self.directory / f"{user}.password")]
+        where = ["-p", str(self.port), "--ca", str(self.directory / "ca.crt")]
+        return [command, *where, *(login if user else []), *arguments]
+
+
+@pytest.fixture(scope="module")
+def peer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
+    directory = tmp_path_factory.mktemp("peer")
+    certs.create_authority(directory)
+    certs.issue_server(directory, ["localhost"], [])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    users = directory / "users"
+    users.touch(mode=0o600)
+    subprocess.run(["mosquitto_passwd", "-b", users, "alice", "secret"], check=True)
+    (directory / "alice.password").write_text("secret\n")
+    (directory / "bob.password").write_text("wrong\n")
+    (directory / "acl").write_text("user alice\ntopic robot/#\n")
+    (directory / "mosquitto.conf").write_text(
+        f"user root\nlistener {port} 127.0.0.1\nallow_anonymous false\n"
+        f"cafile {directory}/ca.crt\ncertfile {directory}/server.crt\n"
+        f"keyfile {directory}/server.key\npassword_file {users}\nacl_file {directory}/acl\n"
+    )
+    assert MOSQUITTO
+    process = subprocess.Popen([MOSQUITTO, "-c", directory / "mosquitto.conf"])
+    try:
+        _wait_for(port)
+        yield Peer(directory, port)
+    finally:
+        process.terminate()
+        process.wait(PATIENCE)
+
+
+def _wait_for(port: int) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+            return
+        except OSError:
+            assert time.monotonic() < deadline, "mosquitto does not listen"
+            time.sleep(0.02)
+
+
+def run(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.mark.parametrize("version", ["5", "311"])
+def test_what_is_published_is_printed(
+    peer: Peer, version: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    topic = f"robot/{version}"
+    assert run(peer.arguments("pub", topic, "-m", "hello", "-r", "-V", version)) == 0
+    arguments = peer.arguments("sub", topic, "-v", "-C", "1", "-W", "10", "-V", version)
+    assert run(arguments) == 0
+    assert capfd.readouterr().out == f"{topic} hello\n"
+
+
+def test_payloads_from_a_file_and_from_lines(
+    peer: Peer,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "payload").write_bytes(b"\x00\xff")
+    (tmp_path / "lines").write_bytes(b"one\ntwo\n")
+    assert run(peer.arguments("pub", "robot/file", "-f", str(tmp_path / "payload"), "-r")) == 0
+    with (tmp_path / "lines").open() as lines:
+        monkeypatch.setattr("sys.stdin", lines)
+        assert run(peer.arguments("pub", "robot/lines", "-l", "-r", "-q", "2")) == 0
+    assert run(peer.arguments("sub", "robot/lines", "-C", "1", "-W", "10")) == 0
+    assert capfd.readouterr().out == "two\n"
+
+
+def test_too_few_messages_in_time(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(peer.arguments("sub", "robot/none", "-W", "0.1")) == 0
+    assert run(peer.arguments("sub", "robot/none", "-W", "0.1", "-C", "1")) == 1
+    assert "0 of 1 messages came within 0.1 s" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("version", ["5", "311"])
+def test_a_wrong_password(peer: Peer, version: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(peer.arguments("sub", "robot/a", "-V", version, user="bob")) == 1
+    error = capfd.readouterr().err
+    assert f"localhost:{peer.port} refused user 'bob': Not authorized" in error
+    assert "Traceback" not in error
+
+
+def test_no_user(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(peer.arguments("sub", "robot/a", user="")) == 1
+    assert "refused a client without user name" in capfd.readouterr().err
+
+
+def test_a_publish_that_the_acl_refuses(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(peer.arguments("pub", "other", "-m", "x")) == 1
+    assert "'other' was refused: Not authorized" in capfd.readouterr().err
+
+
+def test_a_certificate_of_another_authority(
+    peer: Peer, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    certs.create_authority(tmp_path)
+    other = ["--ca", str(tmp_path / "ca.crt")]
+    assert run(peer.arguments("pub", "robot/a", "-m", "x", *other)) == 1
+    error = capfd.readouterr().err
+    assert f"is not trusted by {tmp_path / 'ca.crt'}" in error
+    assert "--ca" in error
+    assert run(peer.arguments("pub", "robot/a", "-m", "x", *other, "--insecure")) == 0
+    assert run(peer.arguments("pub", "robot/a", "-m", "x", "-H", "127.0.0.1")) == 1
+    assert "IP address mismatch" in capfd.readouterr().err
+
+
+def test_a_ca_that_is_none(peer: Peer, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(peer.arguments("pub", "robot/a", "-m", "x", "--ca", str(tmp_path / "none"))) == 1
+    assert "none cannot be read: No such file" in capfd.readouterr().err
+    (tmp_path / "ca").write_text("nothing")
+    assert run(peer.arguments("pub", "robot/a", "-m", "x", "--ca", str(tmp_path / "ca"))) == 1
+    assert "is not a CA certificate in PEM form" in capfd.readouterr().err
+
+
+def test_nobody_there(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+        assert run(peer.arguments("pub", "a", "-m", "x", "-p", str(port))) == 1
+    assert f"localhost:{port} cannot be reached: connection refused" in capfd.readouterr().err
+    assert run(peer.arguments("pub", "a", "-m", "x", "-H", "no-such-host.invalid")) == 1
+    assert "there is no computer called 'no-such-host.invalid'" in capfd.readouterr().err
+
+
+def test_a_server_that_speaks_no_tls(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+
+        def answer() -> None:
+            client, _ = server.accept()
+            with client:
+                client.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        thread = Thread(target=answer)
+        thread.start()
+        assert run(peer.arguments("pub", "a", "-m", "x", "-p", str(port))) == 1
+        thread.join(PATIENCE)
+    assert f"localhost:{port}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["pub", "a/#", "-m", "x"], ["sub", "a/#/b"]])
+def test_what_is_no_topic(
+    peer: Peer, command: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run(peer.arguments(*command)) == 1
+    assert "Traceback" not in capfd.readouterr().err

@@ -1,0 +1,266 @@
+"""appliance.yaml: defaults, units, environment, and every mistake told at once with its place."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from appliance import config
+from appliance.config import Bind, ConfigError, Settings
+
+REFERENCE = Path(__file__).parent.parent / "appliance.yaml"
+HERE = Path("/srv/robot/appliance.yaml")
+
+
+def loads(text: str, **environment: str) -> Settings:
+    return config.loads(text, HERE, environment)
+
+
+def problems(text: str, **environment: str) -> list[str]:
+    """Each problem as `line: key: what`."""
+    with pytest.raises(ConfigError) as raised:
+        loads(text, **environment)
+    return [str(problem).removeprefix(f"{HERE}:") for problem in raised.value.problems]
+
+
+def test_an_empty_file_is_a_secure_broker() -> None:
+    broker = loads("").broker
+    assert [(str(listener.bind), listener.tls) for listener in broker.listeners] == [
+        ("0.0.0.0:8883", True),
+        ("127.0.0.1:1883", False),
+    ]
+    assert not broker.anonymous
+    assert broker.users == HERE.parent / "users.passwd"
+    assert broker.acl == HERE.parent / "acl.conf"
+    assert broker.tls.certificate == HERE.parent / "certs/server.crt"
+    assert broker.tls.key == HERE.parent / "certs/server.key"
+    assert broker.tls.ca == HERE.parent / "certs/ca.crt"
+    assert loads("").file == HERE
+
+
+def keys(section: type[BaseModel]) -> dict[str, object]:
+    """The keys of a section, those of sections inside it included."""
+    return {
+        name: keys(field.annotation)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        else None
+        for name, field in section.model_fields.items()
+    }
+
+
+def test_the_reference_has_every_key_with_its_default() -> None:
+    text = REFERENCE.read_text()
+
+    def missing(written: object, expected: dict[str, object], path: str = "") -> list[str]:
+        assert isinstance(written, dict), path
+        found = [f"{path}{name}" for name in expected if name not in written]
+        for name, inner in expected.items():
+            if isinstance(inner, dict) and name in written:
+                found += missing(written[name], inner, f"{path}{name}.")
+        return found
+
+    assert missing(yaml.safe_load(text), keys(Settings)) == []
+    assert config.loads(text, HERE).model_dump() == loads("").model_dump()
+    for line in text.splitlines():
+        if re.match(r" *(- )?\w+:", line) and not line.rstrip().endswith(":"):
+            assert " # " in line or "tls: " in line, f"says no why: {line}"
+
+
+def test_the_example_routes_of_the_reference_load() -> None:
+    text = re.sub(r"(?m)^  topics: \[\].*", "  topics:", REFERENCE.read_text())
+    example = re.sub(r"(?m)^  #  ", "    ", text)
+    routes = config.loads(example, HERE).bridge.topics
+    assert [(route.ros, route.to) for route in routes] == [("/odom", "mqtt"), ("/cmd_vel", "ros")]
+    assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
+    assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
+
+
+def test_every_problem_is_told_at_once_with_line_and_key() -> None:
+    text = """\
+robot: r2/d2
+brokr: {}
+broker:
+  listeners:
+    - bind: 0.0.0.0:88830
+      foo: 1
+  limits:
+    packet_size: 16 MB
+    keep_alive: 70000 s
+    connect_timeout: 10
+    inflight: 0
+  users: 3
+  users: users.passwd
+bridge:
+  bus: ros1
+  topics:
+    - {ros: odom, to: mqt}
+    - {to: mqtt, type: std_msgs/String, mqtt: "{foo}/x"}
+    - {ros: /a, to: both, expire: 500 ms}
+log: {level: warn}
+"""
+    found = problems(text)
+    expected = [
+        "1: robot: must be one level",
+        "2: brokr: unknown key; did you mean 'broker'?",
+        "5: broker.listeners[0].bind: there is no port 88830",
+        "6: broker.listeners[0].foo: unknown key; known: bind, tls",
+        "8: broker.limits.packet_size: unknown unit 'MB'; use B, KiB, MiB or GiB (it says '16 MB')",
+        "9: broker.limits.keep_alive: must be at most 65535 s",
+        "10: broker.limits.connect_timeout: must be a duration such as",
+        "11: broker.limits.inflight: must be at least 1",
+        "12: broker.users: must be a path",
+        "13: broker.users: is given twice; the first is on line 12",
+        "15: bridge.bus: ros1 is not in this version",
+        "17: bridge.topics[0].ros: must be a full ROS name",
+        "17: bridge.topics[0].to: must be mqtt, ros or both; did you mean 'mqtt'?",
+        "18: bridge.topics[1].ros: is needed",
+        "18: bridge.topics[1].type: must be package/msg/Type",
+        "18: bridge.topics[1].mqtt: knows the placeholders",
+        "19: bridge.topics[2].expire: unknown key",
+        "20: log.level: must be debug, info, warning or error; did you mean 'warning'?",
+    ]
+    assert len(found) == len(expected)
+    for problem, start in zip(found, expected, strict=True):
+        assert problem.startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("- 1", "must be keys with values"),
+        ("a: [", "1: "),
+        ("robot: *b", "1: found undefined alias"),
+        ("log: &a {levels: *a}", "1: log.levels: is an alias of something that contains it"),
+        ("robot: 2024-13-45", "1: robot: month must be in 1..12"),
+        ("? [a]\n: b", "1: a key must be text"),
+        ("a: 1\n---\nb: 1", "2: "),
+        ("robot: !!python/object:os.system x", "1: could not determine a constructor"),
+    ],
+)
+def test_what_is_not_a_configuration_at_all(text: str, place: str) -> None:
+    assert place in problems(text)[0]
+
+
+def test_routes_take_what_they_do_not_say_from_the_defaults() -> None:
+    routes = loads(
+        "bridge: {defaults: {rate: 5, encoding: cdr, qos: 1}, topics: ["
+        "{ros: /a, to: mqtt, encoding: json}, {ros: /b, to: both, rate: null, qos: auto, keep: 3}]}"
+    ).bridge.topics
+    assert [(r.encoding, r.rate, r.qos, r.keep) for r in routes] == [
+        ("json", 5, 1, "latest"),
+        ("cdr", None, None, 3),
+    ]
+    assert routes[0].topic("r2d2") == "r2d2/a"
+
+
+def test_the_same_way_twice_is_a_mistake() -> None:
+    route = "{ros: /a, to: mqtt}"
+    found = problems(f"bridge:\n  topics:\n  - {route}\n  - {route}")
+    assert found == ["4: bridge.topics[1].ros: is the same way as bridge.topics[0]"]
+    found = problems("broker: {listeners: [{bind: ':1883'}, {bind: ':1883'}]}")
+    assert found == ["1: broker.listeners[1].bind: broker.listeners[0] listens there already"]
+    loads("broker: {listeners: [{bind: ':0'}, {bind: ':0'}]}")
+
+
+def test_environment_variables() -> None:
+    text = "robot: ${NAME}\nbroker: {limits: {inflight: '${N:-7}'}}"
+    assert problems("robot: ${NAME}") == ["1: robot: the environment variable NAME is not set"]
+    assert "must be a whole number" in problems(text, NAME="r2")[0]  # in quotes it stays text
+    text = "robot: ${NAME:-c3po}\nbroker:\n  limits:\n    inflight: ${N:-7}"
+    assert loads(text).robot == "c3po"
+    assert loads(text).broker.limits.inflight == 7
+    assert loads(text, NAME="r2", N="9").broker.limits.inflight == 9
+    assert loads(text, NAME="").robot == "c3po"
+    assert loads("broker: {users: '$${HOME}'}", HOME="/").broker.users.name == "${HOME}"
+
+
+def test_secrets_are_masked_in_every_print() -> None:
+    settings = loads(
+        "broker: {plugins: {a.b.C: {password: hunter2, url: 'sql://me:hunter2@db/x', n: [1]}}}"
+    )
+    shown = config.describe(settings)["broker"]["plugins"]["a.b.C"]
+    assert shown == {"password": config.MASK, "url": f"sql://me:{config.MASK}@db/x", "n": [1]}
+    assert settings.broker.plugins["a.b.C"]["password"] == "hunter2"
+    assert "hunter2" not in repr(settings)
+    found = problems("broker: {listeners: [{bind: '${SECRET}'}]}", SECRET="hunter2")
+    assert "hunter2" not in "".join(found)
+
+
+def test_what_is_described_loads_again() -> None:
+    settings = loads(
+        "robot: r2\nbroker: {limits: {queue_bytes: 65 KiB, connect_timeout: 1500 ms}}\n"
+        "bridge: {topics: [{ros: /a, to: mqtt, qos: 1, retain: true, rate: 0.5}]}"
+    )
+    again = loads(yaml.safe_dump(config.describe(settings)))
+    assert again.model_dump() == settings.model_dump()
+
+
+@given(st.integers(0, 1 << 50))
+def test_sizes_are_written_as_they_are_read(size: int) -> None:
+    assert config.parse_size(config.format_size(size)) == size
+
+
+@given(st.integers(0, 10**12))
+def test_durations_are_written_as_they_are_read(milliseconds: int) -> None:
+    text = config.format_duration(milliseconds / 1000)
+    assert config.parse_duration(text) == milliseconds / 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("500 ms", 0.5), ("10s", 10), ("1.5 min", 90), ("2 h", 7200), ("7 d", 604800)],
+)
+def test_durations(text: str, seconds: float) -> None:
+    assert config.parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "10", "ms", "-1 s", "1e3 s", "1 S", "10 seconds", None, 10])
+def test_what_is_no_duration(text: object) -> None:
+    with pytest.raises(ValueError):
+        config.parse_duration(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "bind", "loopback"),
+    [
+        ("0.0.0.0:8883", Bind("0.0.0.0", 8883), False),
+        ("127.0.0.1:0", Bind("127.0.0.1", 0), True),
+        ("localhost:1883", Bind("localhost", 1883), True),
+        ("[::1]:1883", Bind("::1", 1883), True),
+        (":1883", Bind("", 1883), False),
+        ("127.evil.example:1883", Bind("127.evil.example", 1883), False),
+    ],
+)
+def test_binds(text: str, bind: Bind, loopback: bool) -> None:
+    assert config.parse_bind(text) == bind
+    assert bind.loopback is loopback
+    assert str(bind) == text
+
+
+@pytest.mark.parametrize("text", ["", "8883", 8883, "::1:8883", "a:b", "a:99999", "a b:1", "[a:1"])
+def test_what_is_no_bind(text: object) -> None:
+    with pytest.raises(ValueError):
+        config.parse_bind(text)
+
+
+def test_the_file_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(config, "SEARCH_PATH", (Path("appliance.yaml"), tmp_path / "etc.yaml"))
+    with pytest.raises(ConfigError, match="`appliance init` writes one"):
+        config.load()
+    with pytest.raises(ConfigError, match="no such file"):
+        config.load(tmp_path / "other.yaml")
+    (tmp_path / "etc.yaml").write_text("robot: etc")
+    assert config.load().robot == "etc"
+    (tmp_path / "appliance.yaml").write_text("robot: here")
+    assert config.load().robot == "here"
+    assert config.load().broker.users == tmp_path / "users.passwd"
+    (tmp_path / "appliance.yaml").write_bytes(b"robot: \xff")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        config.load()

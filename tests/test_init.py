@@ -1,0 +1,147 @@
+"""`appliance init`: makes what is missing, keeps what is there, and what it makes is good."""
+
+from __future__ import annotations
+
+import ssl
+import stat
+from pathlib import Path
+
+import pytest
+
+from appliance import certs, config
+from appliance.access import Acl, Passwords
+from appliance.broker.ports import Action, Identity
+from appliance.check import check
+from appliance.init import Credentials, InitError, Step, initialise, robot_name
+
+
+def made(steps: list[Step | Credentials]) -> set[str]:
+    return {step.path.name for step in steps if isinstance(step, Step) and step.made}
+
+
+def credentials(steps: list[Step | Credentials]) -> Credentials:
+    assert isinstance(steps[-1], Credentials)
+    return steps[-1]
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_everything_is_made_and_good(tmp_path: Path) -> None:
+    directory = tmp_path / "new" / "robot"
+    steps = list(initialise(directory, robot="R2 D2!"))
+    assert made(steps) == {
+        "appliance.yaml",
+        "ca.crt",
+        "server.crt",
+        "README.md",
+        "acl.conf",
+        "users.passwd",
+    }
+    settings = config.load(directory / "appliance.yaml")
+    assert settings.robot == "R2-D2"
+    assert [finding for finding in check(settings) if finding.level == "error"] == []
+    first = credentials(steps)
+    assert Passwords.load(settings.broker.users).verify(first.user, first.password.encode())
+    assert mode(settings.broker.users) == 0o600
+    assert mode(settings.broker.tls.key) == 0o600
+    assert mode(settings.broker.tls.ca.with_name("ca.key")) == 0o600
+    assert not list(directory.glob(".*"))
+    # Only those who have the CA's certificate trust the server's.
+    ssl.create_default_context(cafile=str(settings.broker.tls.ca))
+
+
+def test_the_first_user_reads_all_of_the_robot_and_writes_what_is_listed(tmp_path: Path) -> None:
+    list(initialise(tmp_path, robot="r2", user="alice"))
+    acl = Acl.load(tmp_path / "acl.conf", "r2")
+    expected = {
+        (Action.RECEIVE, "r2/odom"): True,
+        (Action.SUBSCRIBE, "r2/#"): True,
+        (Action.SUBSCRIBE, "$SYS/#"): True,
+        (Action.PUBLISH, "r2/cmd_vel"): True,
+        (Action.PUBLISH, "r2/odom"): False,
+        (Action.RECEIVE, "other/odom"): False,
+        (Action.PUBLISH, "$SYS/broker/uptime"): False,
+    }
+    alice = Identity("alice", "client")
+    decisions = {key: acl.decide(alice, *key).allowed for key in expected}
+    assert decisions == expected
+    for nobody in (Identity("bob", "client"), Identity(None, "client")):
+        assert not any(acl.decide(nobody, *key).allowed for key in expected)
+
+
+def test_a_second_time_everything_is_kept(tmp_path: Path) -> None:
+    list(initialise(tmp_path))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    steps = list(initialise(tmp_path))
+    assert made(steps) == set()
+    assert not any(isinstance(step, Credentials) for step in steps)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_only_what_is_missing_is_made(tmp_path: Path) -> None:
+    list(initialise(tmp_path))
+    authority = (tmp_path / "certs/ca.crt").read_bytes()
+    (tmp_path / "certs/server.crt").unlink()
+    (tmp_path / "acl.conf").unlink()
+    assert made(list(initialise(tmp_path))) == {"server.crt", "acl.conf"}
+    assert (tmp_path / "certs/ca.crt").read_bytes() == authority
+    findings = list(check(config.load(tmp_path / "appliance.yaml")))
+    assert {finding.level for finding in findings} <= {"ok", "warning"}
+
+
+def test_a_configuration_that_names_other_files(tmp_path: Path) -> None:
+    (tmp_path / "appliance.yaml").write_text(
+        "robot: r2\nbroker: {users: etc/u, acl: etc/a, tls: {certificate: x.crt, key: x.key}}"
+    )
+    with pytest.raises(InitError, match=r"x\.crt"):
+        list(initialise(tmp_path))
+    certs.create_authority(tmp_path)
+    certs.issue_server(tmp_path, ["localhost"], [])
+    (tmp_path / "server.crt").rename(tmp_path / "x.crt")
+    (tmp_path / "server.key").rename(tmp_path / "x.key")
+    assert made(list(initialise(tmp_path))) == {"a", "u"}
+
+
+def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
+    steps = list(initialise(tmp_path, demo=True))
+    file = tmp_path / "user.password"
+    assert file.read_text() == credentials(steps).password + "\n"
+    assert mode(file) == 0o600
+    settings = config.loads(
+        (tmp_path / "appliance.yaml").read_text(),
+        tmp_path / "appliance.yaml",
+        {"APPLIANCE_PORT": "0", "APPLIANCE_PLAIN_PORT": "1"},
+    )
+    assert settings.robot == "demo"
+    assert [listener.bind.port for listener in settings.broker.listeners] == [0, 1]
+    assert {(route.ros, route.to) for route in settings.bridge.topics} == {
+        ("/odom", "mqtt"),
+        ("/battery", "mqtt"),
+        ("/scan", "mqtt"),
+        ("/chatter", "mqtt"),
+        ("/cmd_vel", "ros"),
+    }
+
+
+def test_what_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(InitError, match="user name"):
+        list(initialise(tmp_path, user="a:b"))
+    assert list(tmp_path.iterdir()) == []
+    list(initialise(tmp_path, robot="r2"))
+    with pytest.raises(InitError, match="robot: r2"):
+        list(initialise(tmp_path, robot="c3po"))
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [("r2d2", "r2d2"), ("R2 D2!", "R2-D2"), ("_x/+#", "x"), ("Zoë", "Zo"), ("漢", "robot")],
+)
+def test_robot_names(text: str, name: str) -> None:
+    assert robot_name(text) == name
+    assert config.loads(f"robot: '{name}'", Path("x.yaml"), {}).robot == name
+
+
+def test_a_long_robot_name() -> None:
+    config.loads(f"robot: {robot_name('r' * 99)}", Path("x.yaml"), {})

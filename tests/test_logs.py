@@ -1,0 +1,87 @@
+"""Log lines, for people and for machines."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from appliance import logs
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Iterator[None]:
+    names = ("", "appliance", "appliance.ros", "amqtt")
+    root = logging.getLogger()
+    levels = {name: logging.getLogger(name).level for name in names}
+    handlers = root.handlers[:]
+    yield
+    root.handlers[:] = handlers
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_level_for_each_logger() -> None:
+    stream = io.StringIO()
+    logs.setup("info", {"appliance.ros": "debug", "amqtt": "error"}, stream=stream)
+    for name in ("appliance.broker", "appliance.ros.bridge", "amqtt.plugins", "other"):
+        for level in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR):
+            logging.getLogger(name).log(level, name)
+    found = [(line.split()[2], line.split()[3]) for line in stream.getvalue().splitlines()]
+    assert found == [
+        ("INFO", "broker:"),
+        ("WARNING", "broker:"),
+        ("ERROR", "broker:"),
+        ("DEBUG", "ros.bridge:"),
+        ("INFO", "ros.bridge:"),
+        ("WARNING", "ros.bridge:"),
+        ("ERROR", "ros.bridge:"),
+        ("ERROR", "amqtt.plugins:"),
+        ("WARNING", "other:"),
+        ("ERROR", "other:"),
+    ]
+
+
+def test_strangers_cannot_forge_lines_or_command_the_terminal() -> None:
+    stream = io.StringIO()
+    logs.setup(stream=stream)
+    logging.getLogger("appliance.x").info("client %s", "a\nERROR b\x1b[2J\x9b\u2028é")
+    assert stream.getvalue().endswith("x: client a\\x0aERROR b\\x1b[2J\\x9b\\u2028é\n")
+
+
+def test_colour_only_on_a_terminal_that_wants_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for stream, coloured in ((Terminal(), True), (io.StringIO(), False)):
+        logs.setup(stream=stream)
+        logging.getLogger("appliance").warning("x")
+        assert ("\x1b[" in stream.getvalue()) is coloured
+    monkeypatch.setenv("NO_COLOR", "1")
+    logs.setup(stream=(stream := Terminal()))
+    logging.getLogger("appliance").warning("x")
+    assert "\x1b[" not in stream.getvalue()
+
+
+def test_json_is_one_object_a_line() -> None:
+    logs.setup(form="json", stream=(stream := io.StringIO()))
+    try:
+        raise KeyError("x\ny")
+    except KeyError:
+        logging.getLogger("appliance.broker").exception("two\nlines: %s", "é")
+    line, *rest = stream.getvalue().splitlines()
+    assert rest == []
+    entry = json.loads(line)
+    assert entry["level"] == "error"
+    assert entry["logger"] == "appliance.broker"
+    assert entry["message"] == "two\nlines: é"
+    assert "KeyError" in entry["exception"]
+    assert entry["time"].endswith("Z")
+    assert sys.exc_info() == (None, None, None)
