@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import ctypes
 import importlib.util
 import shlex
 import signal
 import socket
-import subprocess
 import sys
-import threading
-import time
+from asyncio.subprocess import Process
 from pathlib import Path
 
 import typer
+import uvloop
 
-from appliance import app
 from appliance.access import Passwords
+from appliance.app import App
 from appliance.config import Bind, Settings
 from appliance.environment import for_other_programs
 from appliance.init import PASSWORD_FILE
 
-START_TIMEOUT = 30.0  # seconds until the broker takes connections
 STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -32,18 +32,47 @@ class TourError(Exception):
 
 def run(settings: Settings) -> int:
     """Runs broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
-    secure = [listener.bind for listener in settings.broker.listeners if listener.tls]
-    if not secure:
+    if not any(listener.tls for listener in settings.broker.listeners):
         raise TourError("the demo needs a listener with tls: true")
     for listener in settings.broker.listeners:
         _check_free(listener.bind)
-    robot = _start_robot(settings)
-    threading.Thread(target=_announce, args=(settings, secure[0], robot), daemon=True).start()
-    try:
-        return app.run(settings)
-    finally:
-        if robot is not None:
-            _stop(robot)
+    uvloop.run(_main(settings))
+    return 0
+
+
+async def _main(settings: Settings) -> None:
+    await Tour(settings).run()
+
+
+class Tour(App):
+    """The appliance with a demo robot beside it, which starts and stops with it."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        self._robot: Process | None = None
+        self._watching: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Starts everything, then says what to type. Raises what App.start raises."""
+        await super().start()
+        self._robot = await _start_robot(self.settings)
+        if self._robot is not None:
+            self._watching = asyncio.create_task(_watch(self._robot))
+        for listener, (host, port) in zip(
+            self.settings.broker.listeners, self.addresses, strict=True
+        ):
+            if listener.tls:
+                here = "localhost" if host in ("", "0.0.0.0", "::", "127.0.0.1") else host
+                _say(instructions(self.settings, here, port))
+                break
+
+    async def stop(self) -> None:
+        """Stops the robot, then the appliance; may be called twice."""
+        if self._watching is not None:
+            self._watching.cancel()
+        if self._robot is not None:
+            await _stop(self._robot)
+        await super().stop()
 
 
 def _check_free(bind: Bind) -> None:
@@ -59,7 +88,7 @@ def _check_free(bind: Bind) -> None:
             ) from None
 
 
-def _start_robot(settings: Settings) -> subprocess.Popen[bytes] | None:
+async def _start_robot(settings: Settings) -> Process | None:
     if settings.bridge.bus == "none":
         return None
     if importlib.util.find_spec("rclpy") is None:
@@ -69,40 +98,29 @@ def _start_robot(settings: Settings) -> subprocess.Popen[bytes] | None:
         )
         return None
     libc = ctypes.CDLL(None)  # before the fork: nothing may be loaded after it
-    return subprocess.Popen(
-        [sys.executable, "-m", "appliance.demo"],
+    return await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "appliance.demo",
         env=for_other_programs(),
         # The robot must not drive on when this process is killed.
         preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
     )
 
 
-def _stop(robot: subprocess.Popen[bytes]) -> None:
-    robot.terminate()
+async def _watch(robot: Process) -> None:
+    code = await robot.wait()
+    _say(f"The demo robot ended (exit code {code}); the broker runs on without it.")
+
+
+async def _stop(robot: Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        robot.terminate()
     try:
-        robot.wait(STOP_TIMEOUT)
-    except subprocess.TimeoutExpired:
+        await asyncio.wait_for(robot.wait(), STOP_TIMEOUT)
+    except asyncio.TimeoutError:
         robot.kill()
-        robot.wait()
-
-
-def _announce(settings: Settings, secure: Bind, robot: subprocess.Popen[bytes] | None) -> None:
-    """Waits until clients can connect, then says how; runs in a thread of its own."""
-    host = secure.host if secure.host not in ("", "0.0.0.0", "::") else "localhost"
-    deadline = time.monotonic() + START_TIMEOUT
-    while time.monotonic() < deadline:
-        try:
-            socket.create_connection((host, secure.port), timeout=1).close()
-            break
-        except OSError:
-            time.sleep(0.05)
-    else:
-        return
-    if robot is not None:
-        code = robot.poll()
-        if code is not None:
-            _say(f"The demo robot ended (exit code {code}); the broker runs without it.")
-    _say(instructions(settings, host, secure.port))
+        await robot.wait()
 
 
 def instructions(settings: Settings, host: str, port: int) -> str:
@@ -117,6 +135,8 @@ def instructions(settings: Settings, host: str, port: int) -> str:
     )
     command = _quoted(Path(sys.executable).parent / "appliance")
     options = f"-c {_quoted(settings.file or Path('appliance.yaml'))} -u {shlex.quote(user)}"
+    if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
+        options += f" -p {port}"
     options += f" --password-file {_quoted(password)}" if password.exists() else ""
     robot = settings.robot
     twist = '\'{"linear": {"x": 0.5}, "angular": {"z": 0.3}}\''

@@ -1,25 +1,6 @@
-"""`appliance bench`: this broker and mosquitto, side by side, under the same load.
-
-Both are started with equal settings on this computer, driven in turn from a separate process, and
-compared by what they need: CPU time a delivered message first, as it is the steadiest on a computer
-that does other things, then messages a second and latency.
-"""
+"""`appliance bench`: this broker and mosquitto, side by side, under the same load."""
 
 from __future__ import annotations
-
-import signal
-import sys
-import threading
-from types import FrameType
-
-from rich.console import Console
-from rich.markup import escape
-
-from appliance.bench import report
-from appliance.bench.cells import CELLS, REPEATS, Row, compare
-from appliance.bench.peers import find_mosquitto, mosquitto_version
-
-INTERRUPTED = 130  # as a shell says it
 
 
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
@@ -28,58 +9,7 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
     `cells` are names of CELLS (None: all), `seconds` the length of one run, `peer` the mosquitto to
     compare with (None: the one that is installed). Unmet goals are shown and are no failure.
     """
-    console = Console(stderr=True)
-    known = {cell.name: cell for cell in CELLS}
-    if unknown := [name for name in cells or () if name not in known]:
-        console.print(f"no such cell: {', '.join(unknown)}; there are {', '.join(known)}")
-        return 2
-    if seconds <= 0:
-        console.print("the seconds to measure must be more than 0")
-        return 2
-    command = find_mosquitto(peer)
-    if command is None and peer is not None:
-        console.print(f"{peer} is not there, or cannot be run")
-        return 2
-    if command is None:
-        console.print(
-            "mosquitto is not installed (apt install mosquitto): measuring the appliance alone"
-        )
-    chosen = [known[name] for name in cells] if cells else list(CELLS)
-    rows: list[Row] = []
-    status = 0
-    with _Terminated(), console.status("") as shown:
-        try:
-            for number, cell in enumerate(chosen, 1):
-                where = f"{number} of {len(chosen)}: {cell.title}"
-                if not console.is_terminal:
-                    console.print(where, highlight=False)
+    # Only here: the load's processes are of this package too, and need nothing of it all.
+    from appliance.bench import command
 
-                def progress(text: str, where: str = where) -> None:
-                    shown.update(escape(f"{where}: {text}"))
-
-                rows.append(compare(cell, command, seconds, progress=progress))
-        except KeyboardInterrupt:
-            console.print("interrupted; what was measured until then:")
-            status = INTERRUPTED
-    version = mosquitto_version(command) if command else None
-    if as_json:
-        sys.stdout.write(report.to_json(rows, version, seconds, REPEATS) + "\n")
-    else:
-        report.show(rows, version)
-    return status or int(any(row.problem for row in rows))
-
-
-class _Terminated:
-    """Inside, SIGTERM ends the way Ctrl-C does: everything that was started is stopped."""
-
-    def __enter__(self) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGTERM, self._interrupt)
-
-    def __exit__(self, *_: object) -> None:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, self._before)
-
-    @staticmethod
-    def _interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
+    return command.main(cells, seconds, peer, as_json)

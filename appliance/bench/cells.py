@@ -275,40 +275,37 @@ def compare(
         return Row(cell, missing=missing)
     # A connection's memory shows in a process that has not freed any: one run, a process each.
     repeats = 1 if "memory_kib" in cell.goals else repeats
-    runs: dict[str, list[Result]] = {}
+    runs: dict[str, list[Result]] = {"ours": [], "peer": []}
     problems: dict[str, str] = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="appliance-bench-") as directory,
-        contextlib.ExitStack() as stack,
-    ):
+    with tempfile.TemporaryDirectory(prefix="appliance-bench-") as directory:
         site = Site(Path(directory))
         site.prepare()
-        sides: list[tuple[str, Side]] = []
-        starts: list[tuple[str, Callable[[], contextlib.AbstractContextManager[Side]]]] = [
-            ("ours", lambda: cell.ours(site))
-        ]
+        starts = {"ours": cell.ours(site)}
         if command is not None:
-            starts.append(("peer", lambda: cell.peer(site, command)))
-        for whose, start in starts:
-            progress("starting")
-            try:
-                sides.append((whose, stack.enter_context(start())))
-            except PeerError as error:
-                problems[whose] = str(error)
-        for repeat in range(repeats):
-            for whose, side in sides:
-                if whose in problems:
-                    continue
-                progress(f"{side.name}, {repeat + 1} of {repeats}")
-                try:
-                    result = side.measure(seconds)
-                    runs.setdefault(whose, []).append(result)
-                except PeerError as error:
-                    problems[whose] = f"{side.name}: {error}"
-        progress("stopping")
+            starts["peer"] = cell.peer(site, command)
+        try:
+            with contextlib.ExitStack() as stack:
+                sides: dict[str, Side] = {}
+                progress("starting")
+                for whose, start in starts.items():
+                    try:
+                        sides[whose] = stack.enter_context(start)
+                    except PeerError as error:
+                        problems[whose] = str(error)
+                for repeat in range(repeats):
+                    for whose, side in sides.items():
+                        if whose not in problems:
+                            progress(f"{side.name}, {repeat + 1} of {repeats}")
+                            try:
+                                runs[whose].append(side.measure(seconds))
+                            except PeerError as error:
+                                problems[whose] = f"{side.name}: {error}"
+                progress("stopping")
+        except PeerError as error:  # what should be running at the end has ended before
+            problems["end"] = str(error)
     return Row(
         cell,
-        ours=median(runs["ours"]) if "ours" in runs else None,
-        peer=median(runs["peer"]) if "peer" in runs else None,
+        ours=median(runs["ours"]) if runs["ours"] else None,
+        peer=median(runs["peer"]) if runs["peer"] else None,
         problem="; ".join(problems.values()) or None,
     )

@@ -118,7 +118,10 @@ def mqtt_receive(target: Target, topic: str, meter: Meter, seconds: float) -> No
         client.socket.settimeout(FIRST_SECONDS)
         until = time.monotonic() + FIRST_SECONDS + SETTLE_SECONDS + 2 * seconds
         while not meter.complete and time.monotonic() < until:
-            filled += client.transport.recv_into(buffer[filled:])
+            try:
+                filled += client.transport.recv_into(buffer[filled:])
+            except TimeoutError:
+                return  # which the meter puts into words
             whole = filled - filled % size
             for end in range(size, whole + 1, size):
                 meter.add(bytes(buffer[end - TEXT_BYTES : end]))

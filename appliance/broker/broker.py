@@ -15,7 +15,7 @@ from typing import Protocol
 
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
-from appliance.broker.session import Counters, Ledger, PendingWill, Session
+from appliance.broker.session import Ledger, PendingWill, Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -57,8 +57,10 @@ class Route:
     """What is known about one topic for one publishing session, until the epoch changes."""
 
     topic: str
-    decision: Decision
-    #: Reason for the client when `decision` is no.
+    allowed: bool
+    #: The rule that decided.
+    reason: str
+    #: What the client is told when it is not allowed.
     refusal: ReasonCode
     #: session, granted QoS, retain as published, subscription identifiers
     targets: list[tuple[Session, int, bool, list[int] | None]]
@@ -72,6 +74,8 @@ class Broker:
         self.store = store
         self.limits = limits or Limits()
         self.ledger = Ledger(self.limits, store)
+        #: What the broker counts.
+        self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
         self.retained: TopicTree[Message] = TopicTree()
         self.retained_bytes = 0
@@ -85,11 +89,6 @@ class Broker:
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription]] = SubscriptionTree()
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
-
-    @property
-    def counters(self) -> Counters:
-        """What the broker counts."""
-        return self.ledger.counters
 
     @property
     def now(self) -> float:
@@ -255,7 +254,7 @@ class Broker:
             raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
         decision, refusal = self._may_publish(session, topic)
         targets = self._targets(session, topic) if decision else []
-        return Route(topic, decision, refusal, targets)
+        return Route(topic, decision.allowed, decision.reason, refusal, targets)
 
     def _may_publish(self, session: Session, topic: str) -> tuple[Decision, ReasonCode]:
         if session.identity is None:
@@ -303,34 +302,35 @@ class Broker:
         Raises:
             ProtocolError: the topic is not valid.
         """
-        route = (
-            origin.routes.get(message.topic_wire) if origin.epoch == self.epoch else None
-        ) or self.route(origin, message.topic_wire)
-        if not route.decision:
+        return self.publish_on(self.route(origin, message.topic_wire), message, origin)
+
+    def publish_on(self, route: Route, message: Message, origin: Session) -> ReasonCode:
+        """`publish`, for who has the message's route already."""
+        if not route.allowed:
             self.refuse_publish(origin, route)
             return route.refusal
         if self.observer is not None:
             self.observer.published(origin, message)
-        if message.retain and not self._retain(message):
+        retain = message.retain
+        if retain and not self._retain(message):
             return ReasonCode.QUOTA_EXCEEDED
-        delivered = full = 0
+        outcome = ReasonCode.NO_MATCHING_SUBSCRIBERS
         published_qos = message.qos
         for session, qos, as_published, subscription_ids in route.targets:
             if qos > published_qos:
                 qos = published_qos
-            if session.deliver(message, qos, message.retain and as_published, subscription_ids):
-                delivered = 1
+            if session.deliver(message, qos, retain and as_published, subscription_ids):
+                outcome = ReasonCode.SUCCESS
             elif qos:
-                full = 1
                 self._tell_full(session)
-        if delivered:
-            return ReasonCode.SUCCESS
-        return ReasonCode.QUOTA_EXCEEDED if full else ReasonCode.NO_MATCHING_SUBSCRIBERS
+                if outcome:
+                    outcome = ReasonCode.QUOTA_EXCEEDED
+        return outcome
 
     def refuse_publish(self, session: Session, route: Route) -> None:
         """Count and log that the session may not publish to the route's topic."""
         self.counters.publish_refused += 1
-        log.warning("%s may not publish to '%s': %s", session, route.topic, route.decision.reason)
+        log.warning("%s may not publish to '%s': %s", session, route.topic, route.reason)
 
     def _tell_full(self, session: Session) -> None:
         if session.full_since is None or self.now - session.full_since >= FULL_QUEUE_LOG_INTERVAL:
@@ -490,17 +490,19 @@ class Broker:
         With something staged in the store this waits for its commit: acknowledged means kept.
         """
         if self.store.staged:
-            self.store.after_commit(self._write_out)
-        else:
-            self._write_out(True)
-
-    def _write_out(self, kept: bool) -> None:
-        clients, self.unflushed = self.unflushed, []
+            self.store.after_commit(self._committed)
+            return
+        clients = self.unflushed
+        self.unflushed = []
         for client in clients:
-            if kept:
-                client.flush()
-            else:
+            client.flush()
+
+    def _committed(self, kept: bool) -> None:
+        if not kept:
+            clients, self.unflushed = self.unflushed, []
+            for client in clients:
                 client.abandon()
+        self.flush()
 
     def close(self, close: Callable[[Session], None]) -> None:
         """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""

@@ -21,7 +21,6 @@ from appliance.mqtt.connection import (
     PUBREL,
     Connection,
     RawPublish,
-    State,
 )
 from appliance.mqtt.packets import (
     Auth,
@@ -85,6 +84,8 @@ class Client:
         self.connection = Connection(broker.limits.packet_size, broker.limits.topic_alias)
         self.writable = True
         self.session: Session | None = None
+        self._ledger = broker.ledger
+        self._counters = broker.counters
         self._connect: Connect | None = None
         self._out: list[bytes] = []
         self._silence = 0.0  # seconds; 0 for none
@@ -101,14 +102,16 @@ class Client:
 
     def receive(self, data: bytes) -> None:
         """Take in what came from the network and do what it says."""
-        self.broker.counters.bytes_received += len(data)
-        now = self.broker.now
+        counters = self._counters
+        counters.bytes_received += len(data)
+        now = self._ledger.now
         try:
             for event in self.connection.receive_data(data):
                 self._heard_at = now  # complete packets count, dripping bytes do not
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
+                    counters.control_received += 1
                     self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
                     self._on_packet(event)  # type: ignore[arg-type]
@@ -121,25 +124,25 @@ class Client:
         broker = self.broker
         session = self.session
         assert session is not None
-        counters = broker.counters
-        counters.messages_received += 1
+        counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(payload)
-        # The route is asked for its topic, so that it is decoded and checked once, not each time.
-        route = (
-            session.routes.get(topic_wire) if session.epoch == broker.epoch else None
-        ) or broker.route(session, topic_wire)
+        # The route has the topic decoded and checked, which would else be done for each message.
+        if session.epoch == broker.epoch and topic_wire in session.routes:
+            route = session.routes[topic_wire]
+        else:
+            route = broker.route(session, topic_wire)
         qos = first >> 1 & 3
-        message = Message(route.topic, payload, qos, bool(first & 1), topic_wire=topic_wire)
-        # What came in is what goes out, to a receiver with the same version, QoS and flags: its
-        # bytes are taken over instead of being encoded again.
-        message.wire[self._version << 8 | first & 0xF7] = (
-            head if not first & 8 else bytes((first & 0xF7,)) + head[1:]
-        )
+        message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
+        if not first & 8:
+            # What came in is what goes out to a receiver with the same version, QoS and flags:
+            # its bytes are taken over instead of being encoded again.
+            message.wire_key = self._version << 8 | first
+            message.wire_head = head
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
-        code = broker.publish(message, session)
+        code = broker.publish_on(route, message, session)
         if qos:
             self._acknowledge(0x40, packet_id, code)
 
@@ -148,7 +151,7 @@ class Client:
         session = self.session
         assert session is not None
         broker = self.broker
-        counters = broker.counters
+        counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(packet.payload)
         message = Message(
@@ -176,7 +179,7 @@ class Client:
         code = ReasonCode.SUCCESS
         if packet_id in session.received:
             pass  # sent again: PUBREC goes out again [MQTT-4.3.3-12]
-        elif not route.decision:
+        elif not route.allowed:
             self.broker.refuse_publish(session, route)
             # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
             code = route.refusal
@@ -196,7 +199,6 @@ class Client:
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
         assert session is not None
-        self.broker.counters.messages_received += 1
         if kind == PUBACK:
             if not session.puback(packet_id):
                 log.debug("%s: PUBACK %d for nothing in flight", self, packet_id)
@@ -218,13 +220,12 @@ class Client:
 
     def _on_packet(self, packet: Packet) -> None:
         if isinstance(packet, Publish):
-            self.broker.counters.messages_received += 1
             self._on_publish(packet)
             return
+        self._counters.control_received += 1
         if isinstance(packet, Puback | Pubrec | Pubrel | Pubcomp):
             self._on_acknowledgement(packet.TYPE << 16, packet.packet_id, packet.reason_code)
             return
-        self.broker.counters.messages_received += 1
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
         elif isinstance(packet, Subscribe):
@@ -295,7 +296,7 @@ class Client:
             return
         self._connect = packet
         # What follows a CONNECT is read only once it is known who sent it.
-        self.connection.paused = True
+        self.connection.pause()
         self.wire.authenticate(packet)
 
     def refuse(self, code: ReasonCode, reason: str) -> None:
@@ -311,7 +312,7 @@ class Client:
             self.wire.address,
             reason,
         )
-        self.broker.counters.connects_refused += 1
+        self._counters.connects_refused += 1
         self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
 
@@ -339,9 +340,9 @@ class Client:
         self.session = session
         self._maximum_packet_size = options.maximum_packet_size
         self._silence = 1.5 * options.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
-        self._heard_at = self.broker.now
-        self.connection.state = State.CONNECTED
-        counters = self.broker.counters
+        self._heard_at = self._ledger.now
+        self.connection.accept()
+        counters = self._counters
         counters.connects += 1
         self.broker.clients.add(self)
         counters.clients_maximum = max(counters.clients_maximum, len(self.broker.clients))
@@ -355,7 +356,6 @@ class Client:
             ", session continued" if present else "",
         )
         self.broker.connected(session)
-        self.connection.paused = False
         self.receive(b"")  # what came behind CONNECT
 
     def _options(self, packet: Connect) -> ConnectOptions:
@@ -406,7 +406,7 @@ class Client:
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        return self.broker.now + interval if isinstance(interval, int) else None
+        return self._ledger.now + interval if isinstance(interval, int) else None
 
     # --- bytes out: the Link of the session ----------------------------------------------------
 
@@ -424,28 +424,30 @@ class Client:
         if dup:
             first |= 8
         version = self._version
-        out = self._out
-        if not out:
-            self.broker.unflushed.append(self)
-        counters = self.broker.counters
         if self._maximum_packet_size and self._too_large(message, subscription_ids):
-            counters.publish_dropped += 1
+            self._counters.publish_dropped += 1
             if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
                 self.session.give_up(packet_id)
             return
+        out = self._out
+        if not out:
+            self.broker.unflushed.append(self)
         if version == 5 and (subscription_ids or message.expires_at is not None):
-            out.append(message.encode_for(first, packet_id, subscription_ids, self.broker.now))
+            out.append(message.encode_for(first, packet_id, subscription_ids, self._ledger.now))
         else:
-            out.append(message.wire.get(version << 8 | first) or message.head(version, first))
+            if message.wire_key == version << 8 | first:
+                out.append(message.wire_head)
+            else:
+                out.append(message.head(version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
                 out.append(message.payload if version == 4 else message.tail(5))
-        counters.messages_sent += 1
+        counters = self._counters
         counters.publish_sent += 1
         counters.publish_bytes_sent += len(message.payload)
 
     def _too_large(self, message: Message, subscription_ids: list[int] | None) -> bool:
-        size = len(message.encode_for(0x32, 1, subscription_ids, self.broker.now))
+        size = len(message.encode_for(0x32, 1, subscription_ids, self._ledger.now))
         return size > self._maximum_packet_size
 
     def pubrel(self, packet_id: int) -> None:
@@ -461,13 +463,13 @@ class Client:
             out.append(bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code)))
         else:
             out.append(bytes((first, 2, packet_id >> 8, packet_id & 0xFF)))
-        self.broker.counters.messages_sent += 1
+        self._counters.control_sent += 1
 
     def _send(self, packet: Packet) -> None:
         if not self._out:
             self.broker.unflushed.append(self)
         self._out.append(packet.encode(self._version or 4))
-        self.broker.counters.messages_sent += 1
+        self._counters.control_sent += 1
 
     def flush(self) -> None:
         """Write what was sent since the last flush."""
@@ -529,7 +531,7 @@ class Client:
 
     def _shut(self) -> None:
         self._closed = True
-        self.connection.state = State.CLOSED
+        self.connection.close()
         self.writable = False
         self.broker.clients.discard(self)
         self.flush()

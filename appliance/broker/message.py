@@ -19,10 +19,10 @@ class Message:
 
     `topic_wire` is the topic as it stands in a PUBLISH, its two length bytes included. `expires_at`
     is in seconds of the broker's clock (`Broker.now`), None when the message does not expire.
-    `wire` caches the encoded beginnings (QoS 0: whole packets), by ``version << 8 | first byte``.
     """
 
     __slots__ = (
+        "_heads",
         "_tail5",
         "expires_at",
         "payload",
@@ -32,7 +32,8 @@ class Message:
         "size",
         "topic",
         "topic_wire",
-        "wire",
+        "wire_head",
+        "wire_key",
     )
 
     def __init__(
@@ -52,7 +53,11 @@ class Message:
         self.properties = properties
         self.expires_at = expires_at
         self.topic_wire = topic_wire or encode_string(topic)
-        self.wire: dict[int, bytes] = {}
+        #: One encoded beginning (QoS 0: the whole packet), and what it is for: the packet as it
+        #: came, most often, which most often goes out again as it is. `head` knows the others.
+        self.wire_key = 0
+        self.wire_head = b""
+        self._heads: dict[int, bytes] | None = None
         self._tail5: bytes | None = None
         #: Bytes that a queue counts for this message.
         self.size = len(payload) + len(self.topic_wire) + OVERHEAD
@@ -60,7 +65,11 @@ class Message:
     def head(self, version: int, first: int) -> bytes:
         """The packet's bytes up to the topic's end; for QoS 0 to the packet's end."""
         key = version << 8 | first
-        head = self.wire.get(key)
+        if key == self.wire_key:
+            return self.wire_head
+        if self._heads is None:
+            self._heads = {}
+        head = self._heads.get(key)
         if head is None:
             tail = self.tail(version)
             packet_id = 2 if first & 0x06 else 0
@@ -68,7 +77,7 @@ class Message:
             head = bytes((first,)) + encode_varint(size) + self.topic_wire
             if not packet_id:
                 head += tail
-            self.wire[key] = head
+            self._heads[key] = head
         return head
 
     def tail(self, version: int) -> bytes:

@@ -25,8 +25,8 @@ class Counters:
 
     bytes_received: int = 0
     bytes_sent: int = 0
-    messages_received: int = 0
-    messages_sent: int = 0
+    control_received: int = 0
+    control_sent: int = 0
     publish_received: int = 0
     publish_sent: int = 0
     publish_dropped: int = 0
@@ -38,6 +38,16 @@ class Counters:
     sockets: int = 0
     sessions_expired: int = 0
     clients_maximum: int = 0
+
+    @property
+    def messages_received(self) -> int:
+        """Packets of all kinds that came in: `control_received` are those that are no PUBLISH."""
+        return self.publish_received + self.control_received
+
+    @property
+    def messages_sent(self) -> int:
+        """Packets of all kinds that went out."""
+        return self.publish_sent + self.control_sent
 
 
 @dataclass(slots=True)
@@ -133,31 +143,31 @@ class Session:
     ) -> bool:
         """Send the message, or keep it for later; False when it was dropped, and counted."""
         link = self.link
-        if qos:
-            if (
-                link is not None
-                and link.writable
-                and not self.queue
-                and not self.replays
-                and len(self.inflight) < self.window
-            ):
-                if self._has_room(message):
-                    self._send(link, (message, qos, retain, subscription_ids))
-                    return True
-            elif len(self.queue) < self.ledger.limits.queue_messages and self._has_room(message):
-                self._count(message)
-                self.queue.append((message, qos, retain, subscription_ids))
-                if self.persistent:
-                    self.ledger.store.queued(self, message, qos)
+        if not qos:
+            if link is None:
+                return False  # QoS 0 is not kept for an absent client, as the standard allows
+            if link.writable and not self.replays:
+                link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
-            self.ledger.counters.publish_dropped += 1
-            return False
-        if link is None:
-            return False  # QoS 0 is not kept for an absent client, as the standard allows
-        if link.writable and not self.replays:
-            link.publish(message, 0, 0, False, retain, subscription_ids)
+            return self._keep_latest((message, 0, retain, subscription_ids))
+        if (
+            link is not None
+            and link.writable
+            and not self.queue
+            and not self.replays
+            and len(self.inflight) < self.window
+        ):
+            if self._has_room(message):
+                self._send(link, (message, qos, retain, subscription_ids))
+                return True
+        elif len(self.queue) < self.ledger.limits.queue_messages and self._has_room(message):
+            self._count(message)
+            self.queue.append((message, qos, retain, subscription_ids))
+            if self.expiry:
+                self.ledger.store.queued(self, message, qos)
             return True
-        return self._keep_latest((message, 0, retain, subscription_ids))
+        self.ledger.counters.publish_dropped += 1
+        return False
 
     def replay(self, message: Message, qos: int, subscription_ids: list[int] | None) -> None:
         """Send a retained message, behind those before it; the reference is all that it costs."""
@@ -204,13 +214,13 @@ class Session:
 
     def _send(self, link: Link, delivery: Delivery) -> None:
         message, qos, retain, subscription_ids = delivery
+        inflight = self.inflight
         packet_id = self._last_packet_id % 65535 + 1
-        while packet_id in self.inflight:  # [MQTT-2.2.1-3]
+        while packet_id in inflight:  # [MQTT-2.2.1-3]
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
-        self.inflight[packet_id] = delivery
-        self.bytes += message.size
-        self.ledger.queued_bytes += message.size
+        inflight[packet_id] = delivery
+        self._count(message)
         if self.expiry:
             self.ledger.store.queued(self, message, qos)
         link.publish(message, qos, packet_id, False, retain, subscription_ids)

@@ -13,7 +13,7 @@ standard says is absent, and `tests/mqtt/test_connection.py` holds them against 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from enum import Enum
 from typing import TypeAlias
 
@@ -45,8 +45,8 @@ class State(Enum):
 
     NEW = "before CONNECT"
     AUTHENTICATING = "before CONNACK"
-    CONNECTED = "connected"
-    CLOSED = "closed"
+    CONNECTED = "after CONNACK"
+    CLOSED = "after the end"
 
 
 # What a client may send, and when; an absent entry is the error 0x82.
@@ -84,8 +84,9 @@ class Connection:
         self.topic_alias_maximum = topic_alias_maximum
         self.state = State.NEW
         self.version = 0
-        #: Set by the owner: nothing more is yielded until `receive_data` is called without it.
-        self.paused = False
+        #: False while nothing may be yielded: paused, or closed.
+        self._reading = True
+        #: What was received and not yet taken apart; joined once `_need` bytes are there.
         self._chunks: list[bytes] = []
         self._have = 0
         self._need = 0
@@ -96,108 +97,106 @@ class Connection:
         """Bytes that were received and not yet taken apart."""
         return self._have
 
+    def pause(self) -> None:
+        """Keep what comes from here on, until `accept`."""
+        self._reading = False
+
+    def accept(self) -> None:
+        """The client has logged in; `receive_data(b"")` yields what came in the meantime."""
+        self.state = State.CONNECTED
+        self._reading = True
+
+    def close(self) -> None:
+        """Yield nothing more, keep nothing more."""
+        self.state = State.CLOSED
+        self._reading = False
+        self._chunks.clear()
+        self._have = 0
+
     def receive_data(self, data: bytes) -> Iterator[Event]:
         """Yield what `data`, behind what came before it, completes.
 
         A generator, so that what one packet changes (refused, paused, closed) holds for the next.
-        It must be run to its end, or `keep` the connection closed.
+        It is to be run to its end.
 
         Raises:
-            ProtocolError: the bytes or their order are wrong; the connection is `State.CLOSED`.
+            ProtocolError: the bytes or their order are wrong; the connection is closed.
         """
-        # A packet cut into many chunks is joined once, when it is whole: joining at every chunk
-        # would copy a 16 MiB packet a hundred times over.
         if self._have:
+            # A packet cut into many chunks is joined once, when it is whole: joining at every
+            # chunk would copy a 16 MiB packet a hundred times over.
             self._chunks.append(data)
             self._have += len(data)
-            if self._have < self._need or self.paused:
+            if self._have < self._need or not self._reading:
                 return
-            data = b"".join(self._chunks)
+            buf = b"".join(self._chunks)
             self._chunks.clear()
             self._have = 0
-        try:
-            pos = yield from self._parse(data)
-        except ProtocolError:
-            self.state = State.CLOSED
-            raise
-        if pos < len(data) and self.state is not State.CLOSED:
-            self._chunks.append(data[pos:] if pos else data)
-            self._have = len(data) - pos
-
-    def _parse(self, buf: bytes) -> Generator[Event, None, int]:
-        """Yield the whole packets in `buf` and return the position reached."""
+        else:
+            buf = data
         pos = 0
         end = len(buf)
-        self._need = 0
-        acknowledgements = _ACKNOWLEDGEMENTS
-        while end - pos >= 2 and not self.paused and self.state is not State.CLOSED:
-            first = buf[pos]
-            length = buf[pos + 1]
-            body = pos + 2
-            if length > 0x7F:
-                try:
-                    length, body = self._remaining_length(buf, pos)
-                except IndexError:
+        need = 2  # bytes of the packet at `pos`, as far as known
+        try:
+            while end - pos >= 2 and self._reading:
+                first = buf[pos]
+                length = buf[pos + 1]
+                body = pos + 2
+                if length > 0x7F:
+                    try:
+                        length, body = _remaining_length(buf, pos)
+                    except IndexError:
+                        break
+                stop = body + length
+                if stop - pos > 127 or self.state is not State.CONNECTED:
+                    self._check(first, stop - pos)
+                if stop > end:
+                    need = stop - pos
                     break
-            stop = body + length
-            if self.state is not State.CONNECTED:
-                self._check_order(first, stop - pos)
-            if stop - pos > self.maximum_packet_size:
-                raise ProtocolError(
-                    ReasonCode.PACKET_TOO_LARGE,
-                    f"a packet of {stop - pos} bytes, more than the limit of "
-                    f"{self.maximum_packet_size} (broker.limits.packet_size)",
-                )
-            if stop > end:
-                self._need = stop - pos
-                break
-
-            if self.state is not State.CONNECTED:
-                yield self._decode(first, buf[body:stop])
-            elif 0x30 <= first <= 0x3D and length > 4:
-                # The data path: PUBLISH, taken apart by index.
-                topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
-                qos = first & 0x06
-                payload = topic_end + 2 if qos else topic_end
-                if self.version == 5:
-                    # Only an empty property table stays on this path.
-                    if payload < stop and buf[payload] == 0:
+                if 0x30 <= first <= 0x3D and length > 4:
+                    # The data path: a PUBLISH is taken apart by index. What is not plain in it
+                    # (properties, a missing topic, forbidden flags) goes to the full decoder.
+                    topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
+                    payload = topic_end
+                    packet_id = 0
+                    if first & 6:
+                        payload += 2
+                        if payload <= stop:
+                            packet_id = buf[topic_end] << 8 | buf[topic_end + 1]
+                    if self.version == 5:
                         payload += 1
-                    else:
-                        payload = end + 1
-                if payload > stop or topic_end == body + 2 or qos == 6 or (first & 8 and not qos):
-                    yield self._publish(first, buf[body:stop])
-                elif qos:
-                    packet_id = buf[topic_end] << 8 | buf[topic_end + 1]
-                    if not packet_id:
+                    if (
+                        payload > stop
+                        or (self.version == 5 and buf[payload - 1])
+                        or topic_end == body + 2
+                        or (not packet_id if first & 6 else first & 8)
+                        or first & 6 == 6
+                    ):
                         yield self._publish(first, buf[body:stop])
-                    yield (
-                        first,
-                        buf[body:topic_end],
-                        packet_id,
-                        buf[payload:stop],
-                        buf[pos:topic_end],
-                    )
+                    else:
+                        yield (
+                            first,
+                            buf[body:topic_end],
+                            packet_id,
+                            buf[payload:stop],
+                            buf[pos:topic_end] if packet_id else buf[pos:stop],
+                        )
+                elif length == 2 and first in _ACKNOWLEDGEMENTS and (buf[body] or buf[body + 1]):
+                    yield _ACKNOWLEDGEMENTS[first] | buf[body] << 8 | buf[body + 1]
                 else:
-                    yield first, buf[body:topic_end], 0, buf[payload:stop], buf[pos:stop]
-            elif length == 2 and first in acknowledgements and (buf[body] or buf[body + 1]):
-                yield acknowledgements[first] | buf[body] << 8 | buf[body + 1]
-            elif first >> 4 == PacketType.PUBLISH:
-                yield self._publish(first, buf[body:stop])
-            else:
-                self._check_order(first, stop - pos)
-                yield self._decode(first, buf[body:stop])
-            pos = stop
-        return pos
+                    self._check(first, stop - pos)
+                    yield self._decode(first, buf[body:stop])
+                pos = stop
+        except ProtocolError:
+            self.close()
+            raise
+        if pos < end and self.state is not State.CLOSED:
+            self._chunks.append(buf[pos:] if pos else buf)
+            self._have = end - pos
+            self._need = need
 
-    def _remaining_length(self, buf: bytes, pos: int) -> tuple[int, int]:
-        """The length of a packet and where its body begins; IndexError when bytes are missing."""
-        # [MQTT-1.5.5-1]: at most four bytes. Those that are there are checked before more come.
-        if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
-            raise IndexError
-        return decode_varint(buf, pos + 1)
-
-    def _check_order(self, first: int, size: int) -> None:
+    def _check(self, first: int, size: int) -> None:
+        """Whether a packet of this kind may come now, and be of this size."""
         try:
             kind = PacketType(first >> 4)
         except ValueError:
@@ -206,6 +205,12 @@ class Connection:
             raise ProtocolError(
                 ReasonCode.PROTOCOL_ERROR, f"a {kind.name} may not come {self.state.value}"
             )
+        if size > self.maximum_packet_size:
+            raise ProtocolError(
+                ReasonCode.PACKET_TOO_LARGE,
+                f"a packet of {size} bytes, more than the limit of "
+                f"{self.maximum_packet_size} (broker.limits.packet_size)",
+            )
         if self.state is State.NEW and size > MAXIMUM_CONNECT:
             raise ProtocolError(
                 ReasonCode.PACKET_TOO_LARGE,
@@ -213,6 +218,8 @@ class Connection:
             )
 
     def _decode(self, first: int, body: bytes) -> Packet:
+        if first >> 4 == PacketType.PUBLISH:
+            return self._publish(first, body)
         packet = decode_packet(first, body, self.version)
         if isinstance(packet, Connect):
             self.version = packet.version
@@ -244,3 +251,11 @@ class Connection:
         except ValueError as error:
             raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
         return packet
+
+
+def _remaining_length(buf: bytes, pos: int) -> tuple[int, int]:
+    """The length of a packet and where its body begins; IndexError when bytes are missing."""
+    # [MQTT-1.5.5-1]: at most four bytes. Those that are there are checked before more come.
+    if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
+        raise IndexError
+    return decode_varint(buf, pos + 1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable
+from functools import cache
 from math import nan
 from typing import Any
 
@@ -18,8 +19,8 @@ from appliance.ros.definitions import PRIMITIVES, Primitive
 
 HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian, no options
 
-# From so many numbers on, numpy's detour is shorter than making Python numbers.
-_WORTH_NUMPY = 32
+# Fewer numbers than this have a Struct prepared, and are not worth numpy's detour.
+_FEW = 32
 
 _BOOLS = frozenset({bool})
 _INTEGERS = frozenset({int})
@@ -50,31 +51,39 @@ def _read_wide_string(b: bytes, q: int, count: int) -> str:
 
 def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
     """The function that writes a whole list of numbers."""
-    code, pack = primitive.code, struct.pack
+    code = primitive.code
+    few = [struct.Struct(f"<{count}{code}").pack for count in range(_FEW)]
+    types = _BOOLS if primitive.name == "bool" else _INTEGERS
 
     def write_floats(values: Any) -> bytes:
         if values.__class__ is not list:
             raise TypeError
+        count = len(values)
+        pack = few[count] if count < _FEW else struct.Struct(f"<{count}{code}").pack
         try:
             # conjugate gives a float as it is, and refuses all else: the cheapest test there is.
-            return pack(f"<{len(values)}{code}", *map(float.conjugate, values))
+            return pack(*map(float.conjugate, values))
         except TypeError:
             if not _NUMBERS_AND_NULL.issuperset(map(type, values)):
                 raise
-        return pack(f"<{len(values)}{code}", *[nan if x is None else x for x in values])
+        return pack(*[nan if x is None else x for x in values])
 
     def write_exactly(values: Any) -> bytes:
         if values.__class__ is not list or not types.issuperset(map(type, values)):
             raise TypeError
-        return pack(f"<{len(values)}{code}", *values)
+        count = len(values)
+        pack = few[count] if count < _FEW else struct.Struct(f"<{count}{code}").pack
+        return pack(*values)
 
-    types = _BOOLS if primitive.name == "bool" else _INTEGERS
     return write_floats if primitive.is_float else write_exactly
 
 
 def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int], Any]:
     """The function that reads `count` numbers at `q`, all checked to be there."""
-    code, size, unpack_from = primitive.code, primitive.size, struct.unpack_from
+    code, size = primitive.code, primitive.size
+    few = [struct.Struct(f"<{count}{code}").unpack_from for count in range(_FEW)]
+    # float32 always by numpy, so that its digits do not depend on how many there are.
+    fewest = 1 if code == "f" else _FEW
 
     def read_octets(b: bytes, q: int, count: int) -> str:
         end = q + count
@@ -83,9 +92,11 @@ def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int
         return pybase64.b64encode_as_string(b[q:end])
 
     def read_list(b: bytes, q: int, count: int) -> list[Any]:
+        if count < _FEW:
+            return list(few[count](b, q))
         if q + count * size > len(b):
             raise IndexError
-        return list(unpack_from(f"<{count}{code}", b, q))
+        return list(struct.unpack_from(f"<{count}{code}", b, q))
 
     if primitive.is_octet:
         return read_octets
@@ -94,20 +105,20 @@ def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int
         return read_list
 
     def read_array(b: bytes, q: int, count: int) -> Any:
-        if count < least:
-            return read_list(b, q, count)
+        if count < fewest:
+            return list(few[count](b, q))
         end = q + count * size
         if end > len(b):
             raise IndexError
         # A slice, because the numbers in it are aligned in memory as well.
         return frombuffer(b[q:end], code)
 
-    least = 1 if code == "f" else _WORTH_NUMPY
     return read_array
 
 
 def _frombuffer() -> Callable[[bytes, str], Any] | None:
-    """numpy's, where there is numpy (every rclpy brings it), on a little-endian machine."""
+    """numpy's, where there is numpy (every rclpy brings it), on a little-endian machine. It is
+    imported when it is first needed: that takes longer than all else."""
     if sys.byteorder != "little":
         return None
     try:
@@ -117,10 +128,7 @@ def _frombuffer() -> Callable[[bytes, str], Any] | None:
     return frombuffer
 
 
-def _readers(with_numpy: bool) -> dict[str, Any]:
-    return {f"read_{p.name}": _reader(p, with_numpy) for p in PRIMITIVES.values()}
-
-
+@cache
 def readers(with_numpy: bool) -> dict[str, Any]:
     """What decoders call. With numpy, long arrays come as numpy's, else as lists."""
     return {

@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.session import Session
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import describe
-from appliance.ros.flows import Bridged, Direction, Flow, Pattern, RouteSettings, ToMqtt, ToRos
+from appliance.ros.flows import Bridged, Direction, Echo, Flow, RouteSettings, ToMqtt, ToRos
 from appliance.ros.mailbox import Counters, Mailbox
 from appliance.ros.node import RosNode
 
@@ -35,14 +37,18 @@ CLIENT_ID = "_bridge"
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
 
-#: Looks at the graph between two that do not trust the number of endpoints: one may have been
-#: replaced by another. Some 2 s.
+#: Every so many looks at the graph (some 2 s) the number of endpoints is not trusted: one may have
+#: been replaced by another.
 THOROUGH_LOOK = 13
 
 
 @dataclass(frozen=True, slots=True)
 class RouteStatus:
-    """What one route carries in one direction, and what it has counted since the start."""
+    """What a route carries in one direction, and what it has counted since the start.
+
+    `bytes` are payload on MQTT; `dropped` did not fit into the mailbox, `throttled` were above the
+    rate, `errors` could not be converted or published.
+    """
 
     settings: RouteSettings
     direction: Direction
@@ -55,8 +61,21 @@ class RouteStatus:
     last_error: str | None
 
 
+@dataclass(eq=False, slots=True)
+class _Route:
+    """A route in one direction; `pattern` is None when it is of one topic."""
+
+    settings: RouteSettings
+    direction: Direction
+    counters: Counters
+    pattern: re.Pattern[str] | None = None
+
+
 class Bridge:
-    """Carries the routes' topics between a node and the broker."""
+    """Carries the topics of routes between a node and the broker; belongs to the loop's thread.
+
+    `problem` is None, or why there is no ROS (any more).
+    """
 
     def __init__(
         self,
@@ -66,11 +85,242 @@ class Bridge:
         loop: asyncio.AbstractEventLoop,
         robot: str,
     ) -> None:
-        """Assign only; `robot` is the first level of `{robot}/_appliance/routes`."""
+        """What is bridged is told on `{robot}/_appliance/routes`.
+
+        Raises ValueError for a pattern in a route to ROS.
+        """
+        self.problem: str | None = None
         self._node = node
         self._broker = broker
         self._loop = loop
         self._topic = f"{robot}/_appliance/routes"
-        self._converters = Converters(lambda name: describe(node.load(name), node.load))
+        self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
-        self._session = None  # type: ...
+        self._converters = Converters(lambda name: describe(node.load(name), node.load))
+        self._routes: list[_Route] = []
+        #: By what they carry; only the ROS thread adds and removes, once it runs.
+        self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
+        self._to_ros: dict[tuple[str, str], ToRos] = {}
+        #: The same by MQTT topic, for the loop's thread.
+        self._receivers: dict[str, list[ToRos]] = {}
+        #: Topics that have a route by name, which goes before patterns.
+        self._named: set[str] = set()
+        self._looks = 0
+        for settings in routes:
+            self._add(settings)
+
+    def _add(self, settings: RouteSettings) -> None:
+        pattern = settings.pattern()
+        if pattern is not None and settings.to != "mqtt":
+            raise ValueError(f"{settings.ros}: a pattern can only go to MQTT")
+        if settings.to != "mqtt":
+            route = _Route(settings, "to_ros", Counters())
+            self._routes.append(route)
+            self._add_to_ros(route)
+        if settings.to != "ros":
+            route = _Route(settings, "to_mqtt", Counters(), pattern)
+            self._routes.append(route)
+            if pattern is None:
+                self._named.add(settings.ros)
+                self._add_to_mqtt(route, settings.ros)
+
+    def _add_to_ros(self, route: _Route) -> None:
+        settings = route.settings
+        flow = ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
+        key = flow.ros, flow.mqtt
+        if key in self._to_ros:
+            log.warning("%s has a route already; the later one is left out", flow)
+            return
+        self._to_ros[key] = flow
+        self._receivers.setdefault(flow.mqtt, []).append(flow)
+        self._pair(key)
+
+    def _add_to_mqtt(self, route: _Route, ros: str) -> None:
+        flow = ToMqtt(
+            route.settings, ros, route.counters, self._converters, self._tell, self._mailbox
+        )
+        key = flow.ros, flow.mqtt
+        if key in self._to_mqtt:
+            log.warning("%s has a route already; the later one is left out", flow)
+            return
+        self._to_mqtt[key] = flow
+        self._pair(key)
+
+    def _pair(self, key: tuple[str, str]) -> None:
+        """Let the two flows of a topic that goes both ways know their echo."""
+        there, back = self._to_mqtt.get(key), self._to_ros.get(key)
+        if there is not None and back is not None:
+            there.echo = back.echo = Echo()
+
+    # The loop's thread
+
+    def start(self) -> None:
+        """Subscribe on MQTT, and join the bus in the background."""
+        self._session = self._broker.attach(CLIENT_ID, _Link(self._receive))
+        for topic in self._receivers:
+            # No Local stops the echo on a topic that is bridged both ways. A retained message may
+            # be an old command: it does not reach ROS. QoS 0 loses nothing here, as the link takes
+            # each message at once.
+            self._broker.subscribe(
+                self._session, Subscription(topic, 0, no_local=True, retain_handling=2)
+            )
+        self._announce(())
+        self._node.start(self._look, self._failed)
+
+    async def stop(self) -> None:
+        """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        await asyncio.to_thread(self._node.stop)
+        session = self._session
+        if session is None:
+            return
+        for flow in self._flows():
+            flow.lost()
+        while self._deliver():
+            pass
+        self._announce(())
+        self._session = None
+        self._broker.detach(session)
+
+    def status(self) -> list[RouteStatus]:
+        """Every route's state and counters, one entry a direction."""
+        flows = self._flows()
+        return [
+            RouteStatus(
+                route.settings,
+                route.direction,
+                tuple(
+                    flow.bridged
+                    for flow in flows
+                    if flow.counters is route.counters and flow.bridged is not None
+                ),
+                route.counters.messages,
+                route.counters.bytes,
+                route.counters.dropped,
+                route.counters.throttled,
+                route.counters.errors,
+                route.counters.last_error,
+            )
+            for route in self._routes
+        ]
+
+    def _receive(self, message: Message, retain: bool) -> None:
+        if retain:
+            return
+        for receiver in self._receivers.get(message.topic, ()):
+            receiver.on_message(message.payload)
+
+    def _drain(self) -> None:
+        if self._deliver():
+            self._loop.call_soon(self._drain)
+
+    def _deliver(self) -> bool:
+        """Publish what waits in the mailbox, up to a batch; True when there may be more."""
+        session = self._session
+        if session is None:
+            return False
+        batch = self._mailbox.take(BATCH)
+        publish = self._broker.publish
+        for lane, message in batch:
+            counters = lane.counters
+            counters.messages += 1
+            counters.bytes += len(message.payload)
+            publish(message, session)
+        self._broker.flush()
+        return len(batch) == BATCH
+
+    def _announce(self, bridged: Sequence[Bridged]) -> None:
+        if self._session is not None:
+            payload = orjson.dumps(bridged)
+            self._broker.publish(Message(self._topic, payload, 0, True), self._session)
+            self._broker.flush()
+
+    def _stopped(self, reason: str) -> None:
+        self.problem = reason
+        log.warning("there is no bridge to ROS: %s", reason)
+
+    # Any thread
+
+    def _wake(self) -> None:
+        self._post(self._drain)
+
+    def _tell(self, level: int, text: str, *args: object) -> None:
+        if log.isEnabledFor(level):
+            self._post(log.log, level, text, *args)
+
+    def _post(self, callback: Callable[..., object], *args: object) -> None:
+        try:
+            self._loop.call_soon_threadsafe(callback, *args)
+        except RuntimeError:  # the loop is closed: there is nobody to hear it
+            log.debug("the event loop is closed")
+
+    def _flows(self) -> list[Flow]:
+        return [*self._to_mqtt.copy().values(), *self._to_ros.values()]
+
+    # The ROS thread
+
+    def _look(self) -> None:
+        """Follow what has come and gone on the graph."""
+        if self._looks == 0:
+            self._tell(logging.INFO, "on ROS as %s", self._node.name)
+        is_thorough = self._looks % THOROUGH_LOOK == 0
+        self._looks += 1
+        self._match_patterns()
+        has_changed = False
+        for flow in self._flows():
+            has_changed |= flow.look(self._node, is_thorough)
+        if has_changed:
+            self._post(self._announce, self._bridged())
+
+    def _match_patterns(self) -> None:
+        """Begin flows for topics that have come, end those of topics that have gone."""
+        patterns = [route for route in self._routes if route.pattern is not None]
+        if not patterns:
+            return
+        names = self._node.topics()
+        for key, flow in list(self._to_mqtt.items()):
+            if flow.is_matched and flow.ros not in names:
+                flow.close()
+                del self._to_mqtt[key]
+        taken = self._named | {flow.ros for flow in self._to_mqtt.values()}
+        for route in patterns:
+            assert route.pattern is not None
+            for ros in names:
+                if ros not in taken and route.pattern.fullmatch(ros):
+                    taken.add(ros)
+                    self._add_to_mqtt(route, ros)
+
+    def _failed(self, reason: str) -> None:
+        for flow in self._flows():
+            flow.lost()
+        self._post(self._stopped, reason)
+        self._post(self._announce, ())
+
+    def _bridged(self) -> list[Bridged]:
+        return [flow.bridged for flow in self._flows() if flow.bridged is not None]
+
+
+class _Link:
+    """The bridge as the link of its session: it takes everything at once."""
+
+    writable = True
+
+    def __init__(self, receive: Callable[[Message, bool], None]) -> None:
+        self._receive = receive
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """A message for ROS."""
+        self._receive(message, retain)
+
+    def pubrel(self, packet_id: int) -> None:
+        """Its subscriptions are of QoS 0."""
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """There is no connection to close."""

@@ -201,9 +201,13 @@ class _Checker:
                 return bytes(value)
             if not isinstance(value, (list, tuple)):
                 raise ConversionError(path, f"expected base64 or an array, got {_say(value)}")
+            if _all_fit(item, value):
+                return bytes(value)
             return bytes(_number(item, x, f"{path}[{i}]") for i, x in enumerate(value))
         if not isinstance(value, (list, tuple)):
             raise ConversionError(path, f"expected an array, got {_say(value)}")
+        if isinstance(item, Primitive) and _all_fit(item, value):
+            return list(value)
         return [self._value(item, x, f"{path}[{i}]") for i, x in enumerate(value)]
 
 
@@ -223,6 +227,21 @@ def _zero(type_: FieldType) -> Any:
     if isinstance(type_.item, Primitive) and type_.item.is_octet:
         return bytes(length)
     return [_zero(type_.item)] * length
+
+
+def _all_fit(primitive: Primitive, values: list[Any] | tuple[Any, ...]) -> bool:
+    """Whether these are numbers of the right type and range: the usual case, seen at a glance."""
+    if primitive.name == "bool" or not _NUMBERS[primitive.is_float].issuperset(map(type, values)):
+        return False
+    try:
+        struct.pack(f"<{len(values)}{primitive.code}", *values)
+    except (OverflowError, struct.error):
+        return False
+    return True
+
+
+# The Python types of integers, and of floats.
+_NUMBERS = (frozenset({int}), frozenset({int, float}))
 
 
 def _number(primitive: Primitive, value: object, path: str) -> Any:

@@ -38,6 +38,10 @@ __all__ = ["ConversionError", "Converter", "Converters", "compile_converter"]
 # there is one that this leads to its neighbour (each of the 2**31 was tried).
 _TWICE_ROUNDED = b"7.038531e-26"
 
+# Looked up once: these lines run for every message.
+_dumps, _loads = orjson.dumps, orjson.loads
+_NUMPY = orjson.OPT_SERIALIZE_NUMPY
+
 _INTEGER = re.compile(r"\s*([+-]?[0-9]{1,20})\s*\Z", re.ASCII)
 _FLOAT = re.compile(
     r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|[+-]?inf(?:inity)?|nan)\s*\Z",
@@ -56,6 +60,7 @@ class Converter:
         self.description = description
         self._now = now
         self._decode, self._decode_plain, self._encode, self.source = generate(description)
+        self._has_float32_arrays = "read_float32" in self.source
         self._text_type = _text_type(description)
 
     @property
@@ -65,17 +70,17 @@ class Converter:
     def to_json(self, cdr: bytes) -> bytes:
         """The JSON of a serialized message, in either byte order."""
         try:
-            payload = orjson.dumps(self._decode(cdr), option=orjson.OPT_SERIALIZE_NUMPY)
+            payload = _dumps(self._decode(cdr), None, _NUMPY)
         except MISFIT:
-            return orjson.dumps(decode(self.description, cdr))
-        if _TWICE_ROUNDED in payload:
-            return orjson.dumps(self._decode_plain(cdr))
+            return _dumps(decode(self.description, cdr))
+        if self._has_float32_arrays and _TWICE_ROUNDED in payload:
+            return _dumps(self._decode_plain(cdr))
         return payload
 
     def from_json(self, payload: bytes) -> bytes:
         """The serialized message, in little endian, of its JSON."""
         try:
-            value = orjson.loads(payload)
+            value = _loads(payload)
         except orjson.JSONDecodeError as error:
             raise ConversionError("", f"not JSON: {error}") from None
         try:

@@ -29,7 +29,6 @@ from appliance.ros.definitions import (
     String,
     TypeDescription,
     WideString,
-    least_size,
 )
 
 # What generated code raises when a message is not exactly as expected.
@@ -325,6 +324,10 @@ class _Decoder(_Generator):
             return
         names = [part.text for part in self._run if part.text]
         target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
+        first_size = self._run[0].primitive.size
+        if first_size > self._phase.modulus:
+            # Cheaper than as many layouts, and what follows has often but one.
+            self._align(first_size, "1")
         position = self._position()
         name, layout = self._end_run("unpack_from")
         self._line(f"{target}{name}{layout}(b, {'q' if layout else position})")
@@ -384,7 +387,7 @@ class _Decoder(_Generator):
         """Passes the padding before items, of which there may be none."""
         if not self._is_aligned(size):
             self._settle()
-            self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) % {size}")
+            self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) & {size - 1}")
             self._phase = self._phase.align(size)
 
     def _numbers(self, primitive: Primitive, count: str, hint: str) -> str:
@@ -412,9 +415,7 @@ class _Decoder(_Generator):
             self._line(f"q = {end}")
             self._offset = 0
             return items
-        if not count.isdigit():
-            # Looked at before anything is allocated.
-            self._line(f"if {count} * {least_size(item)} > len(b): raise ValueError")
+        # A count that lies ends with the message: every item takes at least a byte of it.
         self._line(f"{items} = []")
         with self._block(f"for _ in range({count}):"):
             value = self._value(item, hint)
@@ -485,6 +486,11 @@ class _Encoder(_Generator):
         if not self._run:
             return
         texts = ", ".join(part.text for part in self._run if part.text)
+        if not texts and len(self._run) == 1:
+            # A lone NUL, or the byte of an empty structure.
+            self._run, self._offset, self._phase = [], self._offset + 1, self._phase.advance(1)
+            self._pieces.append("b'\\0'")
+            return
         name, layout = self._end_run("pack")
         self._pieces.append(f"{name}{layout}({texts})")
 
@@ -578,7 +584,7 @@ class _Encoder(_Generator):
         """Writes the padding before items, of which there may be none."""
         if not self._is_aligned(size):
             self._settle()
-            padding = self._assign("padding", f"ZEROS[:(4 - q) % {size}] if {items} else b''")
+            padding = self._assign("padding", f"ZEROS[:(4 - q) & {size - 1}] if {items} else b''")
             self._bytes(padding, self._phase.align(size))
 
     def _numbers(self, primitive: Primitive, name: str) -> None:

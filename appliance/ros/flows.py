@@ -1,0 +1,457 @@
+"""Routes, and what they come to: one ROS topic carried in one direction is a flow.
+
+A flow follows its topic on the ROS thread: `look` finds the type and the QoS to use from the
+endpoints that are there, and sets up or sets anew what carries the messages.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+from typing import ClassVar, Literal, Protocol, TypeAlias
+
+from appliance.broker.message import Message
+from appliance.mqtt.codec import Properties, Property, encode_string
+from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.mailbox import Counters, Lane, Mailbox
+from appliance.ros.node import (
+    BusError,
+    Endpoint,
+    QosProfile,
+    RosNode,
+    RosPublisher,
+    RosSubscription,
+)
+from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
+
+Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
+Encoding: TypeAlias = Literal["json", "text", "cdr"]
+
+CONTENT_TYPE = {"json": "application/json", "text": "text/plain", "cdr": "application/cdr"}
+
+#: Seconds between two lines in the log about the same route's errors.
+REPORT_INTERVAL = 60.0
+
+#: Seconds that a sample of our own may take to come back; in one process it is microseconds.
+ECHO_TIME = 2.0
+ECHO_SAMPLES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class RouteSettings:
+    """A route. `ros` may be a pattern when it only goes `to` MQTT: `*` is part of a name, `**` of a
+    path. `mqtt` is a topic; a `{ros}` in it stands for the ROS name.
+
+    None is: no limit (`rate`, in Hz), found from the graph (`type`), as the publishers' QoS says
+    (`qos`, `retain`). `keep` is how many messages of a topic wait for a busy broker: the latest,
+    or so many.
+    """
+
+    ros: str
+    to: Literal["mqtt", "ros", "both"]
+    mqtt: str
+    type: str | None = None
+    encoding: Encoding = "json"
+    rate: float | None = None
+    qos: int | None = None
+    retain: bool | None = None
+    keep: int | Literal["latest"] = "latest"
+
+    @property
+    def samples(self) -> int:
+        """`keep` as a number."""
+        return 1 if self.keep == "latest" else self.keep
+
+    def pattern(self) -> re.Pattern[str] | None:
+        """What the names of this route's topics match, None when `ros` is a name.
+
+        Hidden names, with a token that begins with `_`, have to be spelt out in the pattern.
+        """
+        if "*" not in self.ros:
+            return None
+        parts = re.split(r"(\*\*|\*)", self.ros)
+        wild = {"**": ".*", "*": "[^/]*"}
+        visible = "" if "/_" in self.ros else r"(?!.*/_)"
+        return re.compile(visible + "".join(wild.get(part, re.escape(part)) for part in parts))
+
+
+@dataclass(frozen=True, slots=True)
+class Bridged:
+    """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`."""
+
+    ros: str
+    mqtt: str
+    type: str
+    direction: Direction
+    encoding: Encoding
+
+
+class Tell(Protocol):
+    """Writes a line to the log, from any thread."""
+
+    def __call__(self, level: int, text: str, *args: object) -> None: ...
+
+
+class Echo:
+    """Tells samples of our own publisher from others', on a topic that is bridged both ways.
+
+    They are told by their content: rclpy cannot ask the middleware to leave out local publishers,
+    and what it says about a message's sender is missing up to Jazzy and ends EventsExecutor in
+    Kilted. A message that another node publishes with the same content at the same time counts as
+    the echo, and the echo in its place as the other's message: on MQTT nobody can tell.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sent: deque[tuple[float, bytes]] = deque(maxlen=ECHO_SAMPLES)
+
+    def sent(self, cdr: bytes) -> None:
+        """The sample is about to be published. Without CDR's header, where DDS notes padding."""
+        with self._lock:
+            self._sent.append((monotonic() + ECHO_TIME, cdr[4:]))
+
+    def is_own(self, cdr: bytes) -> bool:
+        """Whether the sample received is one that was sent and has not come back yet."""
+        if not self._sent:
+            return False
+        now = monotonic()
+        with self._lock:
+            while self._sent and self._sent[0][0] < now:
+                self._sent.popleft()
+            for index, (_, body) in enumerate(self._sent):
+                # Padding, up to three bytes, may have been added at the end.
+                if 4 <= len(cdr) - len(body) < 8 and cdr.startswith(body, 4):
+                    del self._sent[index]
+                    return True
+        return False
+
+
+class Flow(ABC):
+    """One ROS topic carried in one direction; its methods are for the ROS thread."""
+
+    direction: ClassVar[Direction]
+
+    def __init__(
+        self,
+        settings: RouteSettings,
+        ros: str,
+        counters: Counters,
+        converters: Converters,
+        tell: Tell,
+    ) -> None:
+        self.settings = settings
+        self.ros = ros
+        self.mqtt = settings.mqtt.replace("{ros}", ros)
+        self.counters = counters
+        self.bridged: Bridged | None = None
+        #: Whether a pattern found the topic: it is then bridged while it has publishers.
+        self.is_matched = settings.ros != ros
+        self._converters = converters
+        self._tell = tell
+        self._count: tuple[int, int] | None = None
+        #: Type, QoS and type hash that were last set up, or refused.
+        self._wanted: tuple[str, QosProfile, str | None] | None = None
+        self._foreign: set[str] = set()
+        self._report_at = 0.0
+
+    def look(self, node: RosNode, thorough: bool) -> bool:
+        """Follow the graph; True when what is bridged has changed.
+
+        The endpoints are asked for only when their number has changed, or the look is thorough.
+        """
+        count = node.count(self.ros)
+        if count == self._count and not thorough:
+            return False
+        self._count = count
+        endpoints = self._find(node)
+        if self.is_matched and not endpoints:
+            was_bridged = self.bridged is not None
+            self.close()
+            self._wanted = None
+            return was_bridged
+        found = {endpoint.type for endpoint in endpoints}
+        type_name = self.settings.type
+        if type_name is None:
+            known = self._wanted[0] if self._wanted else None
+            type_name = known if known in found or not found else min(found)
+        if type_name is None:
+            return False
+        self._tell_foreign(found - {type_name}, type_name)
+        endpoints = [endpoint for endpoint in endpoints if endpoint.type == type_name]
+        if not endpoints and self._wanted is not None and self._wanted[0] == type_name:
+            return False  # they have left; all stays as it is for their return
+        hashes = [endpoint.type_hash for endpoint in endpoints if endpoint.type_hash]
+        wanted = (type_name, self._choose_qos(endpoints), min(hashes, default=None))
+        if wanted == self._wanted:
+            return False
+        self._wanted = wanted
+        before = self.bridged
+        self._set_up(node, *wanted)
+        return self.bridged != before
+
+    def _set_up(
+        self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None
+    ) -> None:
+        encoding = self.settings.encoding
+        try:
+            detail = self._open(node, type_name, qos, type_hash)
+        except (BusError, UnknownTypeError, ConversionError) as error:
+            self.close()
+            self.counters.last_error = str(error)
+            self._tell(logging.ERROR, "%s is not bridged: %s", self, error)
+            return
+        self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
+        self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
+
+    def _tell_foreign(self, types: set[str], chosen: str) -> None:
+        if types != self._foreign:
+            self._foreign = types
+            for name in sorted(types):
+                self._tell(
+                    logging.WARNING,
+                    "%s carries %s; the %s that is there too is left out",
+                    self,
+                    chosen,
+                    name,
+                )
+
+    def fail(self, problem: str) -> None:
+        """Count a message that could not be carried, and say so once a minute."""
+        self.counters.errors += 1
+        self.counters.last_error = problem
+        now = monotonic()
+        if now >= self._report_at:
+            self._report_at = now + REPORT_INTERVAL
+            self._tell(
+                logging.WARNING,
+                "%s: a message %s (%d so far)",
+                self,
+                problem,
+                self.counters.errors,
+            )
+
+    @abstractmethod
+    def _find(self, node: RosNode) -> list[Endpoint]:
+        """The endpoints of other nodes that tell type and QoS."""
+
+    @abstractmethod
+    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
+        """The QoS to use with them."""
+
+    @abstractmethod
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        """Set up, or set anew, what carries the messages; returns more for the log.
+
+        Raises BusError, UnknownTypeError, ConversionError.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Carry nothing any more."""
+
+    def lost(self) -> None:
+        """The bus is gone, and with it all that was set up."""
+        self.bridged = self._count = self._wanted = None
+
+
+class ToMqtt(Flow):
+    """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
+
+    direction = "to_mqtt"
+
+    def __init__(
+        self,
+        settings: RouteSettings,
+        ros: str,
+        counters: Counters,
+        converters: Converters,
+        tell: Tell,
+        mailbox: Mailbox,
+    ) -> None:
+        super().__init__(settings, ros, counters, converters, tell)
+        self.echo: Echo | None = None
+        self._mailbox = mailbox
+        self._lane = Lane(settings.samples, counters)
+        self._interval = 1 / settings.rate if settings.rate else 0.0
+        self._due = 0.0
+        self._subscription: RosSubscription | None = None
+        self._convert: Callable[[bytes], bytes] | None = None
+        self._topic_wire = encode_string(self.mqtt)
+        self._qos = 0
+        self._retain = False
+        self._properties: Properties | None = None
+
+    def __str__(self) -> str:
+        return f"{self.ros} → {self.mqtt}"
+
+    def _find(self, node: RosNode) -> list[Endpoint]:
+        return node.publishers(self.ros)
+
+    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
+        return subscription_qos(endpoints, self._lane.keep)
+
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        self.close()
+        encoding = self.settings.encoding
+        self._convert = None
+        if encoding != "cdr":
+            converter = self._converters.get(type_name)
+            if encoding == "text" and not converter.has_text:
+                raise UnknownTypeError(_no_text(type_name))
+            self._convert = converter.to_json if encoding == "json" else converter.to_text
+        wanted_qos, wanted_retain = self.settings.qos, self.settings.retain
+        self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
+        self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        about = [("ros-type", type_name)]
+        if type_hash is not None:
+            about.append(("ros-type-hash", type_hash))
+        self._properties = {
+            Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
+            Property.USER_PROPERTY: about,
+        }
+        self._subscription = node.subscribe_raw(self.ros, type_name, qos, self.on_message)
+        return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
+
+    def close(self) -> None:
+        self.bridged = None
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+
+    def lost(self) -> None:
+        super().lost()
+        self._subscription = None
+
+    def on_message(self, cdr: bytes) -> None:
+        """A message from ROS. Nothing may be logged by ROS here: it would feed /rosout."""
+        if self.echo is not None and self.echo.is_own(cdr):
+            return
+        if self._interval and not self._admit(monotonic()):
+            return
+        payload = cdr
+        if self._convert is not None:
+            try:
+                payload = self._convert(cdr)
+            except ConversionError as error:
+                self.fail(f"cannot be converted: {error}")
+                return
+        self._mailbox.put(
+            self._lane,
+            Message(
+                self.mqtt,
+                payload,
+                self._qos,
+                self._retain,
+                self._properties,
+                None,
+                self._topic_wire,
+            ),
+        )
+
+    def _admit(self, now: float) -> bool:
+        """Whether a message at that time keeps to the rate, as an average over uneven ones."""
+        if now < self._due:
+            self.counters.throttled += 1
+            return False
+        late = now - self._due
+        self._due = (self._due if late < self._interval else now) + self._interval
+        return True
+
+
+class ToRos(Flow):
+    """From MQTT to ROS: a publisher. `on_message` and `fail` are for the loop's thread."""
+
+    direction = "to_ros"
+
+    def __init__(
+        self,
+        settings: RouteSettings,
+        ros: str,
+        counters: Counters,
+        converters: Converters,
+        tell: Tell,
+    ) -> None:
+        super().__init__(settings, ros, counters, converters, tell)
+        self.echo: Echo | None = None
+        #: Replaced as one, because the loop's thread reads it.
+        self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
+
+    def __str__(self) -> str:
+        return f"{self.mqtt} → {self.ros}"
+
+    def _find(self, node: RosNode) -> list[Endpoint]:
+        found = node.subscribers(self.ros)
+        if not found and self.settings.type is None and self.settings.to == "both":
+            return node.publishers(self.ros)  # whoever is there knows the type
+        return found
+
+    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
+        return publisher_qos(endpoints, self.settings.samples)
+
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        converter = self._converters.get(type_name)
+        encoding = self.settings.encoding
+        if encoding == "text" and not converter.has_text:
+            raise UnknownTypeError(_no_text(type_name))
+
+        def checked(payload: bytes) -> bytes:
+            # Nodes end over a message that cannot be read, and rclpy does not look: we do.
+            converter.to_dict(payload)
+            return payload
+
+        convert = {"json": converter.from_json, "text": converter.from_text, "cdr": checked}
+        publisher = node.create_publisher(self.ros, type_name, qos)
+        before, self._out = self._out, (convert[encoding], publisher)
+        if before is not None:
+            before[1].destroy()
+        return ""
+
+    def close(self) -> None:
+        self.bridged = None
+        before, self._out = self._out, None
+        if before is not None:
+            before[1].destroy()
+
+    def lost(self) -> None:
+        super().lost()
+        self._out = None
+
+    def on_message(self, payload: bytes) -> None:
+        """A message from MQTT."""
+        out = self._out
+        if out is None:
+            self.fail(f"was refused: {self._why_not()}")
+            return
+        convert, publisher = out
+        try:
+            cdr = convert(payload)
+            if self.echo is not None:
+                self.echo.sent(cdr)
+            publisher.publish(cdr)
+        except ConversionError as error:
+            self.fail(f"cannot be converted: {error}")
+        except BusError as error:
+            self.fail(f"could not be published: {error}")
+        else:
+            self.counters.messages += 1
+            self.counters.bytes += len(payload)
+
+    def _why_not(self) -> str:
+        if self._wanted is not None:
+            return "its type cannot be bridged"
+        if self._count is None:
+            return "ROS is not ready"
+        return f"no node subscribes to {self.ros}, which would tell its type; the route can name it"
+
+
+def _no_text(type_name: str) -> str:
+    return (
+        f"{type_name} cannot go as text: only types with one field `data`, a number, bool or string"
+    )
