@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import signal
 from importlib.metadata import version
 
@@ -16,9 +17,11 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Limits, Refusal
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import server_context
-from appliance.config import Settings
+from appliance.config import Settings, TopicRoute
 from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.packets import Connect
+from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
 from appliance.store import MemoryStore
 
 log = logging.getLogger(__name__)
@@ -34,6 +37,7 @@ class App:
         """Assign only; `start` reads files and opens ports."""
         self.settings = settings
         self.addresses: list[tuple[str, int]] = []
+        self.bridge: Bridge | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
 
@@ -79,6 +83,7 @@ class App:
         self.addresses = await listeners.start(self._listener_settings())
         for host, port in self.addresses:
             log.info("listening on %s:%d", host or "*", port)
+        self._start_bridge(loop)
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
@@ -94,6 +99,23 @@ class App:
             )
             for listener in self.settings.broker.listeners
         ]
+
+    def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Join the bus in the background: MQTT answers before ROS is there, and without it."""
+        settings = self.settings
+        if settings.bridge.bus == "none":
+            return
+        bridge = settings.bridge
+        use_fastdds_profile(os.environ)
+        self.bridge = Bridge(
+            Ros2Node(bridge.node, bridge.namespace, bridge.domain_id),
+            self.broker,
+            [_route_settings(route, settings.robot) for route in bridge.topics],
+            loop,
+            settings.robot,
+        )
+        self._stack.push_async_callback(self.bridge.stop)
+        self.bridge.start()
 
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick once a second; publish `$SYS` every `broker.sys_interval`."""
@@ -170,6 +192,20 @@ def _broker_limits(settings: Settings) -> Limits:
         session_expiry=round(limits.session_expiry),
         topic_alias=limits.topic_alias,
         keep_alive=round(limits.keep_alive),
+    )
+
+
+def _route_settings(route: TopicRoute, robot: str) -> RouteSettings:
+    return RouteSettings(
+        ros=route.ros,
+        to=route.to,
+        mqtt=route.topic(robot),
+        type=route.type,
+        encoding=route.encoding,
+        rate=route.rate,
+        qos=route.qos,
+        retain=route.retain,
+        keep=route.keep,
     )
 
 

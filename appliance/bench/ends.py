@@ -27,6 +27,7 @@ TEXT_BYTES = 64
 FIRST_SECONDS = 30.0  # discovery, on a computer that has other things to do
 SETTLE_SECONDS = 1.0  # after the first message: the backlog of the start has gone through
 RECEIVE_BYTES = 1 << 16
+QUEUE = 1000  # of the ROS ends: they must not be what loses messages
 
 
 def text(number: int) -> str:
@@ -139,7 +140,7 @@ def ros_send(topic: str, rate: float, seconds: float) -> None:
     string = import_module("std_msgs.msg").String
     rclpy.init()
     node = rclpy.create_node("bench_send")
-    publisher = node.create_publisher(string, topic, 10)
+    publisher = node.create_publisher(string, topic, QUEUE)
 
     def send(data: str) -> None:
         if not rclpy.ok():  # a signal came
@@ -174,7 +175,7 @@ def ros_receive(topic: str, meter: Meter, seconds: float) -> None:
         if meter.complete and not complete.done():
             complete.set_result(None)
 
-    node.create_subscription(import_module("std_msgs.msg").String, topic, receive, 1000)
+    node.create_subscription(import_module("std_msgs.msg").String, topic, receive, QUEUE)
     executor.add_node(node)
     try:
         executor.spin_until_future_complete(
@@ -196,7 +197,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("role", choices=ROLES)
     parser.add_argument("--topic", required=True)
-    parser.add_argument("--cell", default="bridge", help="the name in the result")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=1883)
     parser.add_argument("--user", help="user name")
@@ -210,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     password = os.environ[options.password_env].encode() if options.password_env else None
     target = Target(options.host, options.port, None, options.user, password)
-    meter = Meter(options.cell, options.pid, options.seconds)
+    meter = Meter(options.role, options.pid, options.seconds)
     pin(options.pid)  # both ends on one core, what is between on another
     try:
         if options.role == "mqtt-send":

@@ -79,10 +79,7 @@ def table(rows: Sequence[Row], peer: str | None) -> Table:
             if ours is None and theirs is None:
                 continue
             goal = row.cell.goals.get(figure)
-            # A rate is better when it is higher: turned round, so that more than 1 is always good.
             ratio = row.ratio(figure)
-            if figure == "rate" and ratio:
-                ratio = 1 / ratio
             cells = [title, heading, number(ours)]
             if peer:
                 cells += [number(theirs), f"{ratio:.2f}" if ratio is not None else ""]

@@ -158,6 +158,8 @@ class Flow(ABC):
         self._count: tuple[int, int] | None = None
         #: Type, QoS and type hash that were last set up, or refused.
         self._wanted: tuple[str, QosProfile, str | None] | None = None
+        #: Why the last set-up failed.
+        self._problem: str | None = None
         self._foreign: set[str] = set()
         self._report_at = 0.0
 
@@ -204,9 +206,12 @@ class Flow(ABC):
             detail = self._open(node, type_name, qos, type_hash)
         except (BusError, UnknownTypeError, ConversionError) as error:
             self.close()
-            self.counters.last_error = str(error)
-            self._tell(logging.ERROR, "%s is not bridged: %s", self, error)
+            problem = self.counters.last_error = str(error)
+            if problem != self._problem:
+                self._problem = problem
+                self._tell(logging.ERROR, "%s is not bridged: %s", self, problem)
             return
+        self._problem = None
         self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
         self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 

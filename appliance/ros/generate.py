@@ -50,8 +50,8 @@ _PADDING = Primitive("padding", "x", 1)
 
 
 class Generated(NamedTuple):
-    """The two functions of a type, and their source. `decode_plain` gives lists where `decode`
-    gives numpy arrays, which orjson writes faster and, of float32, in half the digits."""
+    """The functions of a type, and their source. Where `decode_plain` gives lists, `decode` gives
+    numpy arrays, which orjson writes faster and, those of float32, in half the digits."""
 
     decode: Callable[[bytes], dict[str, Any]]
     decode_plain: Callable[[bytes], dict[str, Any]]

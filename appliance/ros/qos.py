@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
 
-#: ROS's own default, and enough for a reader that looks often.
+#: ROS's own default, and enough for a reader that is fast.
 DEPTH = 10
 
 #: Publishers' depths add up to no more than this: a stalled reader holds so many samples.
@@ -21,14 +21,14 @@ def subscription_qos(publishers: Sequence[Endpoint], keep: int = 1) -> QosProfil
     """
     reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
     latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
-    # A topic without keys has one history for all its publishers: for every one to find room for
-    # what it keeps (/tf_static has many that keep one sample each), their depths add up. A depth
-    # that discovery did not tell counts as one.
-    wanted = sum(max(1, end.qos.depth) for end in publishers)
+    # A late subscriber's history has to have room for what every publisher keeps for it, and a topic
+    # without keys has one for all of them (/tf_static: many that keep one sample each): their depths
+    # add up. A depth that discovery did not tell counts as one.
+    kept = sum(max(1, end.qos.depth) for end in publishers) if latched else 0
     return QosProfile(
         Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,
         Durability.TRANSIENT_LOCAL if publishers and latched else Durability.VOLATILE,
-        max(keep, DEPTH, min(wanted, MAX_DEPTH)),
+        max(keep, DEPTH, min(kept, MAX_DEPTH)),
     )
 
 

@@ -78,6 +78,10 @@ def test_depth_has_room_for_all_publishers_and_for_keep(depths, keep, expected):
     assert subscription_qos(found, keep).depth == expected
 
 
+def test_depth_of_volatile_publishers_changes_nothing():
+    assert subscription_qos(ends(QosProfile(depth=1), QosProfile(depth=50))).depth == 10
+
+
 def test_published_commands_are_kept_for_late_subscribers_only_where_one_asks():
     assert publisher_qos([]) == QosProfile(RELIABLE, VOLATILE, 10)
     volatile, latched = QosProfile(BEST_EFFORT, VOLATILE), QosProfile(RELIABLE, LATCHED)

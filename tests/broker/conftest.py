@@ -1,0 +1,389 @@
+"""A broker driven with bytes alone: no network, no event loop, and a clock that is an argument."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from appliance.broker.broker import Broker
+from appliance.broker.client import Client
+from appliance.broker.message import Message
+from appliance.broker.ports import Action, Decision, Identity, Limits
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, decode_varint
+from appliance.mqtt.packets import (
+    Connack,
+    Connect,
+    Disconnect,
+    Packet,
+    Puback,
+    Pubcomp,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Suback,
+    Subscribe,
+    Subscription,
+    Unsuback,
+    Unsubscribe,
+    Will,
+    decode_packet,
+)
+from appliance.mqtt.reason import ReasonCode
+from appliance.mqtt.topics import matches
+from appliance.store import MemoryStore
+
+
+class FakeAccess:
+    """Allows everything but what was denied: a user, an action and a filter."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self._denied: set[tuple[str | None, Action, str]] = set()
+
+    def deny(self, user: str | None, action: Action, topic_filter: str) -> None:
+        self._denied.add((user, action, topic_filter))
+        self.epoch += 1
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        for user, denied, topic_filter in self._denied:
+            if (user, denied) == (identity.username, action) and matches(topic_filter, topic):
+                return Decision(False, f"{user} {action.value} {topic_filter} is denied")
+        return Decision(True, "nothing denies it")
+
+
+class FakeStore(MemoryStore):
+    """Knows what is owed to whom, and can hold back its commit.
+
+    With `holding`, everything counts as staged until `commit`.
+    """
+
+    def __init__(self) -> None:
+        self.holding = False
+        self.sessions: set[str] = set()
+        self.owed: Counter[tuple[str, Message]] = Counter()
+        self._callbacks: list[Callable[[bool], None]] = []
+
+    @property
+    def staged(self) -> bool:  # type: ignore[override]
+        return self.holding
+
+    def after_commit(self, callback: Callable[[bool], None]) -> None:
+        self._callbacks.append(callback)
+
+    def commit(self, kept: bool = True) -> None:
+        self.holding = False
+        callbacks, self._callbacks = self._callbacks, []
+        for callback in callbacks:
+            callback(kept)
+
+    def session_saved(self, session: Session) -> None:
+        self.sessions.add(session.client_id)
+
+    def session_removed(self, session: Session) -> None:
+        self.sessions.discard(session.client_id)
+        for key in [key for key in self.owed if key[0] == session.client_id]:
+            del self.owed[key]
+
+    def queued(self, session: Session, message: Message, qos: int) -> None:
+        self.owed[session.client_id, message] += 1
+
+    def settled(self, session: Session, message: Message) -> None:
+        self.owed[session.client_id, message] -= 1
+        if not self.owed[session.client_id, message]:
+            del self.owed[session.client_id, message]
+
+
+class FakeWire:
+    """A connection that takes everything; the test answers `authenticate`."""
+
+    address = "192.0.2.1:40000"
+
+    def __init__(self) -> None:
+        self.asked: Connect | None = None
+        self.written = bytearray()
+        self.closed = False
+
+    def authenticate(self, connect: Connect) -> None:
+        self.asked = connect
+
+    def write(self, chunks: list[bytes]) -> None:
+        assert not self.closed, "written to after the close"
+        self.written += b"".join(chunks)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Peer:
+    """The client at the other end: says packets, and hears the packets that come back."""
+
+    def __init__(self, broker: Broker, version: int = 5) -> None:
+        self.broker = broker
+        self.version = version
+        self.wire = FakeWire()
+        self.client = Client(broker, self.wire)
+        self._packet_id = 0
+
+    @property
+    def session(self) -> Session:
+        assert self.client.session is not None
+        return self.client.session
+
+    def send(self, *packets: Packet | bytes) -> None:
+        """All of them in one chunk."""
+        self.client.receive(
+            b"".join(p if isinstance(p, bytes) else p.encode(self.version) for p in packets)
+        )
+        self.broker.flush()
+
+    def received(self) -> list[Packet]:
+        """The packets that came since this was last asked."""
+        return list(self._take())
+
+    def _take(self) -> Iterator[Packet]:
+        data = bytes(self.wire.written)
+        self.wire.written.clear()
+        pos = 0
+        while pos < len(data):
+            length, body = decode_varint(data, pos + 1)
+            assert body + length <= len(data), "half a packet was written"
+            yield decode_packet(data[pos], data[body : body + length], self.version)
+            pos = body + length
+
+    def only(self, kind: type[Packet]) -> Packet:
+        """The one packet that came, which is of this kind."""
+        (packet,) = self.received()
+        assert type(packet) is kind, packet
+        return packet
+
+    def messages(self) -> list[Publish]:
+        """The PUBLISH packets that came; nothing else did."""
+        packets = self.received()
+        assert all(isinstance(packet, Publish) for packet in packets), packets
+        return packets  # type: ignore[return-value]
+
+    def payloads(self) -> list[bytes]:
+        return [message.payload for message in self.messages()]
+
+    def next_id(self) -> int:
+        self._packet_id = self._packet_id % 65535 + 1
+        return self._packet_id
+
+    # --- whole exchanges ------------------------------------------------------------------------
+
+    def say_connect(
+        self,
+        client_id: str = "client",
+        *,
+        clean: bool = True,
+        keep_alive: int = 0,
+        user: str | None = "user",
+        will: Will | None = None,
+        properties: Properties | None = None,
+    ) -> None:
+        """CONNECT, without an answer to the question who it is."""
+        self.user = user
+        self.send(
+            Connect(
+                client_id,
+                clean,
+                keep_alive,
+                self.version,
+                user,
+                b"secret" if user is not None else None,
+                will,
+                properties,
+            )
+        )
+
+    def let_in(self) -> None:
+        """The password was right."""
+        self.client.accept(self.user)
+        self.broker.flush()
+
+    def connect(self, client_id: str = "client", **options: object) -> Connack:
+        """CONNECT with the right password, and the CONNACK; what comes behind it stays unread."""
+        self.say_connect(client_id, **options)  # type: ignore[arg-type]
+        self.let_in()
+        first, *rest = self._take()
+        for packet in rest:
+            self.wire.written += packet.encode(self.version)
+        assert isinstance(first, Connack)
+        return first
+
+    def subscribe(
+        self,
+        topic_filter: str,
+        qos: int = 0,
+        *,
+        properties: Properties | None = None,
+        **options: int,
+    ) -> int:
+        """SUBSCRIBE to one filter; returns the code in the SUBACK, what is behind it is unread."""
+        packet_id = self.next_id()
+        subscription = Subscription(topic_filter, qos, **options)  # type: ignore[arg-type]
+        self.send(Subscribe(packet_id, [subscription], properties))
+        packets = self.received()
+        (answer,) = (packet for packet in packets if isinstance(packet, Suback))
+        for packet in packets:
+            if packet is not answer:
+                self.wire.written += packet.encode(self.version)
+        assert answer.packet_id == packet_id  # v5 [MQTT-3.8.4-2]
+        (code,) = answer.reason_codes
+        return code
+
+    def unsubscribe(self, *filters: str) -> Unsuback:
+        self.send(Unsubscribe(self.next_id(), filters))
+        packet = self.only(Unsuback)
+        assert isinstance(packet, Unsuback)
+        return packet
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes = b"payload",
+        qos: int = 0,
+        *,
+        retain: bool = False,
+        properties: Properties | None = None,
+    ) -> int:
+        """PUBLISH, and the exchange that its QoS asks for; returns the code of the answer."""
+        packet_id = self.next_id() if qos else None
+        self.send(Publish(topic, payload, qos, retain, False, packet_id, properties))
+        if not qos:
+            return 0
+        answers = [p for p in self.received() if isinstance(p, Puback | Pubrec) or self._keep(p)]
+        (answer,) = answers
+        assert type(answer) is (Puback if qos == 1 else Pubrec)
+        assert answer.packet_id == packet_id
+        if qos == 2 and answer.reason_code < 0x80:
+            assert packet_id is not None
+            self.send(Pubrel(packet_id))
+            (done,) = [p for p in self.received() if isinstance(p, Pubcomp) or self._keep(p)]
+            assert done.packet_id == packet_id
+        return answer.reason_code
+
+    def _keep(self, packet: Packet) -> bool:
+        self.wire.written += packet.encode(self.version)
+        return False
+
+    def acknowledge(self, *packets: Packet) -> None:
+        """Answer QoS 1 and 2 messages to the end of their exchange."""
+        for packet in packets:
+            if not isinstance(packet, Publish) or packet.packet_id is None:
+                continue
+            if packet.qos == 1:
+                self.send(Puback(packet.packet_id))
+            else:
+                self.send(Pubrec(packet.packet_id))
+                (answer,) = [p for p in self.received() if isinstance(p, Pubrel) or self._keep(p)]
+                assert answer.packet_id == packet.packet_id
+                self.send(Pubcomp(packet.packet_id))
+
+    def drain(self) -> list[Publish]:
+        """Read and acknowledge until nothing more comes; returns the messages."""
+        messages: list[Publish] = []
+        while packets := self.messages():
+            messages += packets
+            self.acknowledge(*packets)
+        return messages
+
+    def lose(self) -> None:
+        """The network is gone."""
+        self.client.lost()
+        self.broker.flush()
+
+    def disconnect(self, code: int = 0, properties: Properties | None = None) -> None:
+        self.send(Disconnect(code, properties))
+        assert self.wire.closed
+
+    def slow(self) -> None:
+        """The network takes nothing more."""
+        self.client.writable = False
+
+    def fast(self) -> None:
+        """The network takes bytes again."""
+        self.client.resume_writing()
+        self.broker.flush()
+
+    def farewell(self) -> ReasonCode:
+        """The connection was closed, and what the DISCONNECT (5.0) said."""
+        assert self.wire.closed
+        packets = self.received()
+        assert isinstance(packets[-1], Disconnect), packets
+        return ReasonCode(packets[-1].reason_code)
+
+
+def queued_bytes(session: Session) -> int:
+    """What the session's queues hold, counted anew."""
+    waiting = [delivery[0] for delivery in (*session.queue, *session.latest.values())]
+    waiting += [delivery[0] for delivery in session.inflight.values() if delivery is not None]
+    waiting += session.received.values()
+    return sum(message.size for message in waiting)
+
+
+def check_accounts(broker: Broker) -> None:
+    """The sums that the broker keeps are those of what it holds."""
+    total = 0
+    for session in broker.sessions.values():
+        assert session.bytes == queued_bytes(session), session
+        total += session.bytes
+    assert broker.ledger.queued_bytes == total
+    retained = [message for _, message in broker.retained.find("#")]
+    retained += [message for _, message in broker.retained.find("$SYS/#")]
+    assert broker.retained_bytes == sum(message.size for message in retained)
+
+
+@pytest.fixture
+def access() -> FakeAccess:
+    return FakeAccess()
+
+
+@pytest.fixture
+def store() -> FakeStore:
+    return FakeStore()
+
+
+@pytest.fixture
+def limits() -> Limits:
+    """The defaults; a test that needs others parametrizes this."""
+    return Limits()
+
+
+@pytest.fixture
+def broker(access: FakeAccess, store: FakeStore, limits: Limits) -> Iterator[Broker]:
+    """A broker whose accounts are checked at the end of every test."""
+    broker = Broker(access, store, limits)
+    broker.tick(1000.0)
+    yield broker
+    check_accounts(broker)
+    for session in list(broker.sessions.values()):
+        if session.link is not None and session.identity is not None:
+            session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "")
+    broker.tick(broker.now + 2 * broker.limits.session_expiry + 1)
+    assert broker.ledger.queued_bytes == sum(session.bytes for session in broker.sessions.values())
+    if all(session.identity is None for session in broker.sessions.values()):
+        assert broker.ledger.queued_bytes == 0
+
+
+@pytest.fixture(params=[4, 5], ids=["3.1.1", "5.0"])
+def version(request: pytest.FixtureRequest) -> int:
+    return request.param  # type: ignore[no-any-return]
+
+
+Join = Callable[..., Peer]
+
+
+@pytest.fixture
+def join(broker: Broker) -> Join:
+    """Makes a connected client: `join("id", version=4, user=…, clean=…)`."""
+
+    def join(client_id: str = "client", *, version: int = 5, **options: object) -> Peer:
+        peer = Peer(broker, version)
+        assert peer.connect(client_id, **options).reason_code == ReasonCode.SUCCESS
+        return peer
+
+    return join

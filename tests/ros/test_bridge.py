@@ -1,0 +1,556 @@
+"""The bridge on a FakeNode and the real broker."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import struct
+
+import pytest
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Subscription
+from appliance.ros.bridge import Bridge, Bridged, RouteSettings
+from appliance.ros.flows import Echo
+from appliance.ros.node import Durability, FakeNode, QosProfile, Reliability
+from appliance.store import MemoryStore
+
+pytest.importorskip("std_msgs.msg")
+from appliance.ros.definitions import import_message
+
+STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+VECTOR, INT = "geometry_msgs/msg/Vector3", "std_msgs/msg/Int32"
+BEST_EFFORT = QosProfile(Reliability.BEST_EFFORT)
+LATCHED = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
+
+
+def string(text):
+    """A serialized std_msgs/msg/String."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+class Rules:
+    epoch = 0
+
+
+class Client:
+    """A session inside the appliance that keeps what it receives."""
+
+    writable = True
+
+    def __init__(self, broker, name="client"):
+        self.broker = broker
+        self.received = []
+        self.session = broker.attach(name, self)
+
+    def subscribe(self, topic, qos=1):
+        self.broker.subscribe(self.session, Subscription(topic, qos))
+        self.broker.send_retained(self.session, Subscription(topic, qos), True)
+
+    def send(self, topic, payload, qos=0, retain=False):
+        self.broker.publish(Message(topic, payload, qos, retain), self.session)
+
+    def publish(self, message, qos, packet_id, dup, retain, subscription_ids):
+        self.received.append((message, qos))
+        if qos:
+            self.session.puback(packet_id)
+
+    def pubrel(self, packet_id):
+        raise AssertionError
+
+    def close(self, reason, message):
+        raise AssertionError
+
+    def payloads(self, topic):
+        return [m.payload for m, _ in self.received if m.topic == topic]
+
+
+class House:
+    """Node, broker, bridge and a client that subscribes to all of the robot's."""
+
+    def __init__(self):
+        types = {name: import_message(name) for name in (STRING, TWIST, VECTOR, INT)}
+        self.node = FakeNode(types=types)
+        self.broker = Broker(Rules(), MemoryStore())
+        self.client = Client(self.broker)
+        self.client.subscribe("r2d2/#")
+
+    def start(self, *routes):
+        loop = asyncio.get_running_loop()
+        self.bridge = Bridge(self.node, self.broker, routes, loop, "r2d2")
+        self.bridge.start()
+        return self.bridge
+
+    async def settle(self):
+        """Let everything that has been handed to the loop happen."""
+        for _ in range(5):
+            await asyncio.sleep(0)
+
+    def routes(self):
+        return json.loads(self.broker.retained.get("r2d2/_appliance/routes").payload)
+
+    def status(self, direction="to_mqtt"):
+        (status,) = [s for s in self.bridge.status() if s.direction == direction]
+        return status
+
+
+@pytest.fixture
+async def house():
+    house = House()
+    yield house
+    await house.bridge.stop()
+    assert house.node.subscriptions == house.node.own_publishers == []
+
+
+def to_mqtt(ros, **kw):
+    return RouteSettings(ros, "mqtt", kw.pop("mqtt", "r2d2{ros}"), **kw)
+
+
+def to_ros(ros, **kw):
+    return RouteSettings(ros, "ros", kw.pop("mqtt", "r2d2{ros}"), **kw)
+
+
+def both(ros, **kw):
+    return RouteSettings(ros, "both", kw.pop("mqtt", "r2d2{ros}"), **kw)
+
+
+# ROS to MQTT
+
+
+async def test_type_and_qos_come_from_the_publishers(house):
+    house.start(to_mqtt("/chatter"))
+    assert house.node.subscriptions == []
+    peer = house.node.add_publisher("/chatter", STRING, type_hash="RIHS01_abc")
+    peer.publish(string("hello"))
+    await house.settle()
+    (message, qos) = house.client.received[-1]
+    assert (message.topic, message.payload, qos) == ("r2d2/chatter", b'{"data":"hello"}', 1)
+    assert not message.retain
+    assert message.properties == {
+        Property.CONTENT_TYPE: "application/json",
+        Property.USER_PROPERTY: [("ros-type", STRING), ("ros-type-hash", "RIHS01_abc")],
+    }
+    status = house.status()
+    assert (status.messages, status.bytes, status.errors) == (1, 16, 0)
+    assert status.topics == (Bridged("/chatter", "r2d2/chatter", STRING, "to_mqtt", "json"),)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "payload", "content_type"),
+    [
+        ("json", b'{"data":"hi"}', "application/json"),
+        ("text", b"hi", "text/plain"),
+        ("cdr", string("hi"), "application/cdr"),
+    ],
+)
+async def test_encodings(house, encoding, payload, content_type):
+    house.start(to_mqtt("/chatter", encoding=encoding), to_ros("/say", encoding=encoding))
+    listener = house.node.add_subscriber("/say", STRING)
+    house.node.add_publisher("/chatter", STRING).publish(string("hi"))
+    await house.settle()
+    message, _ = house.client.received[-1]
+    assert message.payload == payload
+    assert message.properties[Property.CONTENT_TYPE] == content_type
+    house.client.send("r2d2/say", payload)
+    assert listener.received == [string("hi")]
+
+
+async def test_best_effort_is_qos_0_and_transient_local_is_retained(house):
+    house.start(to_mqtt("/fast"), to_mqtt("/map"))
+    house.node.add_publisher("/fast", STRING, BEST_EFFORT).publish(string("a"))
+    latched = house.node.add_publisher("/map", STRING, LATCHED)
+    latched.publish(string("old"))
+    latched.publish(string("new"))
+    await house.settle()
+    assert [qos for m, qos in house.client.received if m.topic == "r2d2/fast"] == [0]
+    assert house.broker.retained.get("r2d2/fast") is None
+    assert house.broker.retained.get("r2d2/map").payload == b'{"data":"new"}'
+
+
+async def test_samples_from_before_the_bridge_arrive(house):
+    house.node.add_publisher("/map", STRING, LATCHED).publish(string("early"))
+    house.start(to_mqtt("/map"))
+    await house.settle()
+    assert house.client.payloads("r2d2/map") == [b'{"data":"early"}']
+
+
+async def test_the_route_may_say_qos_and_retain(house):
+    house.start(to_mqtt("/a", qos=0, retain=True), to_mqtt("/map", qos=2, retain=False))
+    house.node.add_publisher("/a", STRING).publish(string("a"))
+    house.node.add_publisher("/map", STRING, LATCHED).publish(string("m"))
+    await house.settle()
+    assert house.broker.retained.get("r2d2/a").qos == 0
+    assert house.broker.retained.get("r2d2/map") is None
+    assert [m.qos for m, _ in house.client.received if m.topic == "r2d2/map"] == [2]
+
+
+async def test_subscription_is_made_anew_when_publishers_change(house, caplog):
+    caplog.set_level(logging.INFO, "appliance.ros")
+    house.start(to_mqtt("/a", type=STRING))
+    profiles = [house.node.subscriptions[0].endpoint.qos]
+    assert profiles == [BEST_EFFORT]  # matches whatever appears
+    reliable = house.node.add_publisher("/a", STRING)
+    profiles.append(house.node.subscriptions[0].endpoint.qos)
+    best_effort = house.node.add_publisher("/a", STRING, BEST_EFFORT)
+    profiles.append(house.node.subscriptions[0].endpoint.qos)
+    reliable.remove()
+    best_effort.remove()
+    profiles.append(house.node.subscriptions[0].endpoint.qos)  # kept, for their return
+    assert [p.reliability.value for p in profiles] == [
+        "best effort",
+        "reliable",
+        "best effort",
+        "best effort",
+    ]
+    assert len(house.node.subscriptions) == 1
+    await house.settle()
+    lines = [r.getMessage() for r in caplog.records if "/a →" in r.getMessage()]
+    assert len(lines) == 3
+    assert "ROS reliable, volatile, depth 10; MQTT QoS 1" in lines[1]
+
+
+async def test_a_publisher_replaced_between_two_looks_is_found(house):
+    house.start(to_mqtt("/a"))
+    old = house.node.add_publisher("/a", STRING)
+    house.node.remote_publishers.remove(old)
+    house.node.add_publisher("/a", STRING, BEST_EFFORT)
+    for _ in range(20):
+        house.node.spin()
+    assert house.node.subscriptions[0].endpoint.qos.reliability is Reliability.BEST_EFFORT
+
+
+async def test_type_changes_with_the_publishers(house):
+    house.start(to_mqtt("/a"))
+    old = house.node.add_publisher("/a", STRING)
+    await house.settle()
+    assert house.routes()[0]["type"] == STRING
+    old.remove()
+    house.node.add_publisher("/a", INT).publish(b"\0\1\0\0" + struct.pack("<i", 7))
+    await house.settle()
+    assert house.routes() == [
+        {
+            "ros": "/a",
+            "mqtt": "r2d2/a",
+            "type": INT,
+            "direction": "to_mqtt",
+            "encoding": "json",
+        }
+    ]
+    assert house.client.payloads("r2d2/a") == [b'{"data":7}']
+
+
+async def test_of_two_types_one_is_carried_and_the_other_told(house, caplog):
+    house.start(to_mqtt("/a", type=STRING))
+    house.node.add_publisher("/a", INT)
+    house.node.add_publisher("/a", STRING).publish(string("x"))
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"x"}']
+    assert [r.getMessage() for r in caplog.records] == [
+        f"/a → r2d2/a carries {STRING}; the {INT} that is there too is left out"
+    ]
+
+
+async def test_unknown_type_is_told_once_and_harms_nothing_else(house, caplog):
+    house.start(to_mqtt("/odd"), to_mqtt("/a"))
+    house.node.add_publisher("/odd", "odd_msgs/msg/Odd")
+    house.node.add_publisher("/odd", "odd_msgs/msg/Odd")
+    house.node.add_publisher("/a", STRING).publish(string("x"))
+    for _ in range(30):
+        house.node.spin()
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"x"}']
+    errors = [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR]
+    assert len(errors) == 1
+    assert "odd_msgs is not installed" in errors[0]
+    assert "odd_msgs" in house.bridge.status()[0].last_error
+
+
+async def test_text_is_refused_for_other_types(house, caplog):
+    house.start(to_mqtt("/a", encoding="text"), to_ros("/b", encoding="text", type=TWIST))
+    house.node.add_publisher("/a", TWIST)
+    await house.settle()
+    assert [s.topics for s in house.bridge.status()] == [(), ()]
+    assert all("cannot go as text" in s.last_error for s in house.bridge.status())
+
+
+async def test_a_message_that_cannot_be_converted_is_counted_and_told_once(house, caplog):
+    house.start(to_mqtt("/a"))
+    peer = house.node.add_publisher("/a", STRING)
+    for _ in range(3):
+        peer.publish(b"\0\1\0\0\xff\xff\xff\xff")
+    peer.publish(string("good"))
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"good"}']
+    status = house.status()
+    assert (status.errors, status.messages) == (3, 1)
+    assert "cannot be converted" in status.last_error
+    assert len(caplog.records) == 1
+
+
+async def test_rate_is_kept_before_conversion(house, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    house.start(to_mqtt("/a", rate=10, keep=1000))
+    peer = house.node.add_publisher("/a", STRING)
+    for number in range(200):  # 5 s at 40 Hz, unevenly
+        now = 100 + number / 40 + (0.004 if number % 3 else 0)
+        peer.publish(string(str(number)))
+    await house.settle()
+    status = house.status()
+    assert 50 <= status.messages <= 51
+    assert status.throttled == 200 - status.messages
+
+
+async def test_keep_latest_and_keep_n(house):
+    house.start(to_mqtt("/a"), to_mqtt("/b", keep=3))
+    a, b = house.node.add_publisher("/a", STRING), house.node.add_publisher("/b", STRING)
+    for number in range(5):
+        a.publish(string(str(number)))
+        b.publish(string(str(number)))
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"4"}']
+    assert house.client.payloads("r2d2/b") == [b'{"data":"%d"}' % n for n in (2, 3, 4)]
+    assert [s.dropped for s in house.bridge.status()] == [4, 2]
+
+
+async def test_a_long_queue_does_not_hold_the_loop(house):
+    house.start(to_mqtt("/a", keep=1000))
+    peer = house.node.add_publisher("/a", STRING)
+    for number in range(500):
+        peer.publish(string(str(number)))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert 0 < house.status().messages < 500
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert house.client.payloads("r2d2/a")[-1] == b'{"data":"499"}'
+
+
+async def test_patterns(house):
+    house.start(to_mqtt("/camera/**", encoding="cdr"), to_mqtt("/camera/named", encoding="text"))
+    image = house.node.add_publisher("/camera/left/image", STRING)
+    house.node.add_publisher("/camera/named", STRING).publish(string("once"))
+    house.node.add_publisher("/camera/_hidden", STRING)
+    house.node.add_publisher("/lidar", STRING)
+    house.node.add_subscriber("/camera/wanted", STRING)
+    image.publish(string("px"))
+    await house.settle()
+    assert house.client.payloads("r2d2/camera/left/image") == [string("px")]
+    assert house.client.payloads("r2d2/camera/named") == [b"once"]
+    assert {row["ros"] for row in house.routes()} == {"/camera/left/image", "/camera/named"}
+    image.remove()
+    house.node.spin()
+    house.node.spin()
+    await house.settle()
+    assert {row["ros"] for row in house.routes()} == {"/camera/named"}
+    house.node.add_publisher("/camera/left/image", STRING).publish(string("again"))
+    await house.settle()
+    assert house.client.payloads("r2d2/camera/left/image")[-1] == string("again")
+    house.bridge.status()
+
+
+def test_pattern_of_one_level():
+    pattern = to_mqtt("/*/scan").pattern()
+    assert pattern.fullmatch("/left/scan")
+    assert not pattern.fullmatch("/left/front/scan")
+    assert to_mqtt("/**/_x").pattern().fullmatch("/a/_x")
+
+
+async def test_a_pattern_goes_to_mqtt_only(house):
+    house.start()
+    with pytest.raises(ValueError, match="pattern"):
+        Bridge(house.node, house.broker, [both("/a/*")], asyncio.get_running_loop(), "r2d2")
+
+
+# MQTT to ROS
+
+
+async def test_a_command_reaches_ros(house):
+    house.start(to_ros("/cmd_vel", type=TWIST))
+    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    house.client.send("r2d2/cmd_vel", b'{"linear":{"x":0.5}}', qos=1)
+    assert robot.received == [b"\0\1\0\0" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)]
+    assert house.status("to_ros").messages == 1
+    await house.settle()
+    assert house.routes()[0]["direction"] == "to_ros"
+
+
+async def test_without_a_type_messages_are_refused_until_a_subscriber_tells(house, caplog):
+    house.start(to_ros("/cmd_vel"))
+    house.client.send("r2d2/cmd_vel", b"{}")
+    house.client.send("r2d2/cmd_vel", b"{}")
+    status = house.status("to_ros")
+    assert status.errors == 2
+    assert "no node subscribes to /cmd_vel" in status.last_error
+    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    house.client.send("r2d2/cmd_vel", b"{}")
+    assert len(robot.received) == 1
+    await house.settle()
+    assert len([r for r in caplog.records if r.levelno == logging.WARNING]) == 1
+
+
+@pytest.mark.parametrize(
+    ("encoding", "payload"),
+    [
+        ("json", b'{"data": 5}'),
+        ("json", b"nonsense"),
+        ("json", b""),
+        ("json", b'{"date": "x"}'),
+        ("text", b"\xff"),
+        ("cdr", b""),
+        ("cdr", b"\0\1\0\0\xff\xff\xff\xff"),
+    ],
+)
+async def test_wrong_payloads_never_reach_ros(house, encoding, payload):
+    house.start(to_ros("/say", encoding=encoding))
+    listener = house.node.add_subscriber("/say", STRING)
+    house.client.send("r2d2/say", payload)
+    assert listener.received == []
+    assert house.status("to_ros").errors == 1
+
+
+async def test_retained_commands_do_not_reach_ros(house):
+    house.client.send("r2d2/say", b'{"data":"old"}', retain=True)
+    listener = house.node.add_subscriber("/say", STRING)
+    house.start(to_ros("/say"))
+    await house.settle()
+    assert listener.received == []
+    house.bridge._receive(Message("r2d2/say", b'{"data":"old"}'), True)
+    assert listener.received == []
+
+
+async def test_a_refusing_transport_is_counted(house):
+    house.start(to_ros("/say", type=STRING))
+    house.node.own_publishers[0].error = "the transport is full"
+    house.client.send("r2d2/say", b'{"data":"x"}')
+    assert "the transport is full" in house.status("to_ros").last_error
+    house.node.own_publishers[0].error = None
+    house.client.send("r2d2/say", b'{"data":"x"}')
+    assert (house.status("to_ros").errors, house.status("to_ros").messages) == (1, 1)
+
+
+async def test_publisher_becomes_transient_local_where_a_subscriber_asks(house):
+    house.start(to_ros("/map", type=STRING))
+    assert house.node.own_publishers[0].endpoint.qos.durability is Durability.VOLATILE
+    listener = house.node.add_subscriber("/map", STRING, LATCHED)
+    (publisher,) = house.node.own_publishers
+    assert publisher.endpoint.qos.durability is Durability.TRANSIENT_LOCAL
+    house.client.send("r2d2/map", b'{"data":"x"}')
+    assert len(listener.received) == 1
+
+
+# Both ways
+
+
+async def test_both_ways_without_an_echo(house):
+    house.start(both("/chat"))
+    other = house.node.add_publisher("/chat", STRING)
+    listener = house.node.add_subscriber("/chat", STRING)
+    house.client.send("r2d2/chat", b'{"data":"from mqtt"}')
+    other.publish(string("from ros"))
+    await house.settle()
+    assert listener.received == [string("from mqtt"), string("from ros")]
+    # What the client itself published comes back to it from the broker, once, as its own.
+    assert house.client.payloads("r2d2/chat") == [
+        b'{"data":"from mqtt"}',
+        b'{"data":"from ros"}',
+    ]
+
+
+async def test_two_routes_of_one_topic_have_no_echo_either(house):
+    house.start(to_mqtt("/chat"), to_ros("/chat", type=STRING))
+    house.node.add_publisher("/chat", STRING)
+    house.client.send("r2d2/chat", b'{"data":"x"}')
+    await house.settle()
+    assert len(house.client.payloads("r2d2/chat")) == 1
+
+
+async def test_a_set_point_on_another_mqtt_topic_is_seen_on_ros_topic(house):
+    house.start(to_mqtt("/goal"), to_ros("/goal", mqtt="r2d2/goal/set", type=STRING))
+    house.node.add_publisher("/goal", STRING)
+    house.client.send("r2d2/goal/set", b'{"data":"x"}')
+    await house.settle()
+    assert house.client.payloads("r2d2/goal") == [b'{"data":"x"}']
+
+
+async def test_both_ways_takes_the_type_from_a_publisher_too(house):
+    house.start(both("/chat"))
+    house.node.add_publisher("/chat", STRING)
+    assert [p.endpoint.type for p in house.node.own_publishers] == [STRING]
+
+
+def test_echo_knows_padding_and_forgets(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    echo = Echo()
+    sample = string("abcd")
+    assert not echo.is_own(sample)
+    echo.sent(sample)
+    assert not echo.is_own(string("other"))
+    assert not echo.is_own(sample + b"\0\0\0\0")
+    assert echo.is_own(b"\0\1\0\3" + sample[4:] + b"\0\0\0")
+    assert not echo.is_own(sample)
+    echo.sent(sample)
+    now = 10.0
+    assert not echo.is_own(sample)
+
+
+# Life
+
+
+async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
+    house.node.start = lambda poll, failed: None
+    house.start(to_ros("/cmd_vel", type=TWIST))
+    assert house.routes() == []
+    house.client.send("r2d2/cmd_vel", b"{}")
+    assert "ROS is not ready" in house.status("to_ros").last_error
+    await house.bridge.stop()
+    await house.bridge.stop()
+
+
+async def test_ros_missing_is_one_clear_line(house, caplog):
+    house.node.start = lambda poll, failed: failed("there is no ROS 2 here")
+    bridge = house.start(to_mqtt("/a"), to_ros("/b"))
+    await house.settle()
+    assert [r.getMessage() for r in caplog.records] == [
+        "there is no bridge to ROS: there is no ROS 2 here"
+    ]
+    assert bridge.problem == "there is no ROS 2 here"
+
+
+async def test_when_the_node_ends_nothing_is_bridged(house):
+    bridge = house.start(both("/chat", type=STRING))
+    house.node.fail("the daemon died")
+    await house.settle()
+    assert house.routes() == []
+    assert all(status.topics == () for status in bridge.status())
+    house.client.send("r2d2/chat", b'{"data":"x"}')
+    assert house.status("to_ros").errors == 1
+
+
+async def test_what_waits_at_the_stop_still_arrives(house):
+    house.start(to_mqtt("/a"))
+    house.node.add_publisher("/a", STRING).publish(string("last"))
+    await house.bridge.stop()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"last"}']
+    assert house.routes() == []
+    assert "_bridge" not in house.broker.sessions
+
+
+async def test_the_same_route_twice_is_told_and_left_out(house, caplog):
+    house.start(both("/a", type=STRING), both("/a", type=STRING))
+    assert len(house.node.subscriptions) == len(house.node.own_publishers) == 1
+    assert len([r for r in caplog.records if "already" in r.getMessage()]) == 2
+
+
+def test_a_closed_loop_is_no_error():
+    loop = asyncio.new_event_loop()
+    node = FakeNode(types={STRING: import_message(STRING)})
+    bridge = Bridge(node, Broker(Rules(), MemoryStore()), [to_mqtt("/a")], loop, "r2d2")
+    bridge.start()
+    loop.close()
+    node.add_publisher("/a", STRING).publish(string("late"))
