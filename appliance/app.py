@@ -170,6 +170,10 @@ class _Deaf:
     def publish(self, *_: object) -> None:
         """It subscribes to nothing, so this is not called."""
 
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """Nor is this."""
+        return False
+
     def pubrel(self, packet_id: int) -> None:
         """Nor is this."""
 

@@ -70,6 +70,7 @@ class BrokerProcess:
         raise NotImplementedError
 
     def _run(self, arguments: list[str | Path]) -> None:
+        self._ended = False
         environment = os.environ | {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
         self._process = subprocess.Popen(
             arguments,
@@ -185,14 +186,15 @@ class ApplianceProcess(BrokerProcess):
 
     def start(self) -> None:
         """Start it; the ports are those that the system gave it."""
-        before = len(self._lines)
+        listening = r"listening on \S+:(\d+)$"
+        before = len(re.findall(listening, self.log, re.MULTILINE))
         self._run([sys.executable, "-m", "appliance", "run", "-c", self.config])
         try:
-            self.wait_for_log(r"listening on \S+:\d+$", before + 2)
+            self.wait_for_log(listening, before + 2)
         except AssertionError:
             self.stop()
             raise
-        ports = re.findall(r"listening on \S+:(\d+)$", self.log, re.MULTILINE)
+        ports = re.findall(listening, self.log, re.MULTILINE)
         self.port, self.plain_port = map(int, ports[-2:])
 
 

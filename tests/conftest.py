@@ -1,11 +1,13 @@
-"""What holds for every test: in CI nothing is skipped silently."""
+"""What holds for every test, in CI nothing is skipped silently; and an appliance that runs."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+import uuid
+from collections.abc import Generator, Iterator
 
 import pytest
+from appliance_process import ACL, ROBOT, ApplianceProcess
 
 IN_CI = os.environ.get("CI") == "true"
 
@@ -28,3 +30,18 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     report = yield
     _fail_if_skipped(report)
     return report
+
+
+@pytest.fixture(scope="session")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
+    """A running appliance for all tests that change nothing about it."""
+    process = ApplianceProcess(tmp_path_factory.mktemp("appliance"), users={"bob": "bob's"}, acl=ACL)
+    process.start()
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def topic() -> str:
+    """A topic of the robot's that no other test uses."""
+    return f"{ROBOT}/test-{uuid.uuid4().hex[:12]}"

@@ -11,7 +11,7 @@ import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
@@ -52,6 +52,10 @@ class Ticking(Protocol):
         """Check its keep alive."""
 
 
+#: session, granted QoS, retain as published, subscription identifiers
+Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
+
+
 @dataclass(slots=True)
 class Route:
     """What is known about one topic for one publishing session, until the epoch changes."""
@@ -62,8 +66,7 @@ class Route:
     reason: str
     #: What the client is told when it is not allowed.
     refusal: ReasonCode
-    #: session, granted QoS, retain as published, subscription identifiers
-    targets: list[tuple[Session, int, bool, list[int] | None]]
+    targets: list[Target]
 
 
 class Broker:
@@ -268,11 +271,9 @@ class Broker:
         decision = self.access.decide(session.identity, Action.PUBLISH, topic)
         return decision, ReasonCode.NOT_AUTHORIZED
 
-    def _targets(
-        self, origin: Session, topic: str
-    ) -> list[tuple[Session, int, bool, list[int] | None]]:
+    def _targets(self, origin: Session, topic: str) -> list[Target]:
         """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1]."""
-        merged: dict[str, tuple[Session, int, bool, list[int] | None]] = {}
+        merged: dict[str, Target] = {}
         for session, subscription in self._subscriptions.match(topic):
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
                 continue
@@ -302,10 +303,13 @@ class Broker:
         Raises:
             ProtocolError: the topic is not valid.
         """
-        return self.publish_on(self.route(origin, message.topic_wire), message, origin)
+        route = self.route(origin, message.topic_wire)
+        return self.publish_to(route.targets, route, message, origin)
 
-    def publish_on(self, route: Route, message: Message, origin: Session) -> ReasonCode:
-        """`publish`, for who has the message's route already."""
+    def publish_to(
+        self, targets: list[Target], route: Route, message: Message, origin: Session
+    ) -> ReasonCode:
+        """`publish`, for who has the message's route already: to these of its targets."""
         if not route.allowed:
             self.refuse_publish(origin, route)
             return route.refusal
@@ -316,7 +320,7 @@ class Broker:
             return ReasonCode.QUOTA_EXCEEDED
         outcome = ReasonCode.NO_MATCHING_SUBSCRIBERS
         published_qos = message.qos
-        for session, qos, as_published, subscription_ids in route.targets:
+        for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
             if session.deliver(message, qos, retain and as_published, subscription_ids):

@@ -111,7 +111,6 @@ class Client:
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
-                    counters.control_received += 1
                     self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
                     self._on_packet(event)  # type: ignore[arg-type]
@@ -132,6 +131,19 @@ class Client:
             route = session.routes[topic_wire]
         else:
             route = broker.route(session, topic_wire)
+        targets = route.targets
+        if first == 0x30 and route.allowed and broker.observer is None:
+            # A plain QoS 0 message to receivers of the same version leaves as it came: no message
+            # object is made for it. Who cannot take it like this is left for the long way.
+            targets = [
+                target
+                for target in targets
+                if target[3]
+                or target[0].link is None
+                or not target[0].link.mirror(head, self._version, len(payload))
+            ]
+            if not targets:
+                return
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
         if not first & 8:
@@ -142,7 +154,7 @@ class Client:
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
-        code = broker.publish_on(route, message, session)
+        code = broker.publish_to(targets, route, message, session)
         if qos:
             self._acknowledge(0x40, packet_id, code)
 
@@ -199,6 +211,7 @@ class Client:
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
         assert session is not None
+        self._counters.control_received += 1
         if kind == PUBACK:
             if not session.puback(packet_id):
                 log.debug("%s: PUBACK %d for nothing in flight", self, packet_id)
@@ -222,10 +235,10 @@ class Client:
         if isinstance(packet, Publish):
             self._on_publish(packet)
             return
-        self._counters.control_received += 1
         if isinstance(packet, Puback | Pubrec | Pubrel | Pubcomp):
             self._on_acknowledgement(packet.TYPE << 16, packet.packet_id, packet.reason_code)
             return
+        self._counters.control_received += 1
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
         elif isinstance(packet, Subscribe):
@@ -445,6 +458,26 @@ class Client:
         counters = self._counters
         counters.publish_sent += 1
         counters.publish_bytes_sent += len(message.payload)
+
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
+        session = self.session
+        if (
+            version != self._version
+            or not self.writable
+            or self._maximum_packet_size
+            or session is None
+            or session.replays
+        ):
+            return False
+        out = self._out
+        if not out:
+            self.broker.unflushed.append(self)
+        out.append(packet)
+        counters = self._counters
+        counters.publish_sent += 1
+        counters.publish_bytes_sent += payload_size
+        return True
 
     def _too_large(self, message: Message, subscription_ids: list[int] | None) -> bool:
         size = len(message.encode_for(0x32, 1, subscription_ids, self._ledger.now))

@@ -84,6 +84,12 @@ class Link(Protocol):
     ) -> None:
         """Send a PUBLISH; `packet_id` is 0 for QoS 0."""
 
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """Send a QoS 0 PUBLISH as it came in; False, and nothing sent, when it cannot stay so.
+
+        The short cut of the data path; `publish` is the way that always works.
+        """
+
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""
 

@@ -59,7 +59,15 @@ class Ledger:
     counters: Counters = field(default_factory=Counters)
     #: Seconds of the clock that `Broker.tick` was last given.
     now: float = 0.0
+    #: Bytes that the queues of all sessions hold.
     queued_bytes: int = 0
+    #: The limits that every message is measured against, out of `limits` for speed.
+    queue_bytes: int = field(init=False)
+    memory: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.queue_bytes = self.limits.queue_bytes
+        self.memory = self.limits.memory
 
 
 class PendingWill(NamedTuple):
@@ -150,22 +158,22 @@ class Session:
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self._keep_latest((message, 0, retain, subscription_ids))
-        if (
-            link is not None
-            and link.writable
-            and not self.queue
-            and not self.replays
-            and len(self.inflight) < self.window
-        ):
-            if self._has_room(message):
+        if self._has_room(message):
+            if (
+                link is not None
+                and link.writable
+                and len(self.inflight) < self.window
+                and not self.queue
+                and not self.replays
+            ):
                 self._send(link, (message, qos, retain, subscription_ids))
                 return True
-        elif len(self.queue) < self.ledger.limits.queue_messages and self._has_room(message):
-            self._count(message)
-            self.queue.append((message, qos, retain, subscription_ids))
-            if self.expiry:
-                self.ledger.store.queued(self, message, qos)
-            return True
+            if len(self.queue) < self.ledger.limits.queue_messages:
+                self._count(message)
+                self.queue.append((message, qos, retain, subscription_ids))
+                if self.expiry:
+                    self.ledger.store.queued(self, message, qos)
+                return True
         self.ledger.counters.publish_dropped += 1
         return False
 
@@ -247,9 +255,9 @@ class Session:
 
     def _has_room(self, message: Message) -> bool:
         ledger = self.ledger
+        size = message.size
         return (
-            self.bytes + message.size <= ledger.limits.queue_bytes
-            and ledger.queued_bytes + message.size <= ledger.limits.memory
+            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
         )
 
     def _count(self, message: Message) -> None:
@@ -272,7 +280,14 @@ class Session:
         if delivery is None or delivery[1] != 1:
             return False
         del self.inflight[packet_id]
-        self._release(delivery[0])
+        message = delivery[0]
+        size = message.size
+        self.bytes -= size
+        self.ledger.queued_bytes -= size
+        if self.expiry:
+            self.ledger.store.settled(self, message)
+        if self.queue or self.replays:
+            self.pump()
         return True
 
     def pubrec(self, packet_id: int, code: int) -> bool:
@@ -285,8 +300,8 @@ class Session:
         if delivery[1] != 2:
             return False
         if code >= 0x80:
-            del self.inflight[packet_id]
-            self._release(delivery[0])
+            self.give_up(packet_id)
+            self.pump()
         else:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
@@ -300,15 +315,6 @@ class Session:
         if self.queue or self.replays:
             self.pump()
         return True
-
-    def _release(self, message: Message) -> None:
-        size = message.size
-        self.bytes -= size
-        self.ledger.queued_bytes -= size
-        if self.expiry:
-            self.ledger.store.settled(self, message)
-        if self.queue or self.replays:
-            self.pump()
 
     def give_up(self, packet_id: int) -> None:
         """Take a message out of flight that the client cannot be sent [MQTT-3.1.2-25]."""

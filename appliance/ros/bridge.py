@@ -319,6 +319,10 @@ class _Link:
         """A message for ROS."""
         self._receive(message, retain)
 
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """It takes messages, not packets."""
+        return False
+
     def pubrel(self, packet_id: int) -> None:
         """Its subscriptions are of QoS 0."""
 

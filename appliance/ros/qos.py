@@ -21,9 +21,9 @@ def subscription_qos(publishers: Sequence[Endpoint], keep: int = 1) -> QosProfil
     """
     reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
     latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
-    # A late subscriber's history has to have room for what every publisher keeps for it, and a topic
-    # without keys has one for all of them (/tf_static: many that keep one sample each): their depths
-    # add up. A depth that discovery did not tell counts as one.
+    # A late subscriber's history has to have room for what every publisher keeps for it, and a
+    # topic without keys has one history for all of them (/tf_static: many that keep one sample
+    # each), so their depths add up. A depth that discovery did not tell counts as one.
     kept = sum(max(1, end.qos.depth) for end in publishers) if latched else 0
     return QosProfile(
         Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,

@@ -12,7 +12,7 @@ from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Limits
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, decode_varint
+from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -315,6 +315,13 @@ class Peer:
         packets = self.received()
         assert isinstance(packets[-1], Disconnect), packets
         return ReasonCode(packets[-1].reason_code)
+
+
+def lasting(version: int, seconds: int = 3600) -> dict[str, object]:
+    """Options of a CONNECT whose session outlives the connection."""
+    if version == 5:
+        return {"clean": False, "properties": {Property.SESSION_EXPIRY_INTERVAL: seconds}}
+    return {"clean": False}
 
 
 def queued_bytes(session: Session) -> int:

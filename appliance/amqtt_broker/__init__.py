@@ -1,0 +1,24 @@
+"""The running broker as an `amqtt.broker.Broker`: amqtt's frame around our data path.
+
+Configuration object, life cycle, `BrokerContext` and plugin manager are amqtt's, so plugins written
+for it run unchanged. Its listeners, sessions and broadcast loop are not used: what they would do,
+`appliance.broker` does. What plugins can tell from amqtt's own broker:
+
+* MESSAGE_RECEIVED, MESSAGE_BROADCAST and the packet events are about network clients only, their
+  wills included; what the appliance itself and other plugins publish is not told.
+* RETAINED_MESSAGE is told for all topics but `$SYS`, and never with a `client_id`: what waits for
+  an absent client is the store's business.
+* PACKET_RECEIVED is fired for CONNECT, without its password, and for PUBLISH, once its topic was
+  looked up; not for other packets. PACKET_SENT is never fired.
+* Events wait in a bounded number; what handlers are too slow for is not told to them.
+* Topic plugins that have to wait for something cannot answer at once; see `PluginAccess`.
+* The protocol handlers of `BrokerContext`'s sessions are None, and so are packet ids of messages.
+* A plugin that computes, or waits without `await`, stops everything meanwhile: `FileAuthPlugin`
+  does while it hashes. The users file does not.
+"""
+
+from __future__ import annotations
+
+from .broker import ApplianceBroker, Files, PluginSettingsError, configuration, plugin_kinds
+
+__all__ = ["ApplianceBroker", "Files", "PluginSettingsError", "configuration", "plugin_kinds"]

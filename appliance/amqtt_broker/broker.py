@@ -1,0 +1,406 @@
+"""The frame itself: amqtt's broker with our data path in the place of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import ssl
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
+from typing import Any, Protocol, cast
+
+import amqtt.broker
+from amqtt.contexts import BrokerConfig, ListenerConfig
+from amqtt.errors import BrokerError, PluginError, PluginLoadError
+from amqtt.events import BrokerEvents
+from amqtt.mqtt.protocol.broker_handler import BrokerProtocolHandler
+from amqtt.plugins.authentication import AnonymousAuthPlugin
+from amqtt.plugins.base import BaseAuthPlugin, BaseTopicPlugin
+from amqtt.session import Session as AmqttSession
+from amqtt.utils import import_string
+from transitions import MachineError
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Access, Identity, Refusal
+from appliance.broker.session import Session
+from appliance.mqtt.packets import Connect, Subscription
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+
+from .access import VERDICT_AGE, PluginAccess
+from .events import PluginEvents
+from .guard import PLUGIN_TIMEOUT, Guard, name
+from .views import RetainedMessages, Sessions, Unclaimed, login_of
+
+log = logging.getLogger(__name__)
+
+
+class PluginSettingsError(ValueError):
+    """A plugin named in `broker.plugins` cannot be loaded, or not with these settings."""
+
+
+class Files(Access, Protocol):
+    """The users file and the ACL file, as far as the plugins stand beside them."""
+
+    def users(self) -> list[str]:
+        """The names of all users."""
+
+    async def authenticate(
+        self, username: str | None, password: bytes | None, client_id: str, address: str
+    ) -> Identity | Refusal:
+        """Who the client is, or why it is refused."""
+
+
+def plugin_kinds(plugins: Iterable[str]) -> tuple[bool, bool]:
+    """Whether some of the plugins authenticate clients, and whether some rule topics.
+
+    Raises:
+        PluginSettingsError: there is no such plugin.
+    """
+    try:
+        classes = [import_string(path) for path in plugins]
+    except ImportError as error:
+        raise PluginSettingsError(f"broker.plugins: {error}") from error
+    classes = [plugin for plugin in classes if isinstance(plugin, type)]
+    return (
+        any(issubclass(plugin, BaseAuthPlugin) for plugin in classes),
+        any(issubclass(plugin, BaseTopicPlugin) for plugin in classes),
+    )
+
+
+def configuration(
+    listeners: Iterable[tuple[str, bool]],
+    connections: int,
+    plugins: Mapping[str, Mapping[str, Any]],
+) -> BrokerConfig:
+    """amqtt's configuration object of ours; a listener is its address and whether it has TLS.
+
+    Only the plugins given are loaded, none of amqtt's default ones. Certificates are left out:
+    they are our listeners' business.
+    """
+    config = BrokerConfig(
+        listeners={"default": ListenerConfig(bind=None)},
+        plugins={path: dict(settings) for path, settings in plugins.items()},
+    )
+    # Added afterwards: BrokerConfig fills what equals a default from the listener "default".
+    for bind, tls in listeners:
+        config.listeners[bind] = ListenerConfig(bind=bind, ssl=tls, max_connections=connections)
+    return config
+
+
+class _NoLink:
+    """The link of a session that publishes and never receives, or that nobody is connected to."""
+
+    writable = True
+
+    def publish(self, *_: object) -> None:
+        """It subscribes to nothing, so this is not called."""
+
+    def pubrel(self, packet_id: int) -> None:
+        """Nor is this."""
+
+    def close(self, reason: object, message: str) -> None:
+        """There is no connection to close."""
+
+
+class ApplianceBroker(amqtt.broker.Broker):
+    """An `amqtt.broker.Broker` whose data path is ours, for `App` to start and stop.
+
+    `listen` and `hang_up` start and stop the listeners, where amqtt would its own. `files` stay
+    in force: plugins can admit clients that the files do not know, and refuse what these allow.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        files: Files,
+        config: BrokerConfig,
+        listen: Callable[[], Awaitable[None]],
+        hang_up: Callable[[], Awaitable[None]],
+    ) -> None:
+        """Loads the plugins; to be called on the event loop.
+
+        Raises:
+            PluginSettingsError: one cannot be loaded.
+        """
+        try:
+            super().__init__(config)
+        except (PluginError, PluginLoadError) as error:
+            reasons = [str(error), str(error.__cause__ or "")]
+            raise PluginSettingsError(
+                f"broker.plugins ({', '.join(cast(dict[str, Any], config.plugins))}): "
+                + ": ".join(filter(None, reasons))
+            ) from error
+        self.broker = broker
+        self._files = files
+        self._listen = listen
+        self._hang_up = hang_up
+        self._failures = _Failures()
+        self._views = Sessions(broker)
+        self._events = PluginEvents(self.plugins_manager, self._views, self._failures)
+        self._access = PluginAccess(
+            files, broker, self.plugins_manager, self._views, self._failures
+        )
+        # BrokerContext reads and writes these: they are windows on our broker.
+        self._sessions = cast(Any, self._views)
+        self._retained_messages = cast(Any, RetainedMessages(broker, self._retain_quietly))
+        self._inside: Session | None = None
+        self._timer: asyncio.TimerHandle | None = None
+
+    # --- life cycle ----------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Start as amqtt's broker does: from new or stopped, with the events around it.
+
+        Raises:
+            BrokerError: it is running, or a start has failed.
+            Exception: what `listen` raised; nothing runs then.
+        """
+        try:
+            self.transitions.start()
+        except MachineError as error:
+            raise BrokerError(f"Broker instance can't be started: {error}") from error
+        self._inside = self.broker.attach("_amqtt", _NoLink())
+        if self.plugins_manager.plugins:
+            self.broker.access = self._access
+            if self._keeps_sessions:
+                self.broker.observer = self._events
+            self._tick()
+        try:
+            await self._events.life_cycle(BrokerEvents.PRE_START)
+            await self._start_listeners()
+        except BaseException:
+            self.transitions.starting_fail()
+            await self._close()
+            raise
+        self.transitions.starting_success()
+        await self._events.life_cycle(BrokerEvents.POST_START)
+        log.debug(
+            "amqtt plugins: %s", ", ".join(map(_name, self.plugins_manager.plugins)) or "none"
+        )
+
+    async def _start_listeners(self) -> None:
+        """Start our listeners in the place of amqtt's."""
+        await self._listen()
+
+    async def shutdown(self) -> None:
+        """Stop as amqtt's broker does; sessions and retained messages are kept.
+
+        Raises:
+            MachineError: it is not running.
+        """
+        self.transitions.shutdown()
+        await self._events.life_cycle(BrokerEvents.PRE_SHUTDOWN)
+        await self._hang_up()
+        await self._finish("the last events", self.plugins_manager.wait_fired_events())
+        await self._events.life_cycle(BrokerEvents.POST_SHUTDOWN)
+        await self._close()
+        self.transitions.stopping_success()
+
+    async def _close(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._access.close()
+        await self._finish("close", self.plugins_manager.close())
+        self.broker.observer = None
+        self.broker.access = self._files
+        if self._inside is not None:
+            self.broker.detach(self._inside)
+            self._inside = None
+
+    async def _finish(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await _within(PLUGIN_TIMEOUT, work)
+        except asyncio.TimeoutError:
+            log.warning("amqtt plugins still work on %s after %g s", what, PLUGIN_TIMEOUT)
+        except Exception as error:  # a plugin may raise anything, and all else is to stop too
+            self._failures.tell(f"an amqtt plugin at {what}", error)
+
+    def _tick(self) -> None:
+        """Forget what has ended, and let topic plugins change their mind."""
+        self._timer = self._loop.call_later(VERDICT_AGE, self._tick)
+        self._views.purge()
+        if self.plugins_manager._topic_plugins:
+            self._access.ask_again()
+
+    @property
+    def _keeps_sessions(self) -> bool:
+        """Whether plugins meet a session again after its login."""
+        return self._events.about_clients or bool(self.plugins_manager._topic_plugins)
+
+    # --- logins --------------------------------------------------------------------------------
+
+    async def authenticate(
+        self, connect: Connect, address: str, ssl_object: ssl.SSLObject | None = None
+    ) -> Identity | Refusal:
+        """Who sent the CONNECT, or why it is refused.
+
+        Whom the files know or let in is decided by the files alone. Others come in when at least
+        one plugin says yes and none says no. Such a client has the user name that it gave, as far
+        as somebody vouches for it: `AnonymousAuthPlugin` does not, so those are anonymous.
+        """
+        if not self.plugins_manager.plugins:
+            return await self._files.authenticate(
+                connect.username, connect.password, connect.client_id, address
+            )
+        self._events.connect_received(connect)
+        password = None
+        who: Identity | Refusal | None = None
+        if connect.username is None or connect.username in self._files.users():
+            who = await self._files.authenticate(
+                connect.username, connect.password, connect.client_id, address
+            )
+        by_plugins = bool(self.plugins_manager._auth_plugins) and (
+            who is None or (connect.username is None and isinstance(who, Refusal))
+        )
+        if by_plugins:
+            try:
+                password = connect.password.decode() if connect.password is not None else None
+            except UnicodeDecodeError:
+                return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
+        elif who is None:
+            who = await self._files.authenticate(
+                connect.username, connect.password, connect.client_id, address
+            )
+        if isinstance(who, Refusal) and not by_plugins:
+            return who
+        login = _login(connect, address, password, ssl_object)
+        if by_plugins or who is None:
+            who = await self._ask_plugins(login)
+            if isinstance(who, Refusal):
+                return who
+        else:
+            login.is_anonymous = who.username is None
+        self._admit(who, address, login)
+        return who
+
+    def _admit(self, identity: Identity, address: str, login: AmqttSession) -> None:
+        """Remember the login for its connection, and hand an unclaimed session to its owner."""
+        if self._keeps_sessions:
+            self._views.expect(address, login)
+        session = self.broker.sessions.get(identity.client_id)
+        if session is not None and isinstance(session.identity, Unclaimed):
+            log.info("the session '%s' that a plugin made belongs to %s", session, identity)
+            session.identity = identity
+            self.broker.rules_changed()
+
+    async def _ask_plugins(self, login: AmqttSession) -> Identity | Refusal:
+        names = ", ".join(map(_name, self.plugins_manager._auth_plugins))
+        try:
+            answers, vouched = await _within(PLUGIN_TIMEOUT, self._answers(login))
+        except asyncio.TimeoutError:
+            return Refusal(
+                ReasonCode.SERVER_UNAVAILABLE, f"{names} said nothing within {PLUGIN_TIMEOUT:g} s"
+            )
+        except Exception as error:  # a plugin may raise anything
+            self._failures.tell(f"authentication by {names}", error)
+            return Refusal(ReasonCode.SERVER_UNAVAILABLE, f"{names} failed: {error!r}")
+        answered = {plugin: yes for plugin, yes in answers.items() if yes is not None}
+        if not answered:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"{names} do not know the client")
+        refusing = ", ".join(_name(plugin) for plugin, yes in answered.items() if not yes)
+        if refusing:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"refused by {refusing}")
+        return Identity(login.username if vouched else None, login.client_id or "")
+
+    async def _answers(self, login: AmqttSession) -> tuple[dict[Any, Any], bool]:
+        """What each plugin says, and whether one vouches for the user name."""
+        # `map_plugin_auth` in two parts: who vouches is not to be seen from its mixed answers.
+        plugins: list[Any] = list(self.plugins_manager._auth_plugins)
+        undemanding = [plugin for plugin in plugins if isinstance(plugin, AnonymousAuthPlugin)]
+        demanding = [plugin for plugin in plugins if plugin not in undemanding]
+        ask = self.plugins_manager._map_plugin_method
+        answers = await ask(demanding, "authenticate", {"session": login})
+        vouched = not login.is_anonymous and any(answers.values())
+        answers |= await ask(undemanding, "authenticate", {"session": login})
+        return answers, vouched
+
+    # --- what BrokerContext does ---------------------------------------------------------------
+
+    @property
+    def subscriptions(self) -> dict[str, list[tuple[AmqttSession, int]]]:
+        """The subscriptions of all network clients by topic filter, as they are now."""
+        found: dict[str, list[tuple[AmqttSession, int]]] = {}
+        for session in self.broker.sessions.values():
+            if session.identity is not None:
+                for topic_filter, subscription in session.subscriptions.items():
+                    entry = self._views.of(session), int(subscription.qos)
+                    found.setdefault(topic_filter, []).append(entry)
+        return found
+
+    async def internal_message_broadcast(
+        self, topic: str, data: bytes, qos: int | None = None
+    ) -> None:
+        """Publish on behalf of the broker; without `qos` each gets what its subscription says.
+
+        Raises:
+            BrokerError: the topic is not valid, or the broker is not running.
+        """
+        if self._inside is None:
+            raise BrokerError("the broker is not running")
+        message = Message(topic, bytes(data), 2 if qos is None else qos)
+        try:
+            self.broker.publish(message, self._inside)
+        except ProtocolError as error:
+            raise BrokerError(f"'{topic}' cannot be published to: {error}") from error
+        self.broker.flush()
+
+    async def retain_message(
+        self,
+        source_session: AmqttSession | None,
+        topic_name: str | None,
+        data: bytes | bytearray | None,
+        qos: int | None = None,
+    ) -> None:
+        """Retain a message without delivering it; with no data, delete the topic's."""
+        if topic_name is not None:
+            self._retain(topic_name, bytes(data or b""), qos)
+
+    def _retain(self, topic: str, data: bytes, qos: int | None) -> None:
+        if data or self.broker.retained.get(topic) is not None:
+            self.broker._retain(Message(topic, data, 2 if qos is None else qos, True))
+            self.broker.flush()
+
+    def _retain_quietly(self, topic: str, data: bytes, qos: int | None) -> None:
+        with self._unobserved():
+            self._retain(topic, data, qos)
+
+    async def add_subscription(self, subscription: tuple[str, int], session: AmqttSession) -> int:
+        """Subscribe a client's session; returns the granted QoS, or 0x80 for a refusal."""
+        topic_filter, qos = subscription
+        ours = self.broker.sessions.get(session.client_id or "")
+        if ours is None or ours.identity is None:
+            raise BrokerError(f"there is no session '{session.client_id}'")
+        with self._unobserved():
+            code = self.broker.subscribe(ours, Subscription(topic_filter, qos))
+        return int(code) if code <= ReasonCode.GRANTED_QOS_2 else 0x80
+
+    def create_offline_session(self, client_id: str) -> tuple[BrokerProtocolHandler, AmqttSession]:
+        """Make a session for a client that is not there; the first to log in gets it.
+
+        Raises:
+            BrokerError: it cannot be kept.
+        """
+        link = _NoLink()
+        expiry = self.broker.limits.session_expiry
+        if not expiry:
+            raise BrokerError("no session outlives its connection (broker.limits.session_expiry)")
+        try:
+            with self._unobserved():
+                session, _ = self.broker.connect(
+                    link, Unclaimed(None, client_id), clean_start=False, expiry=expiry, will=None
+                )
+                self.broker.disconnect(session, link, publish_will=False)
+        except ProtocolError as error:
+            raise BrokerError(f"no session '{client_id}' can be made: {error}") from error
+        return cast(BrokerProtocolHandler, None), self._views.of(session)
+
+    @contextlib.contextmanager
+    def _unobserved(self) -> Iterator[None]:
+        """What plugins do themselves is not told to them."""
+        observer, self.broker.observer = self.broker.observer, None
+        try:
+            yield
+        finally:
+            self.broker.observer = observer
+

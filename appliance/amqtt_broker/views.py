@@ -1,0 +1,206 @@
+"""Sessions and retained messages as amqtt's plugins see them: made when they are looked at."""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from typing import cast
+
+from amqtt.broker import RetainedApplicationMessage
+from amqtt.session import Session as AmqttSession
+
+from appliance.broker.broker import Broker
+from appliance.broker.client import Client
+from appliance.broker.message import Message
+from appliance.broker.ports import Identity
+from appliance.broker.session import Session
+from appliance.mqtt.codec import V5, Property
+from appliance.mqtt.packets import Connect
+
+#: Logins, of clients not yet connected, that are remembered.
+LOGINS = 1024
+
+
+class Unclaimed(Identity):
+    """Owner of a session that a plugin made for a client that never came.
+
+    The first client that logs in with its id becomes its owner.
+    """
+
+    __slots__ = ()
+
+
+# --- sessions and retained messages, as plugins see them -------------------------------------------
+
+
+def _split(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def _login(
+    connect: Connect, address: str, password: str | None, ssl_object: ssl.SSLObject | None
+) -> AmqttSession:
+    """The session that plugins are shown before it is known whether the client may come in."""
+    login = AmqttSession()
+    login.client_id = connect.client_id
+    login.username = connect.username
+    login.password = password
+    login.remote_address, login.remote_port = _split(address)
+    login.ssl_object = ssl_object
+    login.keep_alive = connect.keep_alive
+    login.clean_session = connect.clean_start
+    if connect.version == V5:  # amqtt means by it what 3.1.1 does: that nothing is kept
+        login.clean_session = not (connect.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
+    login.will_qos, login.will_retain = 0, False
+    if connect.will is not None:
+        will = connect.will
+        login.will_flag, login.will_topic, login.will_message = True, will.topic, will.payload
+        login.will_qos, login.will_retain = will.qos, will.retain
+    return login
+
+
+def _shown(session: Session) -> AmqttSession:
+    """A session as amqtt has it, of one whose login plugins have not seen."""
+    shown = AmqttSession()
+    shown.client_id = session.client_id
+    shown.username = session.identity.username if session.identity else None
+    shown.is_anonymous = shown.username is None
+    shown.clean_session = not session.persistent
+    if isinstance(session.link, Client):
+        shown.remote_address, shown.remote_port = _split(session.link.wire.address)
+    if session.will is not None:
+        will = session.will.message
+        shown.will_flag, shown.will_topic, shown.will_message = True, will.topic, will.payload
+        shown.will_qos, shown.will_retain = will.qos, will.retain
+    if session.link is not None:
+        shown.transitions.connect()
+    else:
+        shown.transitions.disconnect()
+    return shown
+
+
+class Sessions(Mapping[str, tuple[AmqttSession, None]]):
+    """The sessions of all network clients by client id, each with no protocol handler.
+
+    amqtt's objects are large (24 KB), so they are made when they are asked for.
+    """
+
+    def __init__(self, broker: Broker) -> None:
+        self._broker = broker
+        self._known: dict[str, tuple[Session, AmqttSession]] = {}
+        self._logins: dict[str, AmqttSession] = {}
+
+    def __getitem__(self, client_id: str) -> tuple[AmqttSession, None]:
+        session = self._broker.sessions[client_id]
+        if session.identity is None:
+            raise KeyError(client_id)
+        return self.of(session), None
+
+    def __setitem__(self, client_id: str, session: object) -> None:
+        """BrokerContext puts here what `create_offline_session` made; it is here already."""
+
+    def __iter__(self) -> Iterator[str]:
+        for client_id in list(self._broker.sessions):
+            if client_id in self:  # others may end while plugins go through them
+                yield client_id
+
+    def __contains__(self, client_id: object) -> bool:
+        session = self._broker.sessions.get(cast(str, client_id))
+        return session is not None and session.identity is not None
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def of(self, session: Session) -> AmqttSession:
+        """amqtt's object of the session."""
+        known = self._known.get(session.client_id)
+        if known is None or known[0] is not session:
+            known = self._known[session.client_id] = session, _shown(session)
+        return known[1]
+
+    def of_identity(self, identity: Identity) -> AmqttSession:
+        """amqtt's object of the client's session, also of one that is just ending."""
+        session = self._broker.sessions.get(identity.client_id)
+        if session is not None and session.identity == identity:
+            return self.of(session)
+        known = self._known.get(identity.client_id)
+        if known is not None and known[0].identity == identity:
+            return known[1]
+        shown = AmqttSession()
+        shown.client_id, shown.username = identity.client_id, identity.username
+        return shown
+
+    def expect(self, address: str, login: AmqttSession) -> None:
+        """The client at the address logged in: this is what plugins know of it."""
+        while len(self._logins) >= LOGINS:
+            del self._logins[next(iter(self._logins))]
+        self._logins[address] = login
+
+    def connected(self, session: Session) -> AmqttSession:
+        """The client's connection is there; its login becomes its session's object."""
+        link, identity = session.link, session.identity
+        login = self._logins.pop(link.wire.address, None) if isinstance(link, Client) else None
+        before = self._known.pop(session.client_id, None)
+        if (
+            login is None
+            or identity is None
+            or login.client_id not in ("", session.client_id)
+            or identity.username not in (None, login.username)
+        ):
+            return self.of(session)
+        login.client_id = session.client_id
+        if before is not None and before[0] is session:  # continued: plugins left notes in there
+            login.parent = 1
+            login.attributes = before[1].attributes | login.attributes
+        login.transitions.connect()
+        self._known[session.client_id] = session, login
+        return login
+
+    def disconnected(self, session: Session) -> AmqttSession:
+        """The client's connection ended."""
+        shown = self.of(session)
+        shown.transitions.disconnect()
+        return shown
+
+    def purge(self) -> None:
+        """Forget the objects of sessions that have ended."""
+        for client_id, (session, _) in list(self._known.items()):
+            if self._broker.sessions.get(client_id) is not session:
+                del self._known[client_id]
+
+
+def _message(source: AmqttSession | None, message: Message) -> RetainedApplicationMessage:
+    return RetainedApplicationMessage(source, message.topic, message.payload, message.qos)
+
+
+class RetainedMessages(MutableMapping[str, RetainedApplicationMessage]):
+    """The retained messages by topic. What is put here is told to no plugin."""
+
+    def __init__(self, broker: Broker, retain: Callable[[str, bytes, int | None], None]) -> None:
+        self._broker = broker
+        self._retain = retain
+
+    def __getitem__(self, topic: str) -> RetainedApplicationMessage:
+        message = self._broker.retained.get(topic)
+        if message is None:
+            raise KeyError(topic)
+        return _message(None, message)
+
+    def __setitem__(self, topic: str, message: RetainedApplicationMessage) -> None:
+        self._retain(topic, bytes(message.data), message.qos)
+
+    def __delitem__(self, topic: str) -> None:
+        if self._broker.retained.get(topic) is None:
+            raise KeyError(topic)
+        self._retain(topic, b"", 0)
+
+    def __iter__(self) -> Iterator[str]:
+        for topic_filter in ("#", "$SYS/#"):
+            for topic, _ in list(self._broker.retained.find(topic_filter)):
+                yield topic
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+

@@ -1,0 +1,438 @@
+"""The bridge on real ROS 2; the other nodes are in other processes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import struct
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.environment import for_other_programs
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Subscription
+from appliance.ros import ros2
+from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.ros.node import BusError, QosProfile
+from appliance.store import MemoryStore
+
+pytest.importorskip("rclpy")
+
+DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing connections
+DEADLINE = 15.0
+STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+BYTES = "std_msgs/msg/UInt8MultiArray"
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    for variable in ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.setenv(variable, "")  # so that what a test sets is undone after it
+        monkeypatch.delenv(variable)
+
+
+def string(text):
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+async def until(condition, what):
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {DEADLINE} s: {what}"
+        await asyncio.sleep(0.01)
+
+
+class Peer:
+    """peer.py, and what it has received."""
+
+    def __init__(self):
+        self.received = []
+
+    async def start(self, name="peer", **environment):
+        self.process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            str(Path(__file__).parent / "peer.py"),
+            name,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            env=for_other_programs() | environment,
+        )
+        self._answers = asyncio.Queue()
+        self._reader = asyncio.create_task(self._read())
+        await self._answer()
+        return self
+
+    async def _read(self):
+        async for line in self.process.stdout:
+            kind, *rest = json.loads(line)
+            if kind == "received":
+                self.received.append(tuple(rest))
+            else:
+                self._answers.put_nowait(kind)
+        self._answers.put_nowait("ended")
+
+    async def _answer(self):
+        assert await asyncio.wait_for(self._answers.get(), DEADLINE) == "ok"
+
+    async def do(self, *command):
+        self.process.stdin.write(json.dumps(command).encode() + b"\n")
+        await self._answer()
+
+    async def stop(self):
+        self.process.stdin.close()
+        try:
+            await asyncio.wait_for(self.process.wait(), 10)
+        except asyncio.TimeoutError:
+            self.process.kill()
+            await self.process.wait()
+        await self._reader
+
+
+class House:
+    """Broker, bridge and an MQTT client, as in test_bridge.py, on a real node."""
+
+    writable = True
+    epoch = 0
+
+    def __init__(self):
+        self.node = ros2.Ros2Node()
+        self.broker = Broker(self, MemoryStore())
+        self.received = []
+        self.session = self.broker.attach("client", self)
+        self.broker.subscribe(self.session, Subscription("r2d2/#", 1))
+
+    def start(self, *routes):
+        self.bridge = Bridge(self.node, self.broker, routes, asyncio.get_running_loop(), "r2d2")
+        self.bridge.start()
+
+    def publish(self, message, qos, packet_id, dup, retain, subscription_ids):
+        self.received.append((message, qos))
+        if qos:
+            self.session.puback(packet_id)
+
+    def send(self, topic, payload):
+        self.broker.publish(Message(topic, payload), self.session)
+
+    def payloads(self, topic):
+        return [message.payload for message, _ in self.received if message.topic == topic]
+
+    def bridged(self):
+        return [topic for status in self.bridge.status() for topic in status.topics]
+
+
+@pytest.fixture
+async def house():
+    house = House()
+    yield house
+    await house.bridge.stop()
+    assert "ros" not in [thread.name for thread in threading.enumerate()]
+
+
+@pytest.fixture
+async def peer():
+    peer = await Peer().start()
+    yield peer
+    await peer.stop()
+
+
+def route(ros, to, encoding="json", **kw):
+    return RouteSettings(ros, to, "r2d2" + ros, encoding=encoding, **kw)
+
+
+async def test_ros_to_mqtt(house, peer):
+    house.start(route("/chatter", "mqtt"), route("/fast", "mqtt", "cdr"))
+    await peer.do("advertise", "/chatter", STRING)
+    await peer.do("advertise", "/fast", STRING, "best_effort")
+    await peer.do("matched", "/chatter")
+    await peer.do("matched", "/fast")
+    await peer.do("publish", "/chatter", string("hello").hex())
+    await peer.do("publish", "/fast", string("raw").hex())
+    await until(lambda: house.payloads("r2d2/fast"), "the message of /fast")
+    await until(lambda: house.payloads("r2d2/chatter"), "the message of /chatter")
+    found = {m.topic: (m, qos) for m, qos in house.received}
+    message, qos = found["r2d2/chatter"]
+    assert (message.payload, qos) == (b'{"data":"hello"}', 1)
+    assert message.properties[Property.CONTENT_TYPE] == "application/json"
+    (type_name, type_hash) = message.properties[Property.USER_PROPERTY]
+    assert type_name == ("ros-type", STRING)
+    assert type_hash[1].startswith("RIHS01_")
+    message, qos = found["r2d2/fast"]
+    assert (message.payload, qos) == (string("raw"), 0)
+
+
+async def test_mqtt_to_ros(house, peer):
+    house.start(route("/cmd_vel", "ros"))
+    await peer.do("subscribe", "/cmd_vel", TWIST)
+    await until(house.bridged, "the type of /cmd_vel")
+
+    def arrives():
+        house.send("r2d2/cmd_vel", b'{"linear":{"x":0.5}}')
+        return peer.received
+
+    await until(arrives, "a command")
+    expected = b"\0\1\0\0" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
+    assert peer.received[0] == ("/cmd_vel", expected.hex())
+    before = len(peer.received)
+    house.send("r2d2/cmd_vel", b'{"linear":{"x":"fast"}}')
+    house.send("r2d2/cmd_vel", b'{"angular":{"z":1}}')
+    await until(lambda: peer.received[-1][1] != expected.hex(), "the command after the wrong one")
+    assert house.bridge.status()[0].errors == 1
+    assert len(peer.received) <= house.bridge.status()[0].messages
+    assert len(peer.received) > before
+
+
+async def test_both_ways_without_an_echo(house, peer):
+    house.start(route("/chat", "both", "text", keep=100))
+    await peer.do("advertise", "/chat", STRING)
+    await peer.do("subscribe", "/chat", STRING)
+    await peer.do("matched", "/chat", 2)  # its own subscription, and the bridge's
+    await until(lambda: len(house.bridged()) == 2, "both directions")
+
+    def arrives():
+        house.send("r2d2/chat", b"probe")
+        return peer.received
+
+    await until(arrives, "a message from MQTT")
+    sent = house.bridge.status()[0].messages
+    for number in range(20):
+        house.send("r2d2/chat", b"%d" % number)
+    await peer.do("publish", "/chat", string("from ros").hex())
+    await until(lambda: b"from ros" in house.payloads("r2d2/chat"), "the message from ROS")
+    await until(lambda: ("/chat", string("19").hex()) in peer.received, "the last from MQTT")
+    # The client has its own messages from the broker, each once; and nothing else from the bridge.
+    assert len(house.payloads("r2d2/chat")) == sent + 20 + 1
+    assert house.bridge.status()[1].messages == 1
+
+
+async def test_latched_samples_are_retained(house, peer):
+    await peer.do("advertise", "/map", STRING, "reliable", "transient_local")
+    await peer.do("publish", "/map", string("old").hex())
+    await peer.do("publish", "/map", string("new").hex())
+    house.start(route("/map", "mqtt", "text"))
+    retained = house.broker.retained
+    await until(lambda: (m := retained.get("r2d2/map")) and m.payload == b"new", "the new map")
+    assert house.received[-1][1] == 1
+
+
+async def test_publishers_that_change_are_followed(house, peer):
+    house.start(route("/a", "mqtt", "text"))
+    for reliability, qos in (("reliable", 1), ("best_effort", 0), ("reliable", 1)):
+        await peer.do("advertise", "/a", STRING, reliability)
+        await peer.do("matched", "/a")
+
+        seen = len(house.received)
+        deadline = time.monotonic() + DEADLINE
+        while house.received[seen:] == [] or house.received[-1][1] != qos:
+            assert time.monotonic() < deadline, f"not followed: {reliability}"
+            await peer.do("publish", "/a", string(reliability).hex())
+            await asyncio.sleep(0.05)
+        assert house.received[-1][0].payload.decode() == reliability
+        await peer.do("vanish", "/a")
+
+
+async def test_pattern(house, peer):
+    house.start(RouteSettings("/camera/**", "mqtt", "r2d2{ros}", encoding="cdr"))
+    await peer.do("advertise", "/camera/left/image", BYTES, "best_effort")
+    await until(house.bridged, "the camera")
+    assert house.bridged()[0].mqtt == "r2d2/camera/left/image"
+    await peer.do("vanish", "/camera/left/image")
+    await until(lambda: not house.bridged(), "the camera's end")
+
+
+async def test_images_pass_through_the_larger_shared_memory(house):
+    """1 MB, 50 a second, both ways, none lost; and the profile has been taken."""
+    before = shared_memory()
+    house.start(route("/image", "mqtt", "cdr", keep=100), route("/back", "ros", "cdr", type=BYTES))
+    await until(lambda: house.bridged(), "the node")
+    assert max(size for name, size in shared_memory().items() if name not in before) > 32 << 20
+    profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
+    assert list(profile.values()) == [str(Path(ros2.__file__).parent.parent / "fastdds.xml")]
+    peer = await Peer().start("camera", **profile)
+    try:
+        await peer.do("advertise", "/image", BYTES)
+        await peer.do("subscribe", "/back", BYTES)
+        await until(lambda: len(house.bridged()) == 2, "/image")
+        await peer.do("matched", "/image")
+        await peer.do("publish_image", "/image", 1_000_000, 50, 50)
+        await until(lambda: len(house.payloads("r2d2/image")) == 50, "all images")
+        image = house.payloads("r2d2/image")[0]
+        assert len(image) > 1_000_000
+        for _ in range(20):
+            house.send("r2d2/back", image)
+            await asyncio.sleep(0.02)
+        await until(lambda: len(peer.received) == 20, "all images on the way back")
+    finally:
+        await peer.stop()
+
+
+def shared_memory():
+    sizes = {}
+    for path in Path("/dev/shm").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            sizes[path.name] = path.stat().st_size
+    return sizes
+
+
+async def test_refusals_of_ros_are_bus_errors():
+    node = ros2.Ros2Node()
+    problems, failures = [], []
+
+    def look():
+        if problems:
+            return
+        publisher = node.create_publisher("/fine", STRING, QosProfile())
+        publisher.publish(string("x"))
+        publisher.destroy()
+        for refused in (
+            lambda: publisher.publish(string("x")),
+            lambda: node.create_publisher("/not a name", STRING, QosProfile()),
+            lambda: node.subscribe_raw("/not//a", STRING, QosProfile(), problems.append),
+        ):
+            try:
+                refused()
+            except BusError as error:
+                problems.append(str(error))
+
+    node.start(look, failures.append)
+    await until(lambda: problems or failures, "the look")
+    await asyncio.to_thread(node.stop)
+    assert failures == []
+    assert len(problems) == 3
+
+
+async def test_start_and_stop_at_any_moment():
+    for wait in (0.0, 0.05, 0.3):
+        node = ros2.Ros2Node()
+        looks, failures = [], []
+        started = time.monotonic()
+        node.start(lambda looks=looks: looks.append(1), failures.append)
+        assert time.monotonic() - started < 1
+        await asyncio.sleep(wait)
+        await asyncio.to_thread(node.stop)
+        node.stop()
+        assert failures == []
+        assert time.monotonic() - started < wait + 5
+
+
+async def test_an_exception_in_a_look_ends_the_node_and_is_told():
+    node = ros2.Ros2Node()
+    failures = []
+    node.start(lambda: 1 // 0, failures.append)
+    await until(lambda: failures, "the failure")
+    node.stop()
+    assert failures == ["ZeroDivisionError: integer division or modulo by zero"]
+
+
+async def test_a_wrong_node_name_is_told():
+    failures = []
+    node = ros2.Ros2Node("not a name")
+    node.start(lambda: None, failures.append)
+    await until(lambda: failures, "the failure")
+    node.stop()
+    assert "Invalid node name" in failures[0]
+
+
+# What is here, and what is not
+
+
+def test_ros_is_available():
+    assert ros2.available() == (True, "")
+
+
+def test_without_rclpy_one_line_says_so(monkeypatch):
+    monkeypatch.setattr(ros2, "find_spec", lambda name: None)
+    is_available, reason = ros2.available()
+    assert not is_available
+    assert "rclpy cannot be imported" in reason
+    assert "\n" not in reason
+    failures = []
+    node = ros2.Ros2Node()
+    node.start(lambda: None, failures.append)
+    node.stop()
+    assert failures == [reason]
+
+
+def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_nowhere_cpp")
+    is_available, reason = ros2.available()
+    assert not is_available
+    assert "RMW_IMPLEMENTATION is rmw_nowhere_cpp, which is not installed here" in reason
+    assert "rmw_fastrtps_cpp" in reason
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    assert ros2.available() == (True, "")
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"FASTDDS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
+        {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+        {"ROS_LOCALHOST_ONLY": "1"},
+    ],
+)
+def test_the_users_own_settings_of_fast_dds_go_first(environment):
+    before = dict(environment)
+    assert not ros2.use_fastdds_profile(environment)
+    assert environment == before
+
+
+def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    environment = {}
+    assert ros2.use_fastdds_profile(environment)
+    assert [Path(value).is_file() for value in environment.values()] == [True]
+    Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
+    assert not ros2.use_fastdds_profile({})
+
+
+# The demo robot
+
+
+async def test_demo_robot_drives_and_stops(house):
+    house.start(
+        route("/odom", "mqtt"),
+        route("/battery", "mqtt"),
+        route("/scan", "mqtt"),
+        route("/chatter", "mqtt", "text"),
+        route("/robot_description", "mqtt", "text"),
+        route("/cmd_vel", "ros"),
+    )
+    robot = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "appliance.demo", env=for_other_programs()
+    )
+    try:
+        for name in ("odom", "battery", "scan", "chatter", "robot_description"):
+            await until(lambda name=name: house.payloads(f"r2d2/{name}"), name)
+        assert house.broker.retained.get("r2d2/robot_description").payload.startswith(b"<robot")
+        assert json.loads(house.payloads("r2d2/battery")[-1])["temperature"] is None
+        await until(lambda: len(house.bridged()) == 6, "/cmd_vel")
+
+        def x():
+            return json.loads(house.payloads("r2d2/odom")[-1])["pose"]["pose"]["position"]["x"]
+
+        def drives():
+            house.send("r2d2/cmd_vel", b'{"linear":{"x":1}}')
+            return x() > 0.1
+
+        await until(drives, "the robot drives")
+
+        def speed():
+            return json.loads(house.payloads("r2d2/odom")[-1])["twist"]["twist"]["linear"]["x"]
+
+        await until(lambda: speed() == 0, "the robot stops by itself")
+    finally:
+        robot.terminate()
+        assert await asyncio.wait_for(robot.wait(), 10) == 0
