@@ -9,9 +9,10 @@ import os
 import signal
 from importlib.metadata import version
 
+import psutil
 import uvloop
 
-from appliance.access import FileAccess
+from appliance.access import AccessFileError, FileAccess
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Limits, Refusal
@@ -20,6 +21,7 @@ from appliance.certs import server_context
 from appliance.config import Settings, TopicRoute
 from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.packets import Connect
+from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
 from appliance.store import MemoryStore
@@ -58,7 +60,7 @@ class App:
         loop = asyncio.get_running_loop()
         settings = self.settings
         broker_settings = settings.broker
-        access = FileAccess(
+        self._access = access = FileAccess(
             broker_settings.users, broker_settings.acl, settings.robot, broker_settings.anonymous
         )
         self._stack.callback(access.close)
@@ -119,7 +121,10 @@ class App:
 
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick once a second; publish `$SYS` every `broker.sys_interval`."""
-        sys_topics = SysTopics(self.broker, version("ros-mqtt-appliance"))
+        process = psutil.Process()
+        sys_topics = SysTopics(
+            self.broker, version("ros-mqtt-appliance"), lambda: process.memory_info().rss
+        )
         interval = self.settings.broker.sys_interval
         next_sys = loop.time() + min(interval, TICK)
         timer: asyncio.TimerHandle
@@ -151,11 +156,28 @@ class App:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)
         await self.start()
+        loop.add_signal_handler(signal.SIGHUP, self.reload)
         try:
             await self._stopping.wait()
             log.info("stopping")
         finally:
             await self.stop()
+
+    def reload(self) -> None:
+        """Take over the users and ACL files as they are now; a wrong one changes nothing."""
+        try:
+            self._access.reload()
+        except AccessFileError as error:
+            log.error("not reloaded, what was in force stays so: %s", error)
+            return
+        users = set(self._access.users())
+        for session in list(self.broker.sessions.values()):
+            identity = session.identity
+            if identity and identity.username is not None and identity.username not in users:
+                session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
+        self.broker.rules_changed()
+        self.broker.flush()
+        log.info("users and access rules reloaded")
 
     def request_stop(self) -> None:
         """Let `run` end."""

@@ -187,6 +187,16 @@ def _check_ros_name(value: str) -> str:
     return value
 
 
+def _check_ros_pattern(value: str) -> str:
+    """A ROS name, or a pattern of names in which `*` is part of a name and `**` of a path."""
+    if "*" not in value:
+        return _check_ros_name(value)
+    _check_ros_name(re.sub(r"\*+", "x", value))
+    if "***" in value:
+        raise ValueError("knows '*', part of a name, and '**', part of a path, but not '***'")
+    return value
+
+
 def _check_node(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
         raise ValueError("must be a letter or '_', then letters, digits or '_'")
@@ -337,14 +347,20 @@ class RouteDefaults(_Section):
 class TopicRoute(RouteDefaults):
     """One ROS topic that is carried to MQTT, from MQTT, or both ways."""
 
-    ros: Annotated[str, AfterValidator(_check_ros_name)]
+    ros: Annotated[str, AfterValidator(_check_ros_pattern)]
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
 
+    @property
+    def is_pattern(self) -> bool:
+        """Whether `ros` names many topics."""
+        return "*" in self.ros
+
     def topic(self, robot: str) -> str:
-        """The MQTT topic of this route on that robot."""
-        return self.mqtt.replace("{ros}", self.ros).replace("{robot}", robot)
+        """The MQTT topic of this route on that robot; a pattern keeps `{ros}` in it."""
+        topic = self.mqtt.replace("{robot}", robot)
+        return topic if self.is_pattern else topic.replace("{ros}", self.ros)
 
 
 class Bridge(_Section):
@@ -450,6 +466,11 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     routes: dict[tuple[str, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
         first = routes.setdefault((route.ros, route.topic(settings.robot)), number)
+        if route.is_pattern and route.to != "mqtt":
+            yield ("bridge", "topics", number, "to"), "must be mqtt when ros is a pattern"
+        if route.is_pattern and "{ros}" not in route.mqtt:
+            problem = "needs {ros} in it, or all topics of the pattern would be one"
+            yield ("bridge", "topics", number, "mqtt"), problem
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
 

@@ -43,7 +43,7 @@ DESCRIPTION = """<robot name="demo">
 
 
 class Drive:
-    """Where a robot with two wheels is: `x`, `y` in m, `heading` in rad, `turned` the whole way."""
+    """Where a robot with two wheels is, `x` and `y` in m and `heading` in rad, and its speed."""
 
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0

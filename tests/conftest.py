@@ -35,7 +35,9 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 @pytest.fixture(scope="session")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
     """A running appliance for all tests that change nothing about it."""
-    process = ApplianceProcess(tmp_path_factory.mktemp("appliance"), users={"bob": "bob's"}, acl=ACL)
+    process = ApplianceProcess(
+        tmp_path_factory.mktemp("appliance"), users={"bob": "bob's"}, acl=ACL
+    )
     process.start()
     yield process
     process.stop()

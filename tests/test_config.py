@@ -264,3 +264,22 @@ def test_the_file_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / "appliance.yaml").write_bytes(b"robot: \xff")
     with pytest.raises(ConfigError, match="not UTF-8"):
         config.load()
+
+
+def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
+    settings = loads("robot: r2\nbridge: {topics: [{ros: '/camera/**', to: mqtt}]}")
+    route = settings.bridge.topics[0]
+    assert route.is_pattern
+    assert route.topic("r2") == "r2{ros}"
+
+    assert any(
+        "must be mqtt when ros is a pattern" in problem
+        for problem in problems("bridge: {topics: [{ros: '/camera/*', to: both}]}")
+    )
+    assert any(
+        "needs {ros} in it" in problem
+        for problem in problems("bridge: {topics: [{ros: '/a/*', to: mqtt, mqtt: '{robot}/a'}]}")
+    )
+    assert any(
+        "***" in problem for problem in problems("bridge: {topics: [{ros: /a/***, to: mqtt}]}")
+    )

@@ -39,40 +39,39 @@ _WAITS: Final = object()
 
 
 class PluginAccess:
-    """The broker's `Access`: what the files and all topic plugins allow.
+    """The broker's `Access`: what the files allow and no topic plugin refuses.
 
-    The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait
-    for anything (the rules of `TopicAccessControlListPlugin` or a token) are run on the spot. From
-    the first time that one has to wait (for HTTP, SQL), all are asked in the background: what is
-    asked for the first time is refused meanwhile, a SUBSCRIBE too, and the answer holds for the
-    next try. An answer older than 10 s holds while they are asked again, for 10 minutes at most.
-    Messages that already wait for a client are checked again when such an answer turns to no,
-    or the files are read again.
+    The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait for
+    anything (rules in the configuration, a token) are run on the spot. From the first time that
+    one has to wait (HTTP, SQL), all are asked in the background: what is asked for the first time
+    is refused meanwhile, a SUBSCRIBE too, and the answer holds for the next try. Later an answer
+    older than 10 s holds while they are asked again, for 10 minutes at most.
+
+    What already waits for a client is checked again when such an answer turns to no, or when the
+    files are read again.
     """
 
     def __init__(
         self,
         files: Access,
         broker: Broker,
-        plugins: _Plugins,
+        plugins: PluginManager[BrokerContext],
         sessions: Sessions,
-        failures: _Failures,
+        guard: Guard,
     ) -> None:
         self._files = files
         self._broker = broker
         self._plugins = plugins
         self._sessions = sessions
-        self._failures = failures
+        self._guard = guard
         self._epoch = 0
         self._waits = False
-        self._verdicts: OrderedDict[tuple[Identity, Action, str], tuple[Decision, float]] = (
-            OrderedDict()
-        )
-        self._questions: dict[tuple[Identity, Action, str], asyncio.Task[None]] = {}
+        self._verdicts: OrderedDict[Question, tuple[Decision, float]] = OrderedDict()
+        self._asked: dict[Question, asyncio.Task[None]] = {}
 
     @property
     def epoch(self) -> int:
-        """Grows with the files' epoch, and when plugins have to be asked again."""
+        """Grows with the files' epoch, and when plugins are to be asked again."""
         return self._files.epoch + self._epoch
 
     @epoch.setter
@@ -82,108 +81,106 @@ class PluginAccess:
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """What the files allow and no plugin refuses."""
         if isinstance(identity, Unclaimed):
-            return Decision(True, "its plugin subscribed it; checked again when its client comes")
+            return Decision(True, "a plugin subscribed it; checked again when the client comes")
         decision = self._files.decide(identity, action, topic)
-        plugins = self._plugins._topic_plugins
-        if not decision or not plugins:
+        if not decision or not self._plugins._topic_plugins:
             return decision
         if not self._waits:
-            session = self._sessions.of_identity(identity)
-            for plugin in plugins:
-                try:
-                    allowed = self._ask_now(plugin, session, action, topic)
-                except Exception:  # a plugin may raise anything, here also for want of a task
-                    break
-                if allowed is _WAITS:
-                    self._waits = True
-                    log.warning(
-                        "%s has to wait before it can say whether a topic is allowed: what is "
-                        "asked for the first time is refused meanwhile",
-                        type(plugin).__name__,
-                    )
-                    break
-                if not allowed:
-                    return Decision(False, f"refused by {type(plugin).__name__}")
-            else:
-                return decision
-        return self._verdict(identity, action, topic)
+            answered, refusing = self._ask_now(identity, action, topic)
+            if answered:
+                return Decision(False, f"refused by {refusing}") if refusing else decision
+        return self._verdict((identity, action, topic))
 
-    def ask_again(self) -> None:
+    def changed(self) -> None:
         """Let what was decided be decided again."""
-        self._change()
-
-    def close(self) -> None:
-        """Ask no more."""
-        for question in self._questions.values():
-            question.cancel()
-
-    def _ask_now(
-        self, plugin: BaseTopicPlugin, session: AmqttSession, action: Action, topic: str
-    ) -> object:
-        """The plugin's answer, or _WAITS when there is none without waiting."""
-        question = plugin.topic_filtering(
-            session=session, topic=topic, action=AmqttAction(action.value)
-        )
-        try:
-            question.send(None)
-        except StopIteration as answer:
-            return answer.value
-        with contextlib.suppress(RuntimeError):  # it went on waiting while it was cleaning up
-            question.close()
-        return _WAITS
-
-    def _verdict(self, identity: Identity, action: Action, topic: str) -> Decision:
-        key = identity, action, topic
-        now = asyncio.get_running_loop().time()
-        decision, asked_at = self._verdicts.get(key, (None, 0.0))
-        if decision is None or now - asked_at > VERDICT_AGE:
-            if key not in self._questions:
-                if len(self._questions) >= QUESTIONS:
-                    return decision or Decision(False, f"{QUESTIONS} questions wait for plugins")
-                self._questions[key] = asyncio.ensure_future(self._ask(key))
-            if decision is None or now - asked_at > VERDICT_USE:
-                return Decision(False, "the topic plugins have been asked; the next try will tell")
-        self._verdicts.move_to_end(key)
-        return decision
-
-    async def _ask(self, key: tuple[Identity, Action, str]) -> None:
-        """Ask all topic plugins, and keep what they say."""
-        identity, action, topic = key
-        loop = asyncio.get_running_loop()
-        try:
-            answers = await _within(
-                PLUGIN_TIMEOUT,
-                self._plugins.map_plugin_topic(
-                    session=self._sessions.of_identity(identity),
-                    topic=topic,
-                    action=AmqttAction(action.value),
-                ),
-            )
-        except asyncio.TimeoutError:
-            decision = Decision(
-                False, f"the topic plugins said nothing within {PLUGIN_TIMEOUT:g} s"
-            )
-        except Exception as error:  # a plugin may raise anything
-            self._failures.tell("an amqtt topic plugin", error)
-            decision = Decision(False, f"a topic plugin failed: {type(error).__name__}: {error}")
-        else:
-            # As amqtt does it, None is a no.
-            refusing = [type(plugin).__name__ for plugin, yes in answers.items() if not yes]
-            decision = Decision(not refusing, f"decided by plugins: {', '.join(refusing) or 'yes'}")
-        finally:
-            self._questions.pop(key, None)
-        before, _ = self._verdicts.pop(key, (None, 0.0))
-        self._verdicts[key] = decision, loop.time()
-        if len(self._verdicts) > VERDICTS:
-            self._verdicts.popitem(last=False)
-        if before is not None and before.allowed and not decision.allowed:
-            self._epoch += 1
-            self._broker.rules_changed()
-        elif decision.allowed != (before is not None and before.allowed):
-            self._change()
-
-    def _change(self) -> None:
         self._epoch += 1
         self._broker.epoch += 1
 
+    def close(self) -> None:
+        """Ask no more."""
+        for asking in self._asked.values():
+            asking.cancel()
 
+    def _ask_now(self, identity: Identity, action: Action, topic: str) -> tuple[bool, str]:
+        """Whether the plugins could answer on the spot, and which one refuses."""
+        session = self._sessions.of_identity(identity)
+        for plugin in self._plugins._topic_plugins:
+            try:
+                answer = _answer_now(plugin, session, action, topic)
+            except Exception:
+                # Whatever it was, the lack of a task perhaps: it is asked again in one, and what
+                # it raises there is told.
+                return False, ""
+            if answer is _WAITS:
+                self._waits = True
+                log.warning(
+                    "%s has to wait before it can say whether a topic is allowed: what is asked "
+                    "for the first time is refused until it has answered",
+                    name(plugin),
+                )
+                return False, ""
+            if not answer:  # As in amqtt, None is a no.
+                return True, name(plugin)
+        return True, ""
+
+    def _verdict(self, question: Question) -> Decision:
+        """What the plugins last said; they are asked when that is long ago."""
+        decision, said_at = self._verdicts.get(question, (None, 0.0))
+        age = asyncio.get_running_loop().time() - said_at
+        if (decision is None or age > VERDICT_AGE) and question not in self._asked:
+            if len(self._asked) >= QUESTIONS:
+                return Decision(False, f"the topic plugins have {QUESTIONS} questions to answer")
+            self._asked[question] = asyncio.ensure_future(self._ask(question))
+        if decision is None or age > VERDICT_USE:
+            return Decision(False, "the topic plugins were asked; the next try is answered")
+        self._verdicts.move_to_end(question)
+        return decision
+
+    async def _ask(self, question: Question) -> None:
+        """Ask all topic plugins and keep what they say."""
+        identity, action, topic = question
+        session = self._sessions.of_identity(identity)
+        work = self._plugins.map_plugin_topic(
+            session=session, topic=topic, action=AmqttAction(action.value)
+        )
+        try:
+            answers = await self._guard.within(work)
+        except asyncio.TimeoutError:
+            reason = f"the topic plugins said nothing within {self._guard.timeout:g} s"
+            decision = Decision(False, reason)
+        except Exception as error:  # a plugin may raise anything
+            self._guard.tell("an amqtt topic plugin", error)
+            decision = Decision(False, f"a topic plugin failed: {error!r}")
+        else:
+            refusing = ", ".join(name(plugin) for plugin, yes in answers.items() if not yes)
+            reason = f"refused by {refusing}" if refusing else "allowed by the topic plugins"
+            decision = Decision(not refusing, reason)
+        finally:
+            del self._asked[question]
+        self._keep(question, decision)
+
+    def _keep(self, question: Question, decision: Decision) -> None:
+        before, _ = self._verdicts.pop(question, (None, 0.0))
+        self._verdicts[question] = decision, asyncio.get_running_loop().time()
+        if len(self._verdicts) > VERDICTS:
+            self._verdicts.popitem(last=False)
+        was_allowed = before is not None and before.allowed
+        if was_allowed and not decision.allowed:
+            self._epoch += 1
+            self._broker.rules_changed()
+        elif decision.allowed and not was_allowed:
+            self.changed()
+
+
+def _answer_now(
+    plugin: BaseTopicPlugin, session: AmqttSession, action: Action, topic: str
+) -> object:
+    """The plugin's answer, or _WAITS when it has none without waiting."""
+    asked = plugin.topic_filtering(session=session, topic=topic, action=AmqttAction(action.value))
+    try:
+        asked.send(None)
+    except StopIteration as answer:
+        return answer.value
+    with contextlib.suppress(RuntimeError):  # it goes on waiting while it is cleaning up
+        asked.close()
+    return _WAITS

@@ -26,6 +26,7 @@ from appliance.broker.ports import Access, Identity, Refusal
 from appliance.broker.session import Session
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import check_topic
 
 from .access import VERDICT_AGE, PluginAccess
 from .events import PluginEvents
@@ -108,6 +109,7 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     `listen` and `hang_up` start and stop the listeners, where amqtt would its own. `files` stay
     in force: plugins can admit clients that the files do not know, and refuse what these allow.
+    `plugin_timeout` is in seconds.
     """
 
     def __init__(
@@ -117,12 +119,21 @@ class ApplianceBroker(amqtt.broker.Broker):
         config: BrokerConfig,
         listen: Callable[[], Awaitable[None]],
         hang_up: Callable[[], Awaitable[None]],
+        plugin_timeout: float = PLUGIN_TIMEOUT,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
 
         Raises:
             PluginSettingsError: one cannot be loaded.
         """
+        self.broker = broker
+        self._files = files
+        self._listen = listen
+        self._hang_up = hang_up
+        self._guard = Guard(plugin_timeout)
+        self._views = Sessions(broker)
+        self._inside: Session | None = None
+        self._timer: asyncio.TimerHandle | None = None
         try:
             super().__init__(config)
         except (PluginError, PluginLoadError) as error:
@@ -131,21 +142,12 @@ class ApplianceBroker(amqtt.broker.Broker):
                 f"broker.plugins ({', '.join(cast(dict[str, Any], config.plugins))}): "
                 + ": ".join(filter(None, reasons))
             ) from error
-        self.broker = broker
-        self._files = files
-        self._listen = listen
-        self._hang_up = hang_up
-        self._failures = _Failures()
-        self._views = Sessions(broker)
-        self._events = PluginEvents(self.plugins_manager, self._views, self._failures)
-        self._access = PluginAccess(
-            files, broker, self.plugins_manager, self._views, self._failures
-        )
+        manager = self.plugins_manager
+        self._events = PluginEvents(manager, self._views, self._guard)
+        self._access = PluginAccess(files, broker, manager, self._views, self._guard)
         # BrokerContext reads and writes these: they are windows on our broker.
         self._sessions = cast(Any, self._views)
         self._retained_messages = cast(Any, RetainedMessages(broker, self._retain_quietly))
-        self._inside: Session | None = None
-        self._timer: asyncio.TimerHandle | None = None
 
     # --- life cycle ----------------------------------------------------------------------------
 
@@ -175,9 +177,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             raise
         self.transitions.starting_success()
         await self._events.life_cycle(BrokerEvents.POST_START)
-        log.debug(
-            "amqtt plugins: %s", ", ".join(map(_name, self.plugins_manager.plugins)) or "none"
-        )
+        log.debug("amqtt plugins: %s", ", ".join(map(name, self.plugins_manager.plugins)) or "none")
 
     async def _start_listeners(self) -> None:
         """Start our listeners in the place of amqtt's."""
@@ -210,18 +210,18 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     async def _finish(self, what: str, work: Coroutine[Any, Any, None]) -> None:
         try:
-            await _within(PLUGIN_TIMEOUT, work)
+            await self._guard.within(work)
         except asyncio.TimeoutError:
-            log.warning("amqtt plugins still work on %s after %g s", what, PLUGIN_TIMEOUT)
+            log.warning("amqtt plugins still work on %s after %g s", what, self._guard.timeout)
         except Exception as error:  # a plugin may raise anything, and all else is to stop too
-            self._failures.tell(f"an amqtt plugin at {what}", error)
+            self._guard.tell(f"an amqtt plugin at {what}", error)
 
     def _tick(self) -> None:
         """Forget what has ended, and let topic plugins change their mind."""
         self._timer = self._loop.call_later(VERDICT_AGE, self._tick)
         self._views.purge()
         if self.plugins_manager._topic_plugins:
-            self._access.ask_again()
+            self._access.changed()
 
     @property
     def _keeps_sessions(self) -> bool:
@@ -235,70 +235,58 @@ class ApplianceBroker(amqtt.broker.Broker):
     ) -> Identity | Refusal:
         """Who sent the CONNECT, or why it is refused.
 
-        Whom the files know or let in is decided by the files alone. Others come in when at least
-        one plugin says yes and none says no. Such a client has the user name that it gave, as far
-        as somebody vouches for it: `AnonymousAuthPlugin` does not, so those are anonymous.
+        Who has a line in the users file is decided by that file alone, and who needs none, as
+        anonymous clients are let in, comes in. Others come in when at least one plugin says yes
+        and none says no, under the user name that they gave if a plugin vouches for it. With a yes
+        of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
         """
-        if not self.plugins_manager.plugins:
-            return await self._files.authenticate(
-                connect.username, connect.password, connect.client_id, address
-            )
-        self._events.connect_received(connect)
-        password = None
-        who: Identity | Refusal | None = None
-        if connect.username is None or connect.username in self._files.users():
-            who = await self._files.authenticate(
-                connect.username, connect.password, connect.client_id, address
-            )
-        by_plugins = bool(self.plugins_manager._auth_plugins) and (
-            who is None or (connect.username is None and isinstance(who, Refusal))
-        )
-        if by_plugins:
-            try:
-                password = connect.password.decode() if connect.password is not None else None
-            except UnicodeDecodeError:
-                return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
-        elif who is None:
-            who = await self._files.authenticate(
-                connect.username, connect.password, connect.client_id, address
-            )
-        if isinstance(who, Refusal) and not by_plugins:
-            return who
-        login = _login(connect, address, password, ssl_object)
-        if by_plugins or who is None:
-            who = await self._ask_plugins(login)
-            if isinstance(who, Refusal):
+        username, password = connect.username, connect.password
+        plugins = self.plugins_manager
+        if plugins.plugins:
+            self._events.connect_received(connect)
+        known = not plugins._auth_plugins or username in self._files.users()
+        if known or username is None:
+            who = await self._files.authenticate(username, password, connect.client_id, address)
+            if isinstance(who, Identity):
+                # The password is none of the plugins' business here.
+                self._admit(who, address, lambda: login_of(connect, address, None, ssl_object))
                 return who
-        else:
-            login.is_anonymous = who.username is None
-        self._admit(who, address, login)
+            if known:
+                return who
+        try:
+            text = None if password is None else password.decode()
+        except UnicodeDecodeError:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
+        login = login_of(connect, address, text, ssl_object)
+        who = await self._ask_plugins(login)
+        if isinstance(who, Identity):
+            self._admit(who, address, lambda: login)
         return who
 
-    def _admit(self, identity: Identity, address: str, login: AmqttSession) -> None:
+    def _admit(self, identity: Identity, address: str, login: Callable[[], AmqttSession]) -> None:
         """Remember the login for its connection, and hand an unclaimed session to its owner."""
         if self._keeps_sessions:
-            self._views.expect(address, login)
+            self._views.expect(address, login())
         session = self.broker.sessions.get(identity.client_id)
         if session is not None and isinstance(session.identity, Unclaimed):
-            log.info("the session '%s' that a plugin made belongs to %s", session, identity)
+            log.info("the session that a plugin made is taken over by %s", identity)
             session.identity = identity
             self.broker.rules_changed()
 
     async def _ask_plugins(self, login: AmqttSession) -> Identity | Refusal:
-        names = ", ".join(map(_name, self.plugins_manager._auth_plugins))
+        names = ", ".join(map(name, self.plugins_manager._auth_plugins))
         try:
-            answers, vouched = await _within(PLUGIN_TIMEOUT, self._answers(login))
+            answers, vouched = await self._guard.within(self._answers(login))
         except asyncio.TimeoutError:
-            return Refusal(
-                ReasonCode.SERVER_UNAVAILABLE, f"{names} said nothing within {PLUGIN_TIMEOUT:g} s"
-            )
+            reason = f"{names} said nothing within {self._guard.timeout:g} s"
+            return Refusal(ReasonCode.SERVER_UNAVAILABLE, reason)
         except Exception as error:  # a plugin may raise anything
-            self._failures.tell(f"authentication by {names}", error)
+            self._guard.tell(f"authentication by {names}", error)
             return Refusal(ReasonCode.SERVER_UNAVAILABLE, f"{names} failed: {error!r}")
         answered = {plugin: yes for plugin, yes in answers.items() if yes is not None}
         if not answered:
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{names} do not know the client")
-        refusing = ", ".join(_name(plugin) for plugin, yes in answered.items() if not yes)
+        refusing = ", ".join(name(plugin) for plugin, yes in answered.items() if not yes)
         if refusing:
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"refused by {refusing}")
         return Identity(login.username if vouched else None, login.client_id or "")
@@ -352,11 +340,19 @@ class ApplianceBroker(amqtt.broker.Broker):
         data: bytes | bytearray | None,
         qos: int | None = None,
     ) -> None:
-        """Retain a message without delivering it; with no data, delete the topic's."""
+        """Retain a message without delivering it; with no data, delete the topic's.
+
+        Raises:
+            BrokerError: the topic is not valid.
+        """
         if topic_name is not None:
             self._retain(topic_name, bytes(data or b""), qos)
 
     def _retain(self, topic: str, data: bytes, qos: int | None) -> None:
+        try:
+            check_topic(topic)
+        except ValueError as error:
+            raise BrokerError(f"nothing can be retained for '{topic}': {error}") from error
         if data or self.broker.retained.get(topic) is not None:
             self.broker._retain(Message(topic, data, 2 if qos is None else qos, True))
             self.broker.flush()
@@ -366,7 +362,11 @@ class ApplianceBroker(amqtt.broker.Broker):
             self._retain(topic, data, qos)
 
     async def add_subscription(self, subscription: tuple[str, int], session: AmqttSession) -> int:
-        """Subscribe a client's session; returns the granted QoS, or 0x80 for a refusal."""
+        """Subscribe a client's session; returns the granted QoS, or 0x80 for a refusal.
+
+        Raises:
+            BrokerError: there is no such session.
+        """
         topic_filter, qos = subscription
         ours = self.broker.sessions.get(session.client_id or "")
         if ours is None or ours.identity is None:
@@ -403,4 +403,3 @@ class ApplianceBroker(amqtt.broker.Broker):
             yield
         finally:
             self.broker.observer = observer
-

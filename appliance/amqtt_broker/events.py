@@ -47,18 +47,14 @@ _MESSAGES = frozenset(
 class PluginEvents:
     """The broker's `Observer`: fires amqtt's events, those that a plugin has a handler for."""
 
-    def __init__(self, plugins: _Plugins, sessions: Sessions, failures: _Failures) -> None:
+    def __init__(
+        self, plugins: PluginManager[BrokerContext], sessions: Sessions, guard: Guard
+    ) -> None:
         self._plugins = plugins
         self._sessions = sessions
-        self._failures = failures
+        self._guard = guard
         self._wanted = frozenset(plugins._event_plugin_callbacks)
-        self._wants_messages = not self._wanted.isdisjoint(
-            {
-                BrokerEvents.MESSAGE_RECEIVED,
-                BrokerEvents.MESSAGE_BROADCAST,
-                MQTTEvents.PACKET_RECEIVED,
-            }
-        )
+        self._wants_messages = not self._wanted.isdisjoint(_MESSAGES)
         self._pending = 0
         self._pending_bytes = 0
         self._lost = 0
@@ -69,20 +65,17 @@ class PluginEvents:
     @property
     def about_clients(self) -> bool:
         """Whether some plugin wants more than the four events of the life cycle."""
-        return not self._wanted <= {
-            BrokerEvents.PRE_START,
-            BrokerEvents.POST_START,
-            BrokerEvents.PRE_SHUTDOWN,
-            BrokerEvents.POST_SHUTDOWN,
-        }
+        return not self._wanted <= _LIFE_CYCLE
 
     async def life_cycle(self, event: BrokerEvents) -> None:
         """Fire the event and wait until the plugins are done with it, or take too long."""
         tasks = self._fire(event, 0, {})
         if tasks:
-            _, late = await asyncio.wait(tasks, timeout=PLUGIN_TIMEOUT)
+            _, late = await asyncio.wait(tasks, timeout=self._guard.timeout)
             if late:
-                log.warning("amqtt plugins still work on %s after %g s", event, PLUGIN_TIMEOUT)
+                log.warning(
+                    "amqtt plugins still work on %s after %g s", event.value, self._guard.timeout
+                )
 
     def connect_received(self, connect: Connect) -> None:
         """A CONNECT came, from whom is not known yet."""
@@ -154,7 +147,7 @@ class PluginEvents:
             BrokerEvents.RETAINED_MESSAGE,
             len(message.payload),
             client_id=None,
-            retained_message=_message(source, message),
+            retained_message=retained_message(source, message),
         )
 
     def _tell_message(self, session: Session, message: Message, *, allowed: bool) -> None:
@@ -184,12 +177,12 @@ class PluginEvents:
             return
         self._lost += 1
         now = asyncio.get_running_loop().time()
-        if now - self._told_lost_at >= EVENT_LOG_INTERVAL:
+        if now - self._told_lost_at >= LOST_LOG_INTERVAL:
             self._told_lost_at = now
             log.warning("amqtt plugins are too slow: %d events were not told to them", self._lost)
 
     def _fire(
-        self, event: Events, size: int, arguments: Mapping[str, object]
+        self, event: Events, size: int, arguments: dict[str, Any]
     ) -> list[asyncio.Future[Any]]:
         """Let amqtt start the event's handlers; returns what they run in."""
         fired = self._plugins._fired_events
@@ -210,6 +203,4 @@ class PluginEvents:
         if not task.cancelled():
             error = task.exception()
             if error is not None:
-                self._failures.tell(f"an amqtt plugin's handler of {event.value}", error)
-
-
+                self._guard.tell(f"an amqtt plugin's handler of {event.value}", error)

@@ -30,7 +30,7 @@ class Unclaimed(Identity):
     __slots__ = ()
 
 
-# --- sessions and retained messages, as plugins see them -------------------------------------------
+
 
 
 def _split(address: str) -> tuple[str, int]:
@@ -38,7 +38,7 @@ def _split(address: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _login(
+def login_of(
     connect: Connect, address: str, password: str | None, ssl_object: ssl.SSLObject | None
 ) -> AmqttSession:
     """The session that plugins are shown before it is known whether the client may come in."""
@@ -170,7 +170,8 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
                 del self._known[client_id]
 
 
-def _message(source: AmqttSession | None, message: Message) -> RetainedApplicationMessage:
+def retained_message(source: AmqttSession | None, message: Message) -> RetainedApplicationMessage:
+    """A retained message as amqtt has it, with the session that published it, if known."""
     return RetainedApplicationMessage(source, message.topic, message.payload, message.qos)
 
 
@@ -185,7 +186,7 @@ class RetainedMessages(MutableMapping[str, RetainedApplicationMessage]):
         message = self._broker.retained.get(topic)
         if message is None:
             raise KeyError(topic)
-        return _message(None, message)
+        return retained_message(None, message)
 
     def __setitem__(self, topic: str, message: RetainedApplicationMessage) -> None:
         self._retain(topic, bytes(message.data), message.qos)
@@ -202,5 +203,3 @@ class RetainedMessages(MutableMapping[str, RetainedApplicationMessage]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
-
-

@@ -175,6 +175,11 @@ class BridgeCell(Cell):
     receive: Sequence[str] = ()
     maximum: bool = False  # the highest rate without loss, and not the usual one
 
+    @property
+    def queue(self) -> int:
+        """Messages that may wait for the bridge: ten as tutorials have it, or no obstacle."""
+        return 1000 if self.maximum else 10
+
     def missing(self) -> str | None:
         for module in ("rclpy", "std_msgs"):
             if importlib.util.find_spec(module) is None:
@@ -183,8 +188,8 @@ class BridgeCell(Cell):
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
-        # As the tutorial node does it: the text as it is, QoS 0, and what is queued is ten deep.
-        route = {"type": "std_msgs/msg/String", "encoding": "text", "qos": 0, "keep": 10}
+        # As the tutorial node does it: the text as it is, QoS 0, and as much may wait.
+        route = {"type": "std_msgs/msg/String", "encoding": "text", "qos": 0, "keep": self.queue}
         routes = [{"ros": "/chatter", "to": "mqtt"}, {"ros": "/command", "to": "ros"}]
         environment = ros_environment(0)
         with peers.appliance(site, [each | route for each in routes], environment) as server:
@@ -195,7 +200,7 @@ class BridgeCell(Cell):
         environment = {**ros_environment(1), PASSWORD_VARIABLE: site.password}
         with peers.mosquitto(command, site) as server:
             argv = [sys.executable, "-m", "appliance.bench.tutorial"]
-            argv += [str(server.port), peers.USER, PASSWORD_VARIABLE]
+            argv += [str(server.port), peers.USER, PASSWORD_VARIABLE, str(self.queue)]
             log = site.directory / "tutorial.log"
             with peers.running("the tutorial node", argv, environment, log) as node:
                 both = dataclasses.replace(server, pids=(*server.pids, node.pid))

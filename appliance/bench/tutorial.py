@@ -23,10 +23,10 @@ MQTT_TO_ROS = ("bench/command", "command")
 class Tutorial:
     """The node, its MQTT client, and the two callbacks that copy."""
 
-    def __init__(self, port: int, username: str, password: str) -> None:
+    def __init__(self, port: int, username: str, password: str, queue: int) -> None:
         self.node = rclpy.create_node("mqtt_bridge")
-        self.publisher = self.node.create_publisher(String, MQTT_TO_ROS[1], 10)
-        self.node.create_subscription(String, ROS_TO_MQTT[0], self.on_ros, 10)
+        self.publisher = self.node.create_publisher(String, MQTT_TO_ROS[1], queue)
+        self.node.create_subscription(String, ROS_TO_MQTT[0], self.on_ros, queue)
         self.client = mqtt.Client(CallbackAPIVersion.VERSION2)
         self.client.username_pw_set(username, password)
         self.client.on_connect = self.on_connect
@@ -48,10 +48,10 @@ class Tutorial:
 
 
 def main() -> None:
-    """Run until a signal comes: `python -m appliance.bench.tutorial PORT USER VARIABLE`."""
-    port, username, variable = sys.argv[1:]
+    """Run until a signal comes: `python -m appliance.bench.tutorial PORT USER VARIABLE DEPTH`."""
+    port, username, variable, queue = sys.argv[1:]
     rclpy.init()
-    tutorial = Tutorial(int(port), username, os.environ[variable])
+    tutorial = Tutorial(int(port), username, os.environ[variable], int(queue))
     try:
         rclpy.spin(tutorial.node)
     except (KeyboardInterrupt, ExternalShutdownException):

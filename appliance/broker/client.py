@@ -381,11 +381,16 @@ class Client:
         size = properties.get(Property.MAXIMUM_PACKET_SIZE, 0)
         assert isinstance(expiry, int) and isinstance(window, int) and isinstance(size, int)
         return ConnectOptions(
-            keep_alive=packet.keep_alive,
+            keep_alive=self._keep_alive(packet.keep_alive),
             expiry=min(expiry, limits.session_expiry),
             window=min(window, limits.inflight),
             maximum_packet_size=size,
         )
+
+    def _keep_alive(self, asked: int) -> int:
+        """Seconds, 0 for none; only a limit below the protocol's own caps what was asked for."""
+        limit = self.broker.limits.keep_alive
+        return asked if limit == 0xFFFF else min(asked or limit, limit)
 
     def _connack_properties(
         self, packet: Connect, assigned: str | None, options: ConnectOptions
@@ -399,6 +404,8 @@ class Client:
             properties[Property.TOPIC_ALIAS_MAXIMUM] = limits.topic_alias
         if assigned is not None:  # [MQTT-3.2.2-16]
             properties[Property.ASSIGNED_CLIENT_IDENTIFIER] = assigned
+        if packet.keep_alive != options.keep_alive:  # [MQTT-3.1.2-21]
+            properties[Property.SERVER_KEEP_ALIVE] = options.keep_alive
         asked = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL, 0)
         if asked != options.expiry:
             properties[Property.SESSION_EXPIRY_INTERVAL] = options.expiry

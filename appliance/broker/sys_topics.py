@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from appliance.broker.broker import Broker
 
 PREFIX = "$SYS/broker/"
@@ -36,8 +38,10 @@ class Load:
 class SysTopics:
     """Makes the values; `update` gives those that have changed since it was last asked."""
 
-    def __init__(self, broker: Broker, version: str) -> None:
+    def __init__(self, broker: Broker, version: str, heap: Callable[[], int]) -> None:
+        """`heap` says how many bytes of memory the process has."""
         self._broker = broker
+        self._heap = heap
         self._version = version
         self._started_at = broker.now
         self._updated_at = broker.now
@@ -86,6 +90,7 @@ class SysTopics:
             "shared_subscriptions/count": 0,
             "retained messages/count": len(broker.retained),
             "store/messages/count": len(waiting) + len(broker.retained),
+            "heap/current": self._heap(),
             "store/messages/bytes": broker.retained_bytes + broker.ledger.queued_bytes,
         }
         return {name: str(value) for name, value in values.items()} | self._load()

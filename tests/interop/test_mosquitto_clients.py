@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from appliance_process import HOST, PATIENCE, ApplianceProcess, BrokerProcess
 
+from appliance import certs
+
 pytestmark = pytest.mark.skipif(
     shutil.which("mosquitto_pub") is None or shutil.which("mosquitto_sub") is None,
     reason="there is no mosquitto_pub and mosquitto_sub: apt-get install mosquitto-clients",
@@ -112,11 +114,11 @@ def brief(message: dict[str, Any]) -> tuple[str, str, int, int]:
 def test_publish_and_subscribe(broker: BrokerProcess, version: str, topic: str, qos: int) -> None:
     clients = Mosquitto(broker, version)
     with clients.sub("-t", topic, "-q", str(qos)) as subscriber:
-        for text in ("one", "two", "zwölf"):
+        texts = ["one", "", "zwölf"]
+        for text in texts:
             clients.pub(topic, "-q", str(qos), "-m", text)
-        assert [brief(message) for message in subscriber.messages(3)] == [
-            (topic, text, qos, 0) for text in ("one", "two", "zwölf")
-        ]
+        received = [brief(message) for message in subscriber.messages(3)]
+        assert received == [(topic, text, qos, 0) for text in texts]
 
 
 def test_the_lower_qos_counts(broker: BrokerProcess, version: str, topic: str) -> None:
@@ -145,25 +147,22 @@ def test_the_version_of_the_other_makes_no_difference(
 
 
 @pytest.mark.parametrize("qos", QOS)
-def test_many_at_once(broker: BrokerProcess, version: str, topic: str, qos: int) -> None:
-    clients = Mosquitto(broker, version)
+def test_many_at_once(appliance: ApplianceProcess, version: str, topic: str, qos: int) -> None:
+    # Not with mosquitto 2.0.11, whose own client it loses here (MQTT 5, QoS 2: "protocol error").
+    clients = Mosquitto(appliance, version)
     lines = [f"line {number}" for number in range(200)]
     with clients.sub("-t", topic, "-q", str(qos)) as subscriber:
         clients.pub(topic, "-q", str(qos), "-l", stdin="\n".join(lines).encode() + b"\n")
         assert [message["payload"] for message in subscriber.messages(200)] == lines
 
 
-@pytest.mark.parametrize("size", [0, 1, 128, 16_384, 1_000_000])
-def test_sizes(
-    broker: BrokerProcess, version: str, topic: str, size: int, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("size", [1, 128, 16_384, 1_000_000])
+def test_sizes(broker: BrokerProcess, version: str, topic: str, size: int, tmp_path: Path) -> None:
     clients = Mosquitto(broker, version)
     payload = bytes(byte % 251 for byte in range(size))
     (tmp_path / "payload").write_bytes(payload)
     command = ["mosquitto_sub", *clients.arguments, "-t", topic, "-q", "1", "-N", "-C", "1"]
     clients.pub(topic, "-q", "1", "-r", "-f", str(tmp_path / "payload"))
-    if not size:  # retained and empty is nothing
-        return
     received = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=True).stdout
     assert received == payload
     clients.pub(topic, "-r", "-n")
@@ -252,15 +251,13 @@ def test_disconnect_with_will(broker: BrokerProcess, topic: str) -> None:
 
 
 @pytest.mark.parametrize("qos", [1, 2])
-def test_a_session_is_continued(
-    broker: BrokerProcess, version: str, topic: str, qos: int
-) -> None:
+def test_a_session_is_continued(broker: BrokerProcess, version: str, topic: str, qos: int) -> None:
     clients = Mosquitto(broker, version)
     client_id = f"session-{topic[-12:]}"
     clients.subscribe_once(topic, client_id, qos)
     for number in range(30):  # more than go out at once
         clients.pub(topic, "-q", str(qos), "-m", str(number))
-    # -U takes a subscription away that is not there: this time nothing is subscribed to.
+    # It comes back with another subscription: what it receives is owed to the first.
     session = ["--disable-clean-session", "-i", client_id, "-q", str(qos)]
     with clients.sub(*session, "-t", f"{topic}/other") as continued:
         received = [brief(message) for message in continued.messages(30)]
@@ -331,12 +328,10 @@ def test_a_wrong_password(broker: BrokerProcess, version: str, code: int, text: 
 
 
 def test_without_the_authority(broker: BrokerProcess, tmp_path: Path) -> None:
-    from appliance import certs
-
     certs.create_authority(tmp_path, "another")
     clients = Mosquitto(broker, "311")
     clients.arguments[clients.arguments.index("--cafile") + 1] = str(tmp_path / "ca.crt")
     command = ["mosquitto_pub", *clients.arguments, "-t", "r2d2/x", "-m", "x"]
     done = subprocess.run(command, capture_output=True, timeout=PATIENCE)
-    assert done.returncode == 8
+    assert done.returncode
     assert "A TLS error occurred" in done.stderr.decode()

@@ -209,7 +209,8 @@ async def test_both_ways_without_an_echo(house, peer):
         house.send("r2d2/chat", b"%d" % number)
     await peer.do("publish", "/chat", string("from ros").hex())
     await until(lambda: b"from ros" in house.payloads("r2d2/chat"), "the message from ROS")
-    await until(lambda: ("/chat", string("19").hex()) in peer.received, "the last from MQTT")
+    last = string("19").hex()  # DDS may add padding to it
+    await until(lambda: any(cdr.startswith(last) for _, cdr in peer.received), "the last from MQTT")
     # The client has its own messages from the broker, each once; and nothing else from the bridge.
     assert len(house.payloads("r2d2/chat")) == sent + 20 + 1
     assert house.bridge.status()[1].messages == 1
