@@ -97,6 +97,10 @@ class _NoLink:
     def publish(self, *_: object) -> None:
         """It subscribes to nothing, so this is not called."""
 
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """Nor is this."""
+        return False
+
     def pubrel(self, packet_id: int) -> None:
         """Nor is this."""
 
@@ -165,7 +169,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._inside = self.broker.attach("_amqtt", _NoLink())
         if self.plugins_manager.plugins:
             self.broker.access = self._access
-            if self._keeps_sessions:
+            if self._events.about_clients:
                 self.broker.observer = self._events
             self._tick()
         try:
@@ -295,8 +299,8 @@ class ApplianceBroker(amqtt.broker.Broker):
         """What each plugin says, and whether one vouches for the user name."""
         # `map_plugin_auth` in two parts: who vouches is not to be seen from its mixed answers.
         plugins: list[Any] = list(self.plugins_manager._auth_plugins)
-        undemanding = [plugin for plugin in plugins if isinstance(plugin, AnonymousAuthPlugin)]
-        demanding = [plugin for plugin in plugins if plugin not in undemanding]
+        demanding = [plugin for plugin in plugins if not isinstance(plugin, AnonymousAuthPlugin)]
+        undemanding = [plugin for plugin in plugins if plugin not in demanding]
         ask = self.plugins_manager._map_plugin_method
         answers = await ask(demanding, "authenticate", {"session": login})
         vouched = not login.is_anonymous and any(answers.values())

@@ -94,12 +94,12 @@ class PluginEvents:
 
     def connected(self, session: Session) -> None:
         """A client is there."""
-        shown = self._sessions.connected(session)
+        shown = self._sessions.of(session)
         self._tell(BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=shown)
 
     def disconnected(self, session: Session) -> None:
         """A client is gone."""
-        shown = self._sessions.disconnected(session)
+        shown = self._sessions.of(session)
         self._tell(
             BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=shown
         )

@@ -17,9 +17,6 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import V5, Property
 from appliance.mqtt.packets import Connect
 
-#: Logins, of clients not yet connected, that are remembered.
-LOGINS = 1024
-
 
 class Unclaimed(Identity):
     """Owner of a session that a plugin made for a client that never came.
@@ -28,9 +25,6 @@ class Unclaimed(Identity):
     """
 
     __slots__ = ()
-
-
-
 
 
 def _split(address: str) -> tuple[str, int]:
@@ -73,10 +67,6 @@ def _shown(session: Session) -> AmqttSession:
         will = session.will.message
         shown.will_flag, shown.will_topic, shown.will_message = True, will.topic, will.payload
         shown.will_qos, shown.will_retain = will.qos, will.retain
-    if session.link is not None:
-        shown.transitions.connect()
-    else:
-        shown.transitions.disconnect()
     return shown
 
 
@@ -113,11 +103,36 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
         return sum(1 for _ in self)
 
     def of(self, session: Session) -> AmqttSession:
-        """amqtt's object of the session."""
+        """amqtt's object of the session: its last login as plugins saw it, brought up to date."""
         known = self._known.get(session.client_id)
-        if known is None or known[0] is not session:
-            known = self._known[session.client_id] = session, _shown(session)
-        return known[1]
+        before = known[1] if known is not None and known[0] is session else None
+        shown = self._claim_login(session) or before or _shown(session)
+        if shown is not before:
+            if before is not None:  # a session continued: what plugins noted in it stays
+                shown.parent = 1
+                shown.attributes = before.attributes | shown.attributes
+            self._known[session.client_id] = session, shown
+        state = shown.transitions.state
+        if session.link is not None and state != "connected":
+            shown.transitions.connect()
+        elif session.link is None and state != "disconnected":
+            shown.transitions.disconnect()
+        return shown
+
+    def _claim_login(self, session: Session) -> AmqttSession | None:
+        """What plugins saw of the login behind the session's connection, once."""
+        link, identity = session.link, session.identity
+        login = self._logins.pop(link.wire.address, None) if isinstance(link, Client) else None
+        # An address can be used again; who it is cannot be mistaken.
+        if (
+            login is None
+            or identity is None
+            or login.client_id not in ("", session.client_id)
+            or identity.username not in (None, login.username)
+        ):
+            return None
+        login.client_id = session.client_id
+        return login
 
     def of_identity(self, identity: Identity) -> AmqttSession:
         """amqtt's object of the client's session, also of one that is just ending."""
@@ -132,42 +147,18 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
         return shown
 
     def expect(self, address: str, login: AmqttSession) -> None:
-        """The client at the address logged in: this is what plugins know of it."""
-        while len(self._logins) >= LOGINS:
-            del self._logins[next(iter(self._logins))]
+        """The client at the address may come in: this is what plugins know of it."""
         self._logins[address] = login
 
-    def connected(self, session: Session) -> AmqttSession:
-        """The client's connection is there; its login becomes its session's object."""
-        link, identity = session.link, session.identity
-        login = self._logins.pop(link.wire.address, None) if isinstance(link, Client) else None
-        before = self._known.pop(session.client_id, None)
-        if (
-            login is None
-            or identity is None
-            or login.client_id not in ("", session.client_id)
-            or identity.username not in (None, login.username)
-        ):
-            return self.of(session)
-        login.client_id = session.client_id
-        if before is not None and before[0] is session:  # continued: plugins left notes in there
-            login.parent = 1
-            login.attributes = before[1].attributes | login.attributes
-        login.transitions.connect()
-        self._known[session.client_id] = session, login
-        return login
-
-    def disconnected(self, session: Session) -> AmqttSession:
-        """The client's connection ended."""
-        shown = self.of(session)
-        shown.transitions.disconnect()
-        return shown
-
     def purge(self) -> None:
-        """Forget the objects of sessions that have ended."""
+        """Forget the objects of sessions and connections that have ended."""
         for client_id, (session, _) in list(self._known.items()):
             if self._broker.sessions.get(client_id) is not session:
                 del self._known[client_id]
+        clients = (client for client in self._broker.clients if isinstance(client, Client))
+        addresses = {client.wire.address for client in clients}
+        for address in self._logins.keys() - addresses:
+            del self._logins[address]
 
 
 def retained_message(source: AmqttSession | None, message: Message) -> RetainedApplicationMessage:

@@ -25,6 +25,7 @@ GRACE_SECONDS = 90.0  # a run's connecting and settling, above the time it measu
 PACE = 1000.0  # messages a second of the bridge's rows
 PACES = [round(2000 * 1.5**step) for step in range(9)]  # up to 51,258; the sender's end is near
 PACE_SECONDS = 2.0
+BACKLOG_US = 50_000.0  # of median latency: no loss yet, but only because a queue is growing
 LOSS = 0.001  # taken for none: a computer that does other things stalls for more than a queue
 
 Figures = Result  # of one broker: each figure the median of its runs
@@ -148,9 +149,9 @@ class BridgeSide:
         best: Result | None = None
         for pace in PACES:
             result = self._measure(min(seconds, PACE_SECONDS), pace)
-            if result.rate is None or result.rate < 0.95 * pace:
-                break
-            if result.lost > LOSS * (result.messages + result.lost):
+            late = result.p50_us is None or result.p50_us > BACKLOG_US
+            behind = result.rate is None or result.rate < 0.95 * pace
+            if late or behind or result.lost > LOSS * (result.messages + result.lost):
                 break
             best = dataclasses.replace(result, lost=0)
         if best is None:

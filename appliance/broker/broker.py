@@ -9,13 +9,13 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
-from appliance.broker.session import Ledger, PendingWill, Session
+from appliance.broker.session import Delivery, Ledger, PendingWill, Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -32,6 +32,9 @@ log = logging.getLogger(__name__)
 #: Topics a session's routes are cached for; a client that publishes to more starts over, so that
 #: a stranger's invented topics cannot grow the cache.
 CACHED_ROUTES = 1024
+
+#: And the longest of these topics, in bytes.
+CACHED_TOPIC = 512
 
 #: Seconds between two lines in the log about the same full queue.
 FULL_QUEUE_LOG_INTERVAL = 60.0
@@ -145,18 +148,27 @@ class Broker:
             self.sessions[identity.client_id] = session
         session.identity = identity
         session.link = link
-        session.expiry = expiry
         session.ends_at = None
         session.will = will
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
+        self._set_expiry(session, expiry)
+        return session, present
+
+    def _set_expiry(self, session: Session, expiry: int) -> None:
+        was_kept = session.persistent
+        session.expiry = expiry
         if expiry:
             self.store.session_saved(session)
-        return session, present
+        elif was_kept:
+            self.store.session_removed(session)
 
     def connected(self, session: Session) -> None:
         """The CONNACK was sent: observers may know, and what waits may go."""
         if self.observer is not None:
             self.observer.connected(session)
+        for packet_id, delivery in list(session.inflight.items()):
+            if delivery is not None and not self.may_receive(session, delivery[0].topic):
+                session.give_up(packet_id)
         session.resend()
 
     def attach(self, client_id: str, link: Link) -> Session:
@@ -182,7 +194,7 @@ class Broker:
         session.link = None
         session.forget_transient()
         if expiry is not None:
-            session.expiry = min(expiry, self.limits.session_expiry)
+            self._set_expiry(session, min(expiry, self.limits.session_expiry))
         if self.observer is not None:
             self.observer.disconnected(session)
         will = session.will
@@ -205,6 +217,7 @@ class Broker:
         if self.sessions.get(session.client_id) is session:
             del self.sessions[session.client_id]
         self._publish_will(session)
+        session.ends_at = None
         for topic_filter in session.subscriptions:
             self._subscriptions.remove(topic_filter, session)
         if session.subscriptions:
@@ -241,7 +254,9 @@ class Broker:
             session.epoch = self.epoch
         route = session.routes.get(topic_wire)
         if route is None:
-            route = session.routes[topic_wire] = self._find_route(session, topic_wire)
+            route = self._find_route(session, topic_wire)
+            if len(topic_wire) <= CACHED_TOPIC:
+                session.routes[topic_wire] = route
         return route
 
     def _find_route(self, session: Session, topic_wire: bytes) -> Route:
@@ -426,22 +441,23 @@ class Broker:
         handling = subscription.retain_handling
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
+        session.replay(subscription.filter, self._find_retained(session, subscription))
+
+    def _find_retained(self, session: Session, subscription: Subscription) -> Iterator[Delivery]:
+        """What a subscription asks for, checked message by message as the client takes them."""
         ids = [subscription.identifier] if subscription.identifier else None
-        expired = []
         for topic, message in self.retained.find(subscription.filter):
             if message.expires_at is not None and message.expires_at <= self.now:
-                expired.append(message)
+                self.retained_bytes -= message.size
+                self.retained.delete(topic)
             elif self.may_receive(session, topic):
-                session.replay(message, min(message.qos, subscription.qos), ids)
-        for message in expired:
-            self.retained_bytes -= message.size
-            self.retained.delete(message.topic)
-        session.pump()
+                yield message, min(message.qos, subscription.qos), True, ids
 
     def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:
         """Unsubscribe; returns 0x00, or 0x11 when there was no such subscription."""
         if session.subscriptions.pop(topic_filter, None) is None:
             return ReasonCode.NO_SUBSCRIPTION_EXISTED
+        session.replays.pop(topic_filter, None)
         self._subscriptions.remove(topic_filter, session)
         self.epoch += 1
         if session.persistent:
@@ -469,6 +485,15 @@ class Broker:
 
     def _schedule(self, when: float, session: Session) -> None:
         heapq.heappush(self._deadlines, (when, next(self._order), session))
+        # Those of clients that came back in time hold no more: they are not kept for their days.
+        if len(self._deadlines) > 4 * len(self.sessions) + 64:
+            hold = {
+                (when, session.client_id): (when, order, session)
+                for when, order, session in self._deadlines
+                if when in (session.ends_at, session.will_at)
+            }
+            self._deadlines = list(hold.values())
+            heapq.heapify(self._deadlines)
 
     def tick(self, now: float) -> None:
         """Let time pass: keep alive, wills, sessions. `now` is in seconds and never goes back."""
@@ -493,13 +518,14 @@ class Broker:
 
         With something staged in the store this waits for its commit: acknowledged means kept.
         """
-        if self.store.staged:
-            self.store.after_commit(self._committed)
-            return
-        clients = self.unflushed
-        self.unflushed = []
-        for client in clients:
-            client.flush()
+        while self.unflushed:  # what was written makes room for what waited
+            if self.store.staged:
+                self.store.after_commit(self._committed)
+                return
+            clients = self.unflushed
+            self.unflushed = []
+            for client in clients:
+                client.flush()
 
     def _committed(self, kept: bool) -> None:
         if not kept:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -100,6 +100,7 @@ class Session:
         "queue",
         "received",
         "replays",
+        "resends",
         "routes",
         "subscriptions",
         "will",
@@ -119,11 +120,14 @@ class Session:
         self.subscriptions: dict[str, Subscription] = {}
         #: Sent and not acknowledged, in the order sent; None after PUBREC [MQTT-4.3.3-8].
         self.inflight: dict[int, Delivery | None] = {}
+        #: Of those in flight, the ids that a new connection was not sent yet.
+        self.resends: deque[int] = deque()
         self.window = ledger.limits.inflight
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
-        #: Retained messages of new subscriptions, waiting likewise; they go before anything newer.
-        self.replays: deque[Delivery] = deque()
+        #: Retained messages of new subscriptions, by filter; they go before anything newer. They
+        #: are looked up when their turn comes, so that a slow client's take no memory.
+        self.replays: dict[str, Iterator[Delivery]] = {}
         #: QoS 0, waiting for a slow client: the newest of each topic.
         self.latest: dict[str, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
@@ -166,58 +170,87 @@ class Session:
                 and not self.queue
                 and not self.replays
             ):
+                self._owe(message, qos)
                 self._send(link, (message, qos, retain, subscription_ids))
                 return True
             if len(self.queue) < self.ledger.limits.queue_messages:
                 self._count(message)
                 self.queue.append((message, qos, retain, subscription_ids))
-                if self.expiry:
-                    self.ledger.store.queued(self, message, qos)
+                self._owe(message, qos)
                 return True
         self.ledger.counters.publish_dropped += 1
         return False
 
-    def replay(self, message: Message, qos: int, subscription_ids: list[int] | None) -> None:
-        """Send a retained message, behind those before it; the reference is all that it costs."""
-        self.replays.append((message, qos, True, subscription_ids))
+    def replay(self, topic_filter: str, deliveries: Iterator[Delivery]) -> None:
+        """Send retained messages, behind those before them; asked for again, they begin anew."""
+        self.replays.pop(topic_filter, None)
+        self.replays[topic_filter] = deliveries
+        self.pump()
 
     def pump(self) -> None:
         """Send what waits, as far as the window and the client allow."""
         link = self.link
         if link is None:
             return
-        self._pump_queues(link)
-        self._pump_latest(link)
+        if self.resends:
+            self._pump_resends(link)
+        if self.replays and not self.resends:
+            self._pump_replays(link)
+        if not self.replays and not self.resends:
+            self._pump_queue(link)
+            self._pump_latest(link)
 
-    def _pump_queues(self, link: Link) -> None:
-        now = self.ledger.now
-        for waiting in (self.replays, self.queue):
-            while waiting and link.writable:
-                delivery = waiting[0]
+    def _pump_resends(self, link: Link) -> None:
+        # The window may be smaller than it was on the last connection [MQTT-3.3.4-9].
+        resends = self.resends
+        while resends and link.writable and len(self.inflight) - len(resends) < self.window:
+            packet_id = resends.popleft()
+            delivery = self.inflight.get(packet_id)
+            if delivery is not None:
                 message, qos, retain, subscription_ids = delivery
-                if qos and len(self.inflight) >= self.window:
-                    return
-                waiting.popleft()
-                if waiting is self.queue:
-                    self._uncount(message)
-                if message.expires_at is not None and message.expires_at <= now:
-                    self._settled(message, qos)
-                    self.ledger.counters.publish_dropped += 1
-                elif qos:
-                    self._send(link, delivery)
-                else:
-                    link.publish(message, 0, 0, False, retain, subscription_ids)
+                link.publish(message, qos, packet_id, True, retain, subscription_ids)
+
+    def _pump_replays(self, link: Link) -> None:
+        while self.replays and link.writable and len(self.inflight) < self.window:
+            topic_filter = next(iter(self.replays))
+            delivery = next(self.replays[topic_filter], None)
+            if delivery is None:
+                del self.replays[topic_filter]
+                continue
+            message, qos, retain, subscription_ids = delivery
+            if qos:
+                self._owe(message, qos)
+                self._send(link, delivery)
+            else:
+                link.publish(message, 0, 0, False, retain, subscription_ids)
+
+    def _pump_queue(self, link: Link) -> None:
+        while self.queue and link.writable and len(self.inflight) < self.window:
+            delivery = self.queue.popleft()
+            message = delivery[0]
+            self._uncount(message)
+            if self._has_expired(message):
+                self._settled(message, delivery[1])
+            else:
+                self._send(link, delivery)
+
+    def _has_expired(self, message: Message) -> bool:
+        """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
+        if message.expires_at is None or message.expires_at > self.ledger.now:
+            return False
+        self.ledger.counters.publish_dropped += 1
+        return True
 
     def resend(self) -> None:
         """Send again what was in flight when the last connection ended [MQTT-4.4.0-1]."""
         link = self.link
         assert link is not None
-        for packet_id, delivery in list(self.inflight.items()):
+        self.resends.clear()
+        for packet_id, delivery in self.inflight.items():
             if delivery is None:
                 link.pubrel(packet_id)
             else:
-                message, qos, retain, subscription_ids = delivery
-                link.publish(message, qos, packet_id, True, retain, subscription_ids)
+                self.resends.append(packet_id)
         self.pump()
 
     def _send(self, link: Link, delivery: Delivery) -> None:
@@ -229,16 +262,15 @@ class Session:
         self._last_packet_id = packet_id
         inflight[packet_id] = delivery
         self._count(message)
-        if self.expiry:
-            self.ledger.store.queued(self, message, qos)
         link.publish(message, qos, packet_id, False, retain, subscription_ids)
 
     def _pump_latest(self, link: Link) -> None:
-        while self.latest and link.writable and not self.replays:
+        while self.latest and link.writable:
             topic = next(iter(self.latest))
             message, _, retain, subscription_ids = self.latest.pop(topic)
             self._uncount(message)
-            link.publish(message, 0, 0, False, retain, subscription_ids)
+            if not self._has_expired(message):
+                link.publish(message, 0, 0, False, retain, subscription_ids)
 
     def _keep_latest(self, delivery: Delivery) -> bool:
         message = delivery[0]
@@ -268,6 +300,10 @@ class Session:
         self.bytes -= message.size
         self.ledger.queued_bytes -= message.size
 
+    def _owe(self, message: Message, qos: int) -> None:
+        if self.expiry:
+            self.ledger.store.queued(self, message, qos)
+
     def _settled(self, message: Message, qos: int) -> None:
         if qos and self.expiry:
             self.ledger.store.settled(self, message)
@@ -286,7 +322,7 @@ class Session:
         self.ledger.queued_bytes -= size
         if self.expiry:
             self.ledger.store.settled(self, message)
-        if self.queue or self.replays:
+        if self.queue or self.replays or self.resends:
             self.pump()
         return True
 
@@ -295,16 +331,17 @@ class Session:
         if packet_id not in self.inflight:
             return False
         delivery = self.inflight[packet_id]
-        if delivery is None:
-            return True  # PUBREC again: PUBREL goes out again
-        if delivery[1] != 2:
+        if delivery is not None and delivery[1] != 2:
             return False
         if code >= 0x80:
             self.give_up(packet_id)
             self.pump()
+        elif delivery is None:
+            pass  # PUBREC again: PUBREL goes out again
         else:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
+            self._settled(delivery[0], 2)
         return True
 
     def pubcomp(self, packet_id: int) -> bool:
@@ -312,7 +349,7 @@ class Session:
         if packet_id not in self.inflight or self.inflight[packet_id] is not None:
             return False
         del self.inflight[packet_id]
-        if self.queue or self.replays:
+        if self.queue or self.replays or self.resends:
             self.pump()
         return True
 
@@ -345,17 +382,13 @@ class Session:
     def revoke(self, allowed: Callable[[str], bool]) -> int:
         """Drop what waits and may no longer be received; returns how many messages."""
         dropped = 0
-        for waiting in (self.queue, self.replays):
-            kept = [delivery for delivery in waiting if allowed(delivery[0].topic)]
-            if len(kept) < len(waiting):
-                dropped += len(waiting) - len(kept)
-                if waiting is self.queue:
-                    for message, qos, _, _ in waiting:
-                        if not allowed(message.topic):
-                            self._uncount(message)
-                            self._settled(message, qos)
-                waiting.clear()
-                waiting.extend(kept)
+        for delivery in list(self.queue):
+            message, qos, _, _ = delivery
+            if not allowed(message.topic):
+                self.queue.remove(delivery)
+                self._uncount(message)
+                self._settled(message, qos)
+                dropped += 1
         for topic in [topic for topic in self.latest if not allowed(topic)]:
             self._uncount(self.latest.pop(topic)[0])
             dropped += 1
@@ -363,18 +396,23 @@ class Session:
         return dropped
 
     def forget_transient(self) -> None:
-        """Drop what does not outlive the connection: QoS 0, and retained messages not yet sent."""
+        """Drop what does not outlive the connection: QoS 0, and what is known of its topics."""
         for delivery in self.latest.values():
             self._uncount(delivery[0])
         self.latest.clear()
-        self.replays = deque(delivery for delivery in self.replays if delivery[1])
+        for topic_filter in list(self.replays):
+            if not self.subscriptions[topic_filter].qos:
+                del self.replays[topic_filter]
+        self.routes.clear()
 
     def clear(self) -> None:
         """Give back what all queues of this session hold."""
         self.ledger.queued_bytes -= self.bytes
         self.bytes = 0
-        for waiting in (self.queue, self.replays, self.latest, self.inflight, self.received):
+        for waiting in (self.queue, self.latest, self.inflight, self.received):
             waiting.clear()
+        self.resends.clear()
+        self.replays.clear()
 
     def close_link(self, reason: ReasonCode, message: str) -> None:
         """End the session's connection, if it has one."""

@@ -107,7 +107,8 @@ class Subscriber:
 
 
 def brief(message: dict[str, Any]) -> tuple[str, str, int, int]:
-    return message["topic"], message["payload"], message["qos"], message["retain"]
+    payload = message["payload"] or ""  # mosquitto_sub says null of an empty one
+    return message["topic"], payload, message["qos"], message["retain"]
 
 
 @pytest.mark.parametrize("qos", QOS)
