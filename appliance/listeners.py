@@ -14,6 +14,7 @@ from typing import TypeAlias, cast
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.ports import Identity, Refusal
+from appliance.mqtt.connection import State
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
 
@@ -36,6 +37,9 @@ BACKLOG = 1024
 
 #: Seconds until connections are accepted again after the system refused one.
 ACCEPT_PAUSE = 0.5
+
+#: Seconds that a client gets to read the last bytes before its connection is cut.
+CLOSE_TIMEOUT = 10.0
 
 #: Seconds that clients get at the stop to read what was written to them.
 STOP_TIMEOUT = 1.0
@@ -184,6 +188,9 @@ class ClientProtocol(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._loop = asyncio.get_running_loop()
         self._client = Client(self._broker, self)
+        #: Bytes in the output from which on the client is not listened to.
+        self._output_limit = 0
+        self._choked = False
         # Slow strangers: the whole way to the end of CONNECT has one time limit.
         self._timeout = self._loop.call_later(listeners.connect_timeout, self._too_late)
 
@@ -196,6 +203,8 @@ class ClientProtocol(asyncio.Protocol):
         timeout = self._listeners.connect_timeout if context else None
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # A client without keep alive whose computer is gone is found out by the system.
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             await self._loop.connect_accepted_socket(
                 lambda: self, connection, ssl=context, ssl_handshake_timeout=timeout
             )
@@ -208,6 +217,8 @@ class ClientProtocol(asyncio.Protocol):
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=OUTPUT_HIGH_WATER)
+        if self not in self._listeners.open:  # the handshake ended just after its time
+            self._transport.abort()
 
     def _too_late(self) -> None:
         log.warning(
@@ -226,12 +237,22 @@ class ClientProtocol(asyncio.Protocol):
         if len(data) >= LARGE_CHUNK:
             self._pause_reading()
             self._loop.call_soon(self._read_on)
+        if not self._client.writable and self._output_size() > self._output_limit:
+            # It asks on, and does not read the answers.
+            self._choked = True
+            self._pause_reading()
+
+    def _output_size(self) -> int:
+        transport = self._transport
+        return 0 if transport is None else transport.get_write_buffer_size()
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.pause_reading()
 
     def _read_on(self) -> None:
+        if self._choked or self._client.connection.state is State.AUTHENTICATING:
+            return
         if self._transport is not None and not self._transport.is_closing():
             self._transport.resume_reading()
 
@@ -244,12 +265,16 @@ class ClientProtocol(asyncio.Protocol):
     def pause_writing(self) -> None:
         """The client reads slower than it is written to."""
         self._client.writable = False
+        # From here on its output grows by what it is answered only, and by no more than this.
+        self._output_limit = self._output_size() + OUTPUT_HIGH_WATER
 
     def resume_writing(self) -> None:
         """It has caught up."""
         if self._transport is not None and not self._transport.is_closing():
+            self._choked = False
             self._client.resume_writing()
             self._broker.flush()
+            self._read_on()
 
     def _forget(self) -> None:
         self._listeners.closed(self)
@@ -289,6 +314,8 @@ class ClientProtocol(asyncio.Protocol):
         """Write out what waits, then close."""
         if self._transport is not None:
             self._transport.close()
+            self._timeout.cancel()
+            self._timeout = self._loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -12,6 +12,8 @@ for it run unchanged. Its listeners, sessions and broadcast loop are not used: w
   looked up; not for other packets. PACKET_SENT is never fired.
 * Events wait in a bounded number; what handlers are too slow for is not told to them.
 * Topic plugins that have to wait for something cannot answer at once; see `PluginAccess`.
+* A session's `username` is what the client gave, vouched for or not, as in amqtt; its `password`
+  is None for users of the users file.
 * The protocol handlers of `BrokerContext`'s sessions are None, and so are packet ids of messages.
 * A plugin that computes, or waits without `await`, stops everything meanwhile: `FileAuthPlugin`
   does while it hashes. The users file does not.

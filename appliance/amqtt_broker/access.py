@@ -28,8 +28,9 @@ VERDICT_AGE = 10.0
 VERDICT_USE = 600.0
 #: Verdicts of plugins that have to wait for something, kept in all.
 VERDICTS = 4096
-#: Questions to such plugins at one time.
+#: Questions to such plugins at one time, in all and of one client.
 QUESTIONS = 64
+CLIENT_QUESTIONS = 8
 
 #: Who wants to do what with which topic.
 Question: TypeAlias = "tuple[Identity, Action, str]"
@@ -128,8 +129,9 @@ class PluginAccess:
         decision, said_at = self._verdicts.get(question, (None, 0.0))
         age = asyncio.get_running_loop().time() - said_at
         if (decision is None or age > VERDICT_AGE) and question not in self._asked:
-            if len(self._asked) >= QUESTIONS:
-                return Decision(False, f"the topic plugins have {QUESTIONS} questions to answer")
+            own = sum(1 for asked in self._asked if asked[0] == question[0])
+            if len(self._asked) >= QUESTIONS or own >= CLIENT_QUESTIONS:
+                return Decision(False, "the topic plugins have too many questions to answer")
             self._asked[question] = asyncio.ensure_future(self._ask(question))
         if decision is None or age > VERDICT_USE:
             return Decision(False, "the topic plugins were asked; the next try is answered")

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 CONNECT_SECONDS = 60.0  # five hundred TLS handshakes and password checks on a small computer
 RECORDS_BYTES = 1 << 18  # TLS records taken in one system call
+RECORDS = memoryview(bytearray(RECORDS_BYTES))  # one for all: a new one a call costs more than TLS
 
 
 class LoadError(Exception):
@@ -133,12 +134,12 @@ class Tls:
         """Receive; returns the number of bytes, 0 when there is nothing yet."""
         if not self.more:
             try:
-                sealed = self._socket.recv(RECORDS_BYTES)
+                received = self._socket.recv_into(RECORDS)
             except BlockingIOError:
                 return 0
-            if not sealed:
+            if not received:
                 raise LoadError("the broker closed a connection")
-            self._incoming.write(sealed)
+            self._incoming.write(RECORDS[:received])
         size, room = 0, len(buffer)
         try:
             while size < room:

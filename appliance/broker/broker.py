@@ -16,7 +16,7 @@ from typing import Protocol, TypeAlias
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
 from appliance.broker.session import Delivery, Ledger, PendingWill, Session
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Property, decode_string
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import (
@@ -260,12 +260,7 @@ class Broker:
         return route
 
     def _find_route(self, session: Session, topic_wire: bytes) -> Route:
-        try:
-            topic = topic_wire[2:].decode()
-        except UnicodeDecodeError as error:  # [MQTT-1.5.4-1], 3.1.1 [MQTT-1.5.3-1]
-            raise ProtocolError(
-                ReasonCode.MALFORMED_PACKET, f"the topic is not UTF-8: {error}"
-            ) from None
+        topic, _ = decode_string(topic_wire, 0)
         try:
             check_topic(topic)
         except ValueError as error:

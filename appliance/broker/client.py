@@ -49,6 +49,11 @@ log = logging.getLogger(__name__)
 NEVER = 0xFFFF_FFFF
 
 
+#: Bytes that a client is sent before the next flush. What waits in its session waits on, until the
+#: network has taken these: it is the network that says how fast a client is.
+OUTPUT_LIMIT = 1024 * 1024
+
+
 class Wire(Protocol):
     """The connection under a client, as a listener implements it."""
 
@@ -88,6 +93,8 @@ class Client:
         self._counters = broker.counters
         self._connect: Connect | None = None
         self._out: list[bytes] = []
+        self._out_size = 0  # of the PUBLISH packets in there, from their sessions
+        self._full = False  # not writable until the flush, for OUTPUT_LIMIT
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
         self._maximum_packet_size = 0
@@ -250,8 +257,8 @@ class Client:
         elif isinstance(packet, Connect):
             self._on_connect(packet)
         elif isinstance(packet, Auth):
-            raise ProtocolError(  # [MQTT-4.12.0-1]
-                ReasonCode.BAD_AUTHENTICATION_METHOD, "it named no authentication method in CONNECT"
+            raise ProtocolError(  # [MQTT-4.12.0-7]
+                ReasonCode.PROTOCOL_ERROR, "AUTH, but no authentication method in CONNECT"
             )
 
     def _on_subscribe(self, packet: Subscribe) -> None:
@@ -298,6 +305,7 @@ class Client:
     def _on_connect(self, packet: Connect) -> None:
         self._version = packet.version
         properties = packet.properties or {}
+        properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
         if Property.AUTHENTICATION_METHOD in properties:
             self.refuse(
                 ReasonCode.BAD_AUTHENTICATION_METHOD, "enhanced authentication is not offered"
@@ -444,7 +452,7 @@ class Client:
         if dup:
             first |= 8
         version = self._version
-        if self._maximum_packet_size and self._too_large(message, subscription_ids):
+        if self._maximum_packet_size and self._too_large(first, message, subscription_ids):
             self._counters.publish_dropped += 1
             if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
                 self.session.give_up(packet_id)
@@ -462,6 +470,10 @@ class Client:
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
                 out.append(message.payload if version == 4 else message.tail(5))
+        self._out_size += len(out[-1])
+        if self._out_size > OUTPUT_LIMIT:
+            self._full = True
+            self.writable = False
         counters = self._counters
         counters.publish_sent += 1
         counters.publish_bytes_sent += len(message.payload)
@@ -486,8 +498,8 @@ class Client:
         counters.publish_bytes_sent += payload_size
         return True
 
-    def _too_large(self, message: Message, subscription_ids: list[int] | None) -> bool:
-        size = len(message.encode_for(0x32, 1, subscription_ids, self._ledger.now))
+    def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
+        size = len(message.encode_for(first, 1, subscription_ids, self._ledger.now))
         return size > self._maximum_packet_size
 
     def pubrel(self, packet_id: int) -> None:
@@ -512,16 +524,26 @@ class Client:
         self._counters.control_sent += 1
 
     def flush(self) -> None:
-        """Write what was sent since the last flush."""
+        """Write what was sent since the last flush, and close if it was the last."""
         out = self._out
         if out:
             self._out = []
+            self._out_size = 0
+            if self._full:
+                self.writable = not self._closed
             self.wire.write(out)
+        if self._closed:
+            self.wire.close()
+        elif self._full:
+            self._full = False
+            if self.writable:  # the network has not asked for a pause
+                self.resume_writing()
 
     def abandon(self) -> None:
         """Close without sending what waits: what it would acknowledge could not be kept."""
         self._out.clear()
         self.lost()
+        self.wire.close()
 
     def resume_writing(self) -> None:
         """The network takes bytes again: send what waited."""
@@ -570,9 +592,11 @@ class Client:
             self.broker.disconnect(session, self, publish_will=publish_will, expiry=expiry)
 
     def _shut(self) -> None:
+        # The last bytes are written, and the connection closed, by the flush: like all bytes they
+        # wait for what they acknowledge to be kept.
         self._closed = True
         self.connection.close()
         self.writable = False
         self.broker.clients.discard(self)
-        self.flush()
-        self.wire.close()
+        if not self._out:
+            self.broker.unflushed.append(self)

@@ -13,6 +13,9 @@ from appliance.mqtt.codec import (
 #: What a queued message takes beside its payload, roughly: the objects around it, in bytes.
 OVERHEAD = 512
 
+#: And what a user property takes beside its bytes on the wire: a tuple and two strings.
+PAIR_OVERHEAD = 160
+
 
 class Message:
     """An application message; immutable by convention, shared by all sessions that it is owed to.
@@ -61,6 +64,10 @@ class Message:
         self._tail5: bytes | None = None
         #: Bytes that a queue counts for this message.
         self.size = len(payload) + len(self.topic_wire) + OVERHEAD
+        if properties:
+            pairs = properties.get(Property.USER_PROPERTY)
+            self.size += len(encode_properties(properties))
+            self.size += PAIR_OVERHEAD * len(pairs) if isinstance(pairs, list) else 0
 
     def head(self, version: int, first: int) -> bytes:
         """The packet's bytes up to the topic's end; for QoS 0 to the packet's end."""

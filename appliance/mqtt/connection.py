@@ -27,9 +27,10 @@ from appliance.mqtt.topics import check_topic
 RawPublish: TypeAlias = tuple[int, bytes, int, bytes, bytes]
 Event: TypeAlias = "Packet | RawPublish | int"
 
-#: The largest CONNECT that is read: five strings of 65,535 bytes and some properties. A stranger
-#: gets no more memory than this, whatever packet size is allowed to clients that have logged in.
-MAXIMUM_CONNECT = 384 * 1024
+#: The largest packet that is read and is not a PUBLISH, in bytes: five strings of 65,535 bytes and
+#: some properties for a CONNECT, so that a stranger gets no more memory than this; thousands of
+#: filters for a SUBSCRIBE, and not the millions that would keep all others waiting.
+MAXIMUM_CONTROL = 384 * 1024
 
 PUBACK = PacketType.PUBACK << 16
 PUBREC = PacketType.PUBREC << 16
@@ -94,7 +95,8 @@ class Connection:
         #: The last PUBLISH of the data path: its bytes from the header to the topic's end, and what
         #: they say. A client that repeats itself (same topic, same size: most of them do) is
         #: recognised by these bytes, which saves taking them apart again.
-        self._head = b"\0"  # no packet begins with it
+        self._head_first = -1
+        self._head = b""
         self._head_topic = b""
         self._head_size = 0
 
@@ -146,7 +148,7 @@ class Connection:
         try:
             while end - pos >= 2 and self._reading:
                 first = buf[pos]
-                if first == self._head[0] and buf.startswith(self._head, pos):
+                if first == self._head_first and buf.startswith(self._head, pos):
                     stop = pos + self._head_size
                     if stop > end:
                         need = self._head_size
@@ -190,6 +192,7 @@ class Connection:
                     ):
                         yield self._publish(first, buf[body:stop])
                     else:
+                        self._head_first = first
                         self._head = head = buf[pos:topic_end]
                         self._head_topic = buf[body:topic_end]
                         self._head_size = stop - pos
@@ -217,7 +220,7 @@ class Connection:
     def _repeated(self, buf: bytes, pos: int, stop: int) -> RawPublish | None:
         """A PUBLISH that begins as the last one did; None when it needs the full decoder."""
         head = self._head
-        first = head[0]
+        first = self._head_first
         payload = pos + len(head)
         packet_id = 0
         if first & 6:
@@ -253,10 +256,10 @@ class Connection:
                 f"a packet of {size} bytes, more than the limit of "
                 f"{self.maximum_packet_size} (broker.limits.packet_size)",
             )
-        if self.state is State.NEW and size > MAXIMUM_CONNECT:
+        if size > MAXIMUM_CONTROL and kind is not PacketType.PUBLISH:
             raise ProtocolError(
-                ReasonCode.PACKET_TOO_LARGE,
-                f"a CONNECT of {size} bytes, more than the limit of {MAXIMUM_CONNECT}",
+                ReasonCode.QUOTA_EXCEEDED,
+                f"a {kind.name} of {size} bytes, more than the limit of {MAXIMUM_CONTROL}",
             )
 
     def _decode(self, first: int, body: bytes) -> Packet:
@@ -273,6 +276,10 @@ class Connection:
         packet = decode_packet(first, body, self.version)
         assert isinstance(packet, Publish)
         properties = packet.properties
+        if properties and Property.SUBSCRIPTION_IDENTIFIER in properties:  # [MQTT-3.3.4-6]
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, "only a server sends subscription identifiers"
+            )
         alias = properties.pop(Property.TOPIC_ALIAS, None) if properties else None
         if isinstance(alias, int):
             if alias > self.topic_alias_maximum:  # [MQTT-3.3.2-9]

@@ -987,7 +987,7 @@ def test_the_queue_is_bounded_in_bytes(join: Join, broker: Broker):
     other = join("other", **lasting(5))
     other.subscribe("#", 1)
     publisher = join("publisher")
-    for n in range(5):
+    for _ in range(5):
         publisher.publish("a", bytes(3000), 1)
         other.drain()
     session = broker.sessions["subscriber"]

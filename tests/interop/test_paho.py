@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from typing import Any
 
 import pytest
@@ -127,7 +128,9 @@ def test_a_delayed_will_is_due_only_when_the_client_stays_away(
         with back:
             assert back.session_present
             second.kill()  # after the first, so its will comes after the first's would have
+            killed_at = time.monotonic()
             assert watcher.message().topic == f"{topic}/second"
+            assert time.monotonic() - killed_at > 0.9
 
 
 def test_properties_are_passed_on_unchanged(broker: BrokerProcess, topic: str) -> None:
@@ -141,9 +144,7 @@ def test_properties_are_passed_on_unchanged(broker: BrokerProcess, topic: str) -
     with Peer(broker, V5) as sender, Peer(broker, V5) as receiver:
         receiver.subscribe(topic, 2)
         for qos in QOS:
-            sender.publish(topic, "{}", qos, retain=True, **table)
-        sender.publish(topic, "", retain=True)
-        for qos in QOS:
+            sender.publish(topic, "{}", qos, **table)
             message = receiver.message()
             assert message.qos == qos
             assert message.properties.json() == properties(PacketTypes.PUBLISH, **table).json()
@@ -163,28 +164,29 @@ def test_the_expiry_that_is_left_is_told(broker: BrokerProcess, qos: int, topic:
         sender.publish(topic, b"", retain=True)
 
 
-def test_expired_messages_are_gone(broker: BrokerProcess, topic: str) -> None:
-    absent = Peer(broker, V5, topic[-12:], clean=False, expiry=60)
-    with absent:
-        absent.subscribe(f"{topic}/queued")
-    with Peer(broker, V5) as sender:
+def test_expired_messages_are_gone(appliance: ApplianceProcess, topic: str) -> None:
+    def absent() -> Peer:
+        return Peer(appliance, V5, topic[-12:], clean=False, expiry=60)
+
+    with absent() as peer:
+        peer.subscribe(f"{topic}/queued")
+    with Peer(appliance, V5) as sender:
         for name in ("queued", "retained"):
-            sender.publish(
-                f"{topic}/{name}", "old", retain=name == "retained", MessageExpiryInterval=1
-            )
+            retain = name == "retained"
+            sender.publish(f"{topic}/{name}", "old", retain=retain, MessageExpiryInterval=1)
         sender.publish(f"{topic}/queued", "lasting")
 
         def gone() -> bool:
-            with Peer(broker, V5) as late:
+            with Peer(appliance, V5) as late:
                 late.subscribe(f"{topic}/#")
                 late.publish(f"{topic}/live", "live")
                 return bool(late.message().payload == b"live")
 
         # What was queued is older than what was retained: when that is gone, so is this.
         eventually(gone, "a retained message expires")
-    with Peer(broker, V5, topic[-12:], clean=False, expiry=60) as back:
-        assert back.session_present
-        assert back.payloads(1) == ["lasting"]
+    with absent() as peer:
+        assert peer.session_present
+        assert peer.payloads(1) == ["lasting"]
 
 
 def test_subscription_identifiers(broker: BrokerProcess, topic: str) -> None:
@@ -277,9 +279,11 @@ def test_a_session_is_continued(
             sender.publish(f"{topic}/{number % 3}", str(number), 1 + number % 2)
         with client() as peer:
             assert peer.session_present
-            received = [(message.payload.decode(), message.qos) for message in peer.receive(100)]
-            assert received == [(str(number), 1 + number % 2) for number in range(100)]
-            sender.publish(f"{topic}/live", "live")
+            received = peer.receive(100)
+            for qos in (1, 2):  # paho hands a QoS 2 message out at PUBREL, later than one of QoS 1
+                texts = [message.payload.decode() for message in received if message.qos == qos]
+                assert texts == [str(number) for number in range(qos - 1, 100, 2)]
+            sender.publish(f"{topic}/live", "live", 0)  # so that nothing is under way at the kill
             assert peer.payloads(1) == ["live"]
             peer.kill()
         sender.publish(f"{topic}/a", "after the kill")
@@ -297,9 +301,8 @@ def test_a_session_is_continued(
 
 
 @both_versions
-@pytest.mark.parametrize("qos", [1, 2])
 def test_what_was_not_acknowledged_is_sent_again(
-    broker: BrokerProcess, version: MQTTProtocolVersion, qos: int, topic: str
+    broker: BrokerProcess, version: MQTTProtocolVersion, topic: str
 ) -> None:
     def client(manual_ack: bool) -> Peer:
         options: dict[str, Any] = {"clean": False, "expiry": 600, "manual_ack": manual_ack}
@@ -307,21 +310,41 @@ def test_what_was_not_acknowledged_is_sent_again(
 
     with Peer(broker, version) as sender:
         with client(manual_ack=True) as silent:
-            silent.subscribe(topic, qos)
+            silent.subscribe(topic)
             for text in "abc":
-                sender.publish(topic, text, qos)
-            if qos == 1:
-                assert silent.payloads(3) == ["a", "b", "c"]
+                sender.publish(topic, text)
+            assert silent.payloads(3) == ["a", "b", "c"]
             silent.kill()
         with client(manual_ack=False) as back:
             assert back.session_present
             received = back.receive(3)
             assert [message.payload.decode() for message in received] == ["a", "b", "c"]
-            if qos == 1:
-                assert all(message.dup for message in received)
-            sender.publish(topic, "new", qos)
+            assert all(message.dup for message in received)
+            sender.publish(topic, "new")
             message = back.message()
             assert (message.payload, message.dup) == (b"new", False)
+
+
+@both_versions
+def test_exactly_once_over_lost_connections(
+    broker: BrokerProcess, version: MQTTProtocolVersion, topic: str
+) -> None:
+    with Peer(broker, version) as sender:
+        receiver = Peer(broker, version, topic[-12:], clean=False, expiry=600).start()
+        receiver.subscribe(topic, 2)
+        received: list[str] = []
+        for number in range(300):
+            sender.client.publish(topic, str(number), 2)
+        for _ in range(3):
+            received += receiver.payloads(40)
+            receiver.kill()
+            receiver.start()  # the same object: it knows what it was in the middle of
+            assert receiver.session_present
+        received += receiver.payloads(300 - len(received))
+        sender.publish(topic, "end", 2)
+        assert receiver.payloads(1) == ["end"]
+        assert received == [str(number) for number in range(300)]
+        receiver.stop()
 
 
 def test_a_receive_maximum_is_kept_to(broker: BrokerProcess, topic: str) -> None:
@@ -350,7 +373,7 @@ def test_take_over(broker: BrokerProcess, version: MQTTProtocolVersion, topic: s
         first.subscribe(topic)
         with client() as second:
             code = first.disconnected.get(timeout=PATIENCE)
-            if version == V5:
+            if version == V5 and broker.name == "appliance":  # mosquitto 2.0.11 does not tell
                 assert code.value == 0x8E
             assert second.session_present
             sender.publish(topic, "for the second")
