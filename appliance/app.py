@@ -13,14 +13,14 @@ import psutil
 import uvloop
 
 from appliance.access import AccessFileError, FileAccess
+from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity, Limits, Refusal
+from appliance.broker.ports import Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import server_context
 from appliance.config import Settings, TopicRoute
 from appliance.listeners import Listeners, ListenerSettings
-from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
@@ -28,8 +28,10 @@ from appliance.store import MemoryStore
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two ticks of the broker's clock: the grain of keep alive and expiry.
+#: Seconds between two ticks of the broker's clock, the grain of keep alive and expiry; fewer when
+#: a will or a session falls due before, but never fewer than the second of these.
 TICK = 1.0
+SHORTEST_TICK = 0.01
 
 
 class App:
@@ -48,6 +50,7 @@ class App:
 
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
+            PluginSettingsError: one of broker.plugins cannot be loaded.
             OSError: a port cannot be listened on.
         """
         try:
@@ -60,31 +63,46 @@ class App:
         loop = asyncio.get_running_loop()
         settings = self.settings
         broker_settings = settings.broker
+        users, acl = broker_settings.users, broker_settings.acl
+        # A file may be missing where plugins do its work, and only there.
+        authenticating, ruling = plugin_kinds(broker_settings.plugins)
         self._access = access = FileAccess(
-            broker_settings.users, broker_settings.acl, settings.robot, broker_settings.anonymous
+            None if authenticating and not users.exists() else users,
+            None if ruling and not acl.exists() else acl,
+            settings.robot,
+            broker_settings.anonymous,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
         self.broker = broker = Broker(access, MemoryStore(), _broker_limits(settings))
         broker.tick(loop.time())
 
-        async def authenticate(connect: Connect, address: str) -> Identity | Refusal:
-            return await access.authenticate(
-                connect.username, connect.password, connect.client_id, address
-            )
+        async def listen() -> None:
+            self.addresses = await listeners.start(self._listener_settings())
+            for host, port in self.addresses:
+                log.info("listening on %s:%d", host or "*", port)
 
+        config = configuration(
+            [(str(listener.bind), listener.tls) for listener in broker_settings.listeners],
+            limits.connections,
+            broker_settings.plugins,
+        )
+        # In less than the listeners' time limit, so that a client is told when plugins hang.
+        plugin_timeout = 0.8 * limits.connect_timeout
+        frame = ApplianceBroker(
+            broker, access, config, listen, lambda: listeners.stop(), plugin_timeout
+        )
         listeners = Listeners(
             broker,
-            authenticate,
+            frame.authenticate,
             connections=limits.connections,
             connect_timeout=limits.connect_timeout,
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", _Deaf())
         self._start_clock(loop)
-        self.addresses = await listeners.start(self._listener_settings())
-        for host, port in self.addresses:
-            log.info("listening on %s:%d", host or "*", port)
+        await frame.start()
+        self._stack.push_async_callback(frame.shutdown)
         self._start_bridge(loop)
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
@@ -132,12 +150,12 @@ class App:
         def tick() -> None:
             nonlocal timer, next_sys
             now = loop.time()
-            self.broker.tick(now)
+            due = self.broker.tick(now)
             if interval and now >= next_sys:
                 next_sys = now + interval
                 for topic, payload in sys_topics.update():
                     self._publish(topic, payload, retain=True)
-            timer = loop.call_later(TICK, tick)
+            timer = loop.call_at(min(now + TICK, max(due, now + SHORTEST_TICK)), tick)
 
         timer = loop.call_later(TICK, tick)
         self._stack.callback(lambda: timer.cancel())
@@ -165,15 +183,15 @@ class App:
 
     def reload(self) -> None:
         """Take over the users and ACL files as they are now; a wrong one changes nothing."""
+        users = set(self._access.users())
         try:
             self._access.reload()
         except AccessFileError as error:
             log.error("not reloaded, what was in force stays so: %s", error)
             return
-        users = set(self._access.users())
+        removed = users - set(self._access.users())  # others are known to plugins
         for session in list(self.broker.sessions.values()):
-            identity = session.identity
-            if identity and identity.username is not None and identity.username not in users:
+            if session.identity and session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
         self.broker.rules_changed()
         self.broker.flush()

@@ -142,11 +142,12 @@ def run(
 def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
     from appliance.access import AccessFileError
+    from appliance.amqtt_broker import PluginSettingsError
     from appliance.certs import CertificateError
 
     try:
         yield
-    except (AccessFileError, CertificateError) as error:
+    except (AccessFileError, CertificateError, PluginSettingsError) as error:
         raise CommandError(str(error)) from None
 
 

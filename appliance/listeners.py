@@ -20,8 +20,10 @@ from appliance.mqtt.reason import ReasonCode
 
 log = logging.getLogger(__name__)
 
-#: Who sent this CONNECT, from this address?
-Authenticate: TypeAlias = Callable[[Connect, str], Awaitable["Identity | Refusal"]]
+#: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
+Authenticate: TypeAlias = Callable[
+    [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
+]
 
 #: Bytes that wait in a connection's output before its client counts as slow: what a healthy one
 #: takes in one round of the event loop, with room to spare.
@@ -230,8 +232,9 @@ class ClientProtocol(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand the chunk to the client; then everyone is written to, once, what it caused."""
-        self._client.receive(data)
         broker = self._broker
+        broker.ledger.now = self._loop.time()
+        self._client.receive(data)
         if broker.unflushed:
             broker.flush()
         if len(data) >= LARGE_CHUNK:
@@ -259,6 +262,7 @@ class ClientProtocol(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection ended, whoever ended it."""
         self._forget()
+        self._broker.ledger.now = self._loop.time()
         self._client.lost()
         self._broker.flush()
 
@@ -294,7 +298,8 @@ class ClientProtocol(asyncio.Protocol):
         self._listeners.in_background(self._log_in(connect))
 
     async def _log_in(self, connect: Connect) -> None:
-        who = await self._listeners.authenticate(connect, self.address)
+        tls = self._transport.get_extra_info("ssl_object") if self._transport else None
+        who = await self._listeners.authenticate(connect, self.address, tls)
         self._timeout.cancel()
         if isinstance(who, Refusal):
             self._client.refuse(who.code, who.reason)

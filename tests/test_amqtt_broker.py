@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import amqtt.broker
 import pytest
+import yaml
 from amqtt.broker import BrokerContext, RetainedApplicationMessage
 from amqtt.client import MQTTClient
 from amqtt.contexts import Action as AmqttAction
@@ -26,7 +27,8 @@ from amqtt.session import Session as AmqttSession
 from argon2 import PasswordHasher
 from transitions import MachineError
 
-from appliance.access import FileAccess, Passwords
+from appliance import certs
+from appliance.access import AccessFileError, FileAccess, Passwords
 from appliance.amqtt_broker import (
     ApplianceBroker,
     PluginSettingsError,
@@ -35,9 +37,11 @@ from appliance.amqtt_broker import (
     events,
     plugin_kinds,
 )
+from appliance.app import App
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Refusal
+from appliance.config import Settings, load
 from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Will
@@ -685,6 +689,7 @@ async def test_every_event_with_its_arguments(amqtt_users: dict[str, Any]) -> No
         await bob.publish("a/b", b"x", qos=2)
         await bob.publish("a/c", b"kept", qos=1, retain=True)
         await bob.publish("a/c", b"", qos=1, retain=True)
+        await bob.publish("nothing/kept", b"", retain=True)
         await bob.unsubscribe(["a/#"])
         await bob.disconnect()
         await until(lambda: bool(told("broker_client_disconnected")))
@@ -705,15 +710,16 @@ async def test_every_event_with_its_arguments(amqtt_users: dict[str, Any]) -> No
     assert told("broker_client_unsubscribed") == [{"client_id": "b1", "topic": "a/#"}]
 
     for event in ("broker_message_received", "broker_message_broadcast"):
-        assert [set(arguments) for arguments in told(event)] == [{"client_id", "message"}] * 3
+        assert [set(arguments) for arguments in told(event)] == [{"client_id", "message"}] * 4
         messages = [arguments["message"] for arguments in told(event)]
         assert all(isinstance(message, ApplicationMessage) for message in messages)
         assert [(m.topic, m.data, m.qos, m.retain) for m in messages] == [
             ("a/b", b"x", 2, False),
             ("a/c", b"kept", 1, True),
             ("a/c", b"", 1, True),
+            ("nothing/kept", b"", 0, True),
         ]
-        assert [m.publish_packet.retain_flag for m in messages] == [False, True, True]
+        assert [m.publish_packet.retain_flag for m in messages] == [False, True, True, True]
 
     kept, cleared = told("broker_retained_message")
     assert set(kept) == {"client_id", "retained_message"}
@@ -730,7 +736,7 @@ async def test_every_event_with_its_arguments(amqtt_users: dict[str, Any]) -> No
     assert connect["packet"].username == "bob"
     assert "secret" not in repr(connect["packet"])
     assert all(set(arguments) == {"packet", "session"} for arguments in publishes)
-    assert [type(arguments["packet"]) for arguments in publishes] == [PublishPacket] * 3
+    assert [type(arguments["packet"]) for arguments in publishes] == [PublishPacket] * 4
     assert publishes[0]["packet"].topic_name == "a/b"
     assert publishes[0]["session"] is session
     assert told("mqtt_packet_sent") == []
@@ -741,10 +747,12 @@ async def test_a_message_that_is_not_allowed_is_received_and_not_broadcast(
 ) -> None:
     async with running({**amqtt_users, own(Recorder): {}}) as rig:
         await rig.connect("bob:secret", "b1")
-        rig.frame._events.refused(rig.broker.sessions["b1"], Message("no", b"x"))
+        bob = rig.clients[0]
+        for qos in (0, 1, 2):
+            await bob.publish("$no", b"x", qos=qos)
         await rig.frame.plugins_manager.wait_fired_events()
-        [arguments] = told("broker_message_received")
-        assert arguments["message"].topic == "no"
+        topics = [arguments["message"].topic for arguments in told("broker_message_received")]
+        assert topics == ["$no"] * 3
         assert told("broker_message_broadcast") == []
 
 
@@ -976,3 +984,71 @@ def test_kinds_of_plugins() -> None:
     assert plugin_kinds([TABOO, EVENT_LOGGER]) == (False, True)
     with pytest.raises(PluginSettingsError, match="no_such"):
         plugin_kinds(["no_such.Plugin"])
+
+
+# --- in the appliance ----------------------------------------------------------------------------
+
+
+def settings_of(directory: Path, plugins: dict[str, dict[str, Any]], **broker: Any) -> Settings:
+    lines(directory / "acl.conf", "topic #", "pattern readwrite #")
+    text = yaml.safe_dump(
+        {
+            "broker": {
+                "listeners": [{"bind": "127.0.0.1:0", "tls": "tls" in broker}],
+                "plugins": plugins,
+                **broker,
+            },
+            "bridge": {"bus": "none"},
+        }
+    )
+    return load(lines(directory / "appliance.yaml", text))
+
+
+async def test_the_appliance_without_a_users_file(
+    amqtt_users: dict[str, Any], tmp_path: Path
+) -> None:
+    app = App(settings_of(tmp_path, {**amqtt_users, own(Recorder): {}}))
+    await app.start()
+    try:
+        client = MQTTClient(config={"auto_reconnect": False, "plugins": {}})
+        uri = f"mqtt://bob:secret@127.0.0.1:{app.addresses[0][1]}"
+        await asyncio.wait_for(client.connect(uri), PATIENCE)
+        await client.subscribe([("+/_appliance/state", 1)])
+        assert (await receive(client)).data == b"online"
+        app.reload()  # who is known to a plugin stays
+        await client.publish("a", b"x", qos=1)
+        await client.disconnect()
+    finally:
+        await app.stop()
+    names = [name for name, _ in Recorder.told]
+    assert names[:2] == ["broker_pre_start", "broker_post_start"]
+    assert names[-3:] == ["broker_pre_shutdown", "broker_post_shutdown", "close"]
+    assert len(told("broker_client_disconnected")) == 1
+
+
+async def test_files_that_no_plugin_stands_for_are_needed(tmp_path: Path) -> None:
+    with pytest.raises(AccessFileError, match=r"users\.passwd"):
+        await App(settings_of(tmp_path, {own(Recorder): {}})).start()
+    settings = settings_of(tmp_path, OPEN)
+    settings.broker.acl.unlink()
+    with pytest.raises(AccessFileError, match=r"acl\.conf"):
+        await App(settings).start()
+
+
+async def test_plugins_see_the_tls_connection(tmp_path: Path) -> None:
+    certs.create_authority(tmp_path)
+    certs.issue_server(tmp_path, ["localhost"], [])
+    names = {"certificate": "server.crt", "key": "server.key", "ca": "ca.crt"}
+    app = App(settings_of(tmp_path, {own(Login): {}}, tls=names))
+    await app.start()
+    try:
+        client = MQTTClient(config={"auto_reconnect": False, "plugins": {}})
+        uri = f"mqtts://localhost:{app.addresses[0][1]}"
+        connecting = client.connect(uri, cafile=str(tmp_path / "ca.crt"))
+        await asyncio.wait_for(connecting, PATIENCE)
+        await client.disconnect()
+    finally:
+        await app.stop()
+    [session] = Login.seen
+    assert session.ssl_object is not None
+    assert session.ssl_object.version() in ("TLSv1.2", "TLSv1.3")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
@@ -321,7 +322,7 @@ class Broker:
     ) -> ReasonCode:
         """`publish`, for who has the message's route already: to these of its targets."""
         if not route.allowed:
-            self.refuse_publish(origin, route)
+            self.refuse_publish(origin, route, message)
             return route.refusal
         if self.observer is not None:
             self.observer.published(origin, message)
@@ -341,9 +342,11 @@ class Broker:
                     outcome = ReasonCode.QUOTA_EXCEEDED
         return outcome
 
-    def refuse_publish(self, session: Session, route: Route) -> None:
-        """Count and log that the session may not publish to the route's topic."""
+    def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
+        """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
+        if self.observer is not None:
+            self.observer.refused(session, message)
         log.warning("%s may not publish to '%s': %s", session, route.topic, route.reason)
 
     def _tell_full(self, session: Session) -> None:
@@ -359,9 +362,10 @@ class Broker:
     def _retain(self, message: Message) -> bool:
         old = self.retained.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
-            if old is not None:
-                self.retained_bytes -= old.size
-                self.retained.delete(message.topic)
+            if old is None:
+                return True
+            self.retained_bytes -= old.size
+            self.retained.delete(message.topic)
         else:
             grown = self.retained_bytes + message.size - (old.size if old is not None else 0)
             limits = self.limits
@@ -490,8 +494,12 @@ class Broker:
             self._deadlines = list(hold.values())
             heapq.heapify(self._deadlines)
 
-    def tick(self, now: float) -> None:
-        """Let time pass: keep alive, wills, sessions. `now` is in seconds and never goes back."""
+    def tick(self, now: float) -> float:
+        """Let time pass: keep alive, wills, sessions. `now` is in seconds and never goes back.
+
+        Returns when a will or a session falls due next, infinity for never. Between two ticks
+        `ledger.now` may be moved on, so that what begins then is not cut short.
+        """
         self.ledger.now = now
         for client in tuple(self.clients):
             client.tick(now)
@@ -507,6 +515,7 @@ class Broker:
                 self.counters.sessions_expired += 1
                 self._end(session)
         self.flush()
+        return self._deadlines[0][0] if self._deadlines else math.inf
 
     def flush(self) -> None:
         """Write to every network client what it was sent since the last flush.

@@ -199,7 +199,7 @@ class Client:
         if packet_id in session.received:
             pass  # sent again: PUBREC goes out again [MQTT-4.3.3-12]
         elif not route.allowed:
-            self.broker.refuse_publish(session, route)
+            self.broker.refuse_publish(session, route, message)
             # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
             code = route.refusal
         elif self._version == 5 and len(session.received) >= self.broker.limits.inflight:

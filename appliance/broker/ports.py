@@ -149,6 +149,9 @@ class Observer(Protocol):
     def published(self, session: Session, message: Message) -> None:
         """A client's message was accepted and is about to be delivered."""
 
+    def refused(self, session: Session, message: Message) -> None:
+        """A client's message was not allowed and goes nowhere."""
+
     def retained(self, message: Message) -> None:
         """A retained message was kept, or, with an empty payload, deleted."""
 

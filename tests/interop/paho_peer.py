@@ -143,7 +143,8 @@ class Peer:
         """Be gone without a word."""
         sock = self.client.socket()
         assert sock is not None
-        sock.shutdown(socket.SHUT_RDWR)
+        # Not the TLS socket's own, behind which paho would read on, and without decrypting.
+        socket.socket.shutdown(sock, socket.SHUT_RDWR)
         self.disconnected.get(timeout=PATIENCE)
         self.client.loop_stop()
 

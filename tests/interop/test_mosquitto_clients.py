@@ -328,6 +328,19 @@ def test_a_wrong_password(broker: BrokerProcess, version: str, code: int, text: 
         assert text in done.stderr.decode()
 
 
+def test_what_the_rules_refuse_is_told(appliance: ApplianceProcess, version: str) -> None:
+    clients = Mosquitto(appliance, version)
+    arguments = [*clients.arguments, "-t", "elsewhere/x", "-q", "1"]
+    subscribe = ["mosquitto_sub", *arguments, "-E"]
+    done = subprocess.run(subscribe, capture_output=True, text=True, timeout=PATIENCE)
+    assert "All subscription requests were denied." in done.stderr
+    publish = ["mosquitto_pub", *arguments, "-m", "x"]
+    done = subprocess.run(publish, capture_output=True, text=True, timeout=PATIENCE)
+    told = "Publish 1 failed: Not authorized" in done.stderr
+    assert told == (version == "5")  # 3.1.1 has no way to say it
+    appliance.wait_for_log("may not publish to 'elsewhere/x'")
+
+
 def test_without_the_authority(broker: BrokerProcess, tmp_path: Path) -> None:
     certs.create_authority(tmp_path, "another")
     clients = Mosquitto(broker, "311")
