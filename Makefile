@@ -6,7 +6,7 @@ PYTHON ?= python3
 PORT ?= 8883
 PLAIN_PORT ?= 1883
 BIN := .venv/bin
-INTEROP := tests/interop
+INTEROP := tests/interop/mqttjs
 
 # A sourced ROS is used as it is; without one, ROS 2 comes from PyPI.
 ifdef ROS_DISTRO

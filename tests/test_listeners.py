@@ -372,11 +372,13 @@ async def test_who_asks_and_does_not_read_the_answers_is_bounded(house: House, t
     """Rule 3: it is not listened to until it reads."""
     monkeypatch.setattr(listeners, "OUTPUT_HIGH_WATER", 65536)
     await house.start()
-    caller = await house.join("mute", tls=tls, receive_buffer=8192)
+    caller = await house.join("mute", tls=tls)
     protocol = house.protocol("mute")
     assert protocol._transport is not None
-    server_end = protocol._transport.get_extra_info("socket")
-    server_end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8192)
+    for end in (protocol._transport, caller.writer):  # little in the system's buffers
+        sock = end.get_extra_info("socket")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
     chunk = Pingreq().encode(5) * 8192
     said = 0
     with contextlib.suppress(asyncio.TimeoutError):

@@ -246,6 +246,11 @@ class Connection:
             kind = PacketType(first >> 4)
         except ValueError:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, "packet type 0 is reserved") from None
+        if self.state is State.NEW and first == 0x16:
+            raise ProtocolError(
+                ReasonCode.MALFORMED_PACKET,
+                "what it sends is TLS; is it meant for the listener with tls: true?",
+            )
         if kind not in _LEGAL[self.state]:
             raise ProtocolError(
                 ReasonCode.PROTOCOL_ERROR, f"a {kind.name} may not come {self.state.value}"
