@@ -98,6 +98,7 @@ class Client:
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
         self._maximum_packet_size = 0
+        self._unfinished_maximum = 0
         self._version = 0
         self._closed = False
 
@@ -118,7 +119,11 @@ class Client:
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
-                    self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
+                    if event < PUBREC and self.session is not None:  # PUBACK: most of them
+                        counters.control_received += 1
+                        self.session.puback(event & 0xFFFF)
+                    else:
+                        self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
                     self._on_packet(event)  # type: ignore[arg-type]
         except ProtocolError as error:
@@ -202,8 +207,8 @@ class Client:
             self.broker.refuse_publish(session, route, message)
             # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
             code = route.refusal
-        elif self._version == 5 and len(session.received) >= self.broker.limits.inflight:
-            raise ProtocolError(  # [MQTT-3.3.4-9]
+        elif self._version == 5 and len(session.received) >= self._unfinished_maximum:
+            raise ProtocolError(  # [MQTT-3.3.4-7]
                 ReasonCode.RECEIVE_MAXIMUM_EXCEEDED,
                 f"more than {self.broker.limits.inflight} unfinished QoS 2 messages",
             )
@@ -358,6 +363,8 @@ class Client:
             self.refuse(error.code, str(error))
             return
         session.window = options.window
+        # A client's send quota begins anew with each connection (section 4.9).
+        self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         self.session = session
         self._maximum_packet_size = options.maximum_packet_size
         self._silence = 1.5 * options.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]

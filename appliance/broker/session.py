@@ -162,7 +162,10 @@ class Session:
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self._keep_latest((message, 0, retain, subscription_ids))
-        if self._has_room(message):
+        # `_has_room` and `_count`, written out here and in `_send`: two calls less a message.
+        ledger = self.ledger
+        size = message.size
+        if self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory:
             if (
                 link is not None
                 and link.writable
@@ -170,15 +173,16 @@ class Session:
                 and not self.queue
                 and not self.replays
             ):
-                self._owe(message, qos)
+                if self.expiry:
+                    self._owe(message, qos)
                 self._send(link, (message, qos, retain, subscription_ids))
                 return True
-            if len(self.queue) < self.ledger.limits.queue_messages:
+            if len(self.queue) < ledger.limits.queue_messages:
                 self._count(message)
                 self.queue.append((message, qos, retain, subscription_ids))
                 self._owe(message, qos)
                 return True
-        self.ledger.counters.publish_dropped += 1
+        ledger.counters.publish_dropped += 1
         return False
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery]) -> None:
@@ -261,7 +265,8 @@ class Session:
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
         inflight[packet_id] = delivery
-        self._count(message)
+        self.bytes += message.size
+        self.ledger.queued_bytes += message.size
         link.publish(message, qos, packet_id, False, retain, subscription_ids)
 
     def _pump_latest(self, link: Link) -> None:

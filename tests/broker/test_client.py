@@ -333,6 +333,20 @@ def test_more_than_the_receive_maximum_ends_the_connection(join: Join):
     assert peer.farewell() == ReasonCode.RECEIVE_MAXIMUM_EXCEEDED
 
 
+@pytest.mark.parametrize("limits", [Limits(inflight=3)])
+def test_the_receive_maximum_is_a_connections(join: Join):
+    """v5 section 4.9: the quota begins anew with each connection"""
+    peer = join(**lasting(5))
+    peer.send(*[Publish("a", b"", 2, packet_id=n) for n in (1, 2, 3)])
+    peer.lose()
+    peer = join(**lasting(5))
+    peer.send(*[Publish("a", b"", 2, packet_id=n) for n in (4, 5, 6)])
+    assert not peer.wire.closed
+    assert set(peer.session.received) == {1, 2, 3, 4, 5, 6}
+    peer.send(*[Pubrel(n) for n in range(1, 7)])
+    assert not peer.session.received
+
+
 @pytest.mark.parametrize("limits", [Limits(queue_bytes=20_000)])
 def test_unfinished_qos_2_messages_are_bounded_in_bytes(join: Join, broker: Broker, version):
     """Rule 3 of the design"""
