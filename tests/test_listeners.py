@@ -424,8 +424,11 @@ async def test_a_stranger_is_not_listened_to_during_the_login(house: House):
     caller = await house.dial()
     caller.writer.write(Connect("flood").encode() + bytes(200 * MIB))
     await until(lambda: house.listeners.tasks)
-    await asyncio.sleep(0.3)
     (protocol,) = house.listeners.open
+    assert protocol._transport is not None
+    for _ in range(50):
+        await asyncio.sleep(0)
+        assert not protocol._transport.is_reading()
     assert protocol._client.connection.buffered < 2 * MIB
     caller.hang_up()
     house.gate.set()

@@ -397,9 +397,10 @@ class Broker:
             code, reason = refusal
             log.warning("%s may not subscribe to '%s': %s", session, subscription.filter, reason)
             return code
-        session.subscriptions[subscription.filter] = subscription
-        self._subscriptions.add(subscription.filter, session, (session, subscription))
-        self.epoch += 1
+        if session.subscriptions.get(subscription.filter) != subscription:
+            session.subscriptions[subscription.filter] = subscription
+            self._subscriptions.add(subscription.filter, session, (session, subscription))
+            self.epoch += 1
         if session.persistent:
             self.store.subscribed(session, subscription)
         if self.observer is not None:
@@ -440,16 +441,16 @@ class Broker:
         handling = subscription.retain_handling
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
-        session.replay(subscription.filter, self._find_retained(session, subscription))
+        session.replay(subscription.filter, self._find_retained(session, subscription.filter))
 
-    def _find_retained(self, session: Session, subscription: Subscription) -> Iterator[Delivery]:
+    def _find_retained(self, session: Session, topic_filter: str) -> Iterator[Delivery]:
         """What a subscription asks for, checked message by message as the client takes them."""
-        ids = [subscription.identifier] if subscription.identifier else None
-        for topic, message in self.retained.find(subscription.filter):
+        for topic, message in self.retained.find(topic_filter):
             if message.expires_at is not None and message.expires_at <= self.now:
-                self.retained_bytes -= message.size
-                self.retained.delete(topic)
+                self._retain(Message(topic, b"", retain=True))
             elif self.may_receive(session, topic):
+                subscription = session.subscriptions[topic_filter]
+                ids = [subscription.identifier] if subscription.identifier else None
                 yield message, min(message.qos, subscription.qos), True, ids
 
     def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:

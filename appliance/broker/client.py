@@ -309,6 +309,7 @@ class Client:
 
     def _on_connect(self, packet: Connect) -> None:
         self._version = packet.version
+        self._connect = packet
         properties = packet.properties or {}
         properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
         if Property.AUTHENTICATION_METHOD in properties:
@@ -320,7 +321,6 @@ class Client:
             # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
-        self._connect = packet
         # What follows a CONNECT is read only once it is known who sent it.
         self.connection.pause()
         self.wire.authenticate(packet)
@@ -487,14 +487,7 @@ class Client:
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
-        session = self.session
-        if (
-            version != self._version
-            or not self.writable
-            or self._maximum_packet_size
-            or session is None
-            or session.replays
-        ):
+        if version != self._version or not self.writable or self._maximum_packet_size:
             return False
         out = self._out
         if not out:
@@ -506,8 +499,10 @@ class Client:
         return True
 
     def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
-        size = len(message.encode_for(first, 1, subscription_ids, self._ledger.now))
-        return size > self._maximum_packet_size
+        limit = self._maximum_packet_size
+        if message.size <= limit and not subscription_ids:
+            return False
+        return len(message.encode_for(first, 1, subscription_ids, self._ledger.now)) > limit
 
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""

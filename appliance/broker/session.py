@@ -158,7 +158,7 @@ class Session:
         if not qos:
             if link is None:
                 return False  # QoS 0 is not kept for an absent client, as the standard allows
-            if link.writable and not self.replays:
+            if link.writable:  # then replays wait for the window only, which is no matter of QoS 0
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self._keep_latest((message, 0, retain, subscription_ids))
@@ -202,6 +202,7 @@ class Session:
             self._pump_replays(link)
         if not self.replays and not self.resends:
             self._pump_queue(link)
+        if self.latest:
             self._pump_latest(link)
 
     def _pump_resends(self, link: Link) -> None:
@@ -215,18 +216,19 @@ class Session:
                 link.publish(message, qos, packet_id, True, retain, subscription_ids)
 
     def _pump_replays(self, link: Link) -> None:
-        while self.replays and link.writable and len(self.inflight) < self.window:
-            topic_filter = next(iter(self.replays))
-            delivery = next(self.replays[topic_filter], None)
-            if delivery is None:
-                del self.replays[topic_filter]
-                continue
-            message, qos, retain, subscription_ids = delivery
-            if qos:
-                self._owe(message, qos)
-                self._send(link, delivery)
-            else:
-                link.publish(message, 0, 0, False, retain, subscription_ids)
+        for topic_filter, deliveries in list(self.replays.items()):
+            needs_window = self.subscriptions[topic_filter].qos > 0  # QoS 0 does not [MQTT-3.3.4-8]
+            while link.writable and not (needs_window and len(self.inflight) >= self.window):
+                delivery = next(deliveries, None)
+                if delivery is None:
+                    del self.replays[topic_filter]
+                    break
+                message, qos, retain, subscription_ids = delivery
+                if qos:
+                    self._owe(message, qos)
+                    self._send(link, delivery)
+                else:
+                    link.publish(message, 0, 0, False, retain, subscription_ids)
 
     def _pump_queue(self, link: Link) -> None:
         while self.queue and link.writable and len(self.inflight) < self.window:

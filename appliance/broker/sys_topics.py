@@ -62,12 +62,10 @@ class SysTopics:
         counters = broker.counters
         connected = len(broker.clients)
         total = sum(1 for session in broker.sessions.values() if session.identity is not None)
-        waiting = [
-            delivery
+        stored = len(broker.retained) + sum(
+            len(session.queue) + sum(delivery is not None for delivery in session.inflight.values())
             for session in broker.sessions.values()
-            for delivery in (*session.queue, *session.inflight.values())
-            if delivery is not None
-        ]
+        )
         values: dict[str, str | int] = {
             "version": f"appliance version {self._version}",
             "uptime": f"{broker.now - self._started_at:.0f} seconds",
@@ -78,7 +76,7 @@ class SysTopics:
             "clients/total": total,
             "messages/received": counters.messages_received,
             "messages/sent": counters.messages_sent,
-            "messages/stored": len(waiting) + len(broker.retained),
+            "messages/stored": stored,
             "publish/messages/received": counters.publish_received,
             "publish/messages/sent": counters.publish_sent,
             "publish/messages/dropped": counters.publish_dropped,
@@ -89,7 +87,7 @@ class SysTopics:
             "subscriptions/count": broker.subscription_count,
             "shared_subscriptions/count": 0,
             "retained messages/count": len(broker.retained),
-            "store/messages/count": len(waiting) + len(broker.retained),
+            "store/messages/count": stored,
             "heap/current": self._heap(),
             "store/messages/bytes": broker.retained_bytes + broker.ledger.queued_bytes,
         }

@@ -103,6 +103,17 @@ def test_a_subscription_made_again_replaces_the_old_one(join: Join, version):
         assert message.properties == {Property.SUBSCRIPTION_IDENTIFIER: [4]}
 
 
+def test_a_subscription_made_again_as_it_is_costs_the_others_nothing(join: Join, broker: Broker):
+    """What is cached of all clients' routes stays valid."""
+    subscriber = join("subscriber")
+    subscriber.subscribe("a", 1)
+    epoch = broker.epoch
+    subscriber.subscribe("a", 1)
+    assert broker.epoch == epoch
+    subscriber.subscribe("a", 2)
+    assert broker.epoch > epoch
+
+
 def test_no_local_keeps_a_clients_own_messages_from_it(join: Join):
     """v5 [MQTT-3.8.3-3]"""
     peer, other = join("peer"), join("other")
@@ -1171,3 +1182,70 @@ def test_the_store_knows_what_is_owed(join: Join, broker: Broker, store: FakeSto
     assert len(subscriber.drain()) == 2
     assert not store.owed
     assert isinstance(subscriber.unsubscribe("a"), Unsuback)
+
+
+def test_a_closed_window_holds_up_no_qos_0(join: Join):
+    """v5 [MQTT-3.3.4-8]; a subscription whose retained messages wait does not either"""
+    publisher = join("publisher")
+    for n in range(30):
+        publisher.publish(f"r/{n}", b"retained", 1, retain=True)
+    subscriber = join("subscriber")
+    subscriber.subscribe("r/+", 1)
+    subscriber.subscribe("live")
+    first = subscriber.messages()
+    assert len(first) == 20
+    for n in range(3):
+        publisher.publish("live", b"%d" % n)
+        publisher.publish("live", b"%d with" % n, properties={MESSAGE_EXPIRY: 5})
+    assert [m.payload for m in subscriber.messages()] == [
+        payload for n in range(3) for payload in (b"%d" % n, b"%d with" % n)
+    ]
+    subscriber.subscribe("r/1")  # an own subscription for QoS 0
+    assert [m.qos for m in subscriber.messages()] == [0]
+    subscriber.acknowledge(*first)
+    assert len(subscriber.drain()) == 10
+
+
+def test_retained_messages_wait_for_the_next_connection(join: Join):
+    """[MQTT-4.1.0-1]: those of QoS 1 and 2 are part of what the session owes"""
+    publisher = join("publisher")
+    for n in range(30):
+        publisher.publish(f"r/{n}", b"%d" % n, 1, retain=True)
+    subscriber = join("subscriber", **lasting(5))
+    subscriber.subscribe("r/+", 1)
+    assert len(subscriber.messages()) == 20  # lost with the connection
+    subscriber.lose()
+    subscriber = join("subscriber", **lasting(5))
+    assert sorted(int(m.payload) for m in subscriber.drain()) == list(range(30))
+
+
+def test_unsubscribing_ends_the_retained_messages_too(join: Join):
+    publisher = join("publisher")
+    for n in range(30):
+        publisher.publish(f"r/{n}", b"x", 1, retain=True)
+    subscriber = join("subscriber")
+    subscriber.subscribe("r/+", 1)
+    first = subscriber.messages()
+    subscriber.unsubscribe("r/+")
+    subscriber.acknowledge(*first)
+    assert subscriber.drain() == []
+
+
+def test_what_is_retained_meanwhile_is_what_is_sent(join: Join, broker: Broker):
+    """A retained message that waits for its turn is looked up then: the newest, or none."""
+    publisher = join("publisher")
+    for n in range(30):
+        publisher.publish(f"r/{n}", b"old", 1, retain=True)
+    subscriber = join("subscriber")
+    subscriber.subscribe("r/+", 1, retain_as_published=True)
+    first = subscriber.messages()
+    sent = {m.topic for m in first}
+    rest = [f"r/{n}" for n in range(30) if f"r/{n}" not in sent]
+    publisher.publish(rest[0], b"new", 1, retain=True)
+    publisher.publish(rest[1], b"", 1, retain=True)
+    subscriber.acknowledge(*first)
+    messages = subscriber.drain()
+    assert {m.payload for m in messages if m.topic == rest[0]} == {b"new"}
+    assert [m.payload for m in messages if m.topic == rest[1]] == [b""]
+    assert {m.topic for m in messages} == set(rest)
+    assert len(broker.retained) == 29
