@@ -8,6 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
+from appliance_process import ACL, ApplianceProcess
 
 from appliance.access import Passwords
 from appliance.mqtt.packets import (
@@ -23,7 +24,6 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ReasonCode
-from tests.appliance_process import ACL, ApplianceProcess
 
 
 class Peer:
