@@ -286,8 +286,10 @@ class ClientProtocol(asyncio.Protocol):
 
     def abort(self) -> None:
         """Close at once."""
+        # asyncio's own TLS transport, up to Python 3.11.2, cannot be aborted twice.
         if self._transport is not None:
-            self._transport.abort()
+            with contextlib.suppress(AttributeError):
+                self._transport.abort()
         self._forget()
 
     # --- the client's Wire ---------------------------------------------------------------------
