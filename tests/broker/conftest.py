@@ -63,6 +63,7 @@ class FakeStore(MemoryStore):
     def __init__(self) -> None:
         self.holding = False
         self.sessions: set[str] = set()
+        self.kept: dict[str, bytes] = {}
         self.owed: Counter[tuple[str, Message]] = Counter()
         self._callbacks: list[Callable[[bool], None]] = []
 
@@ -86,6 +87,11 @@ class FakeStore(MemoryStore):
         self.sessions.discard(session.client_id)
         for key in [key for key in self.owed if key[0] == session.client_id]:
             del self.owed[key]
+
+    def retained(self, message: Message) -> None:
+        self.kept[message.topic] = message.payload
+        if not message.payload:
+            del self.kept[message.topic]
 
     def queued(self, session: Session, message: Message, qos: int) -> None:
         self.owed[session.client_id, message] += 1

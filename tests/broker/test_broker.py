@@ -292,8 +292,9 @@ def test_an_empty_retained_message_clears_the_topic(join: Join, broker: Broker, 
     assert retained(broker, version) == []
     assert (len(broker.retained), broker.retained_bytes) == (0, 0)
     assert subscriber.payloads() == [b"x", b""]  # it goes to who listens like any other
-    publisher.publish("a", b"", retain=True)  # and once more, with nothing there
-    assert broker.retained_bytes == 0
+    code = publisher.publish("a", b"", 1, retain=True)  # and once more, with nothing there
+    assert code == ReasonCode.SUCCESS and broker.retained_bytes == 0
+    assert subscriber.payloads() == [b""]
 
 
 def test_a_message_without_retain_leaves_the_retained_one(join: Join, broker: Broker, version):
@@ -372,22 +373,23 @@ def test_a_retained_message_keeps_its_properties(join: Join, broker: Broker):
     assert message.properties == properties
 
 
-def test_more_retained_messages_than_the_window_all_arrive(join: Join, version):
+@pytest.mark.parametrize("qos", [1, 2])
+def test_more_retained_messages_than_the_window_all_arrive(join: Join, version, qos):
     """v5 [MQTT-3.3.4-9]; the rest waits for the acknowledgements."""
     publisher = join("publisher")
     expected = {f"a/{n}": b"%d" % n for n in range(75)}
     for topic, payload in expected.items():
-        publisher.publish(topic, payload, 1, retain=True)
+        publisher.publish(topic, payload, qos, retain=True)
     subscriber = join("subscriber", version=version)
-    subscriber.subscribe("a/+", 1)
+    subscriber.subscribe("a/+", qos)
     first = subscriber.messages()
     assert len(first) == 20
-    publisher.publish("a/0", b"newer", 1)  # waits behind them
+    publisher.publish("a/0", b"newer", qos)  # waits behind them
     subscriber.acknowledge(*first)
     messages = first + subscriber.drain()
     assert {m.topic: m.payload for m in messages if m.retain} == expected
     assert [m.payload for m in messages if m.topic == "a/0"][-1] == b"newer"
-    assert all(m.qos == 1 for m in messages)
+    assert all(m.qos == qos for m in messages)
 
 
 @pytest.mark.parametrize("limits", [Limits(retained_messages=2)])
@@ -899,6 +901,7 @@ def test_changed_rules_hold_for_what_waits(join: Join, access: FakeAccess, broke
     broker.rules_changed()
     subscriber.fast()
     assert [m.topic for m in subscriber.drain()] == ["open", "open"]
+    assert broker.counters.publish_dropped == 2
 
 
 def test_changed_rules_hold_for_what_is_in_flight_to_an_absent_client(
@@ -1041,6 +1044,19 @@ def test_a_slow_client_gets_the_newest_of_each_topic(join: Join, broker: Broker)
     assert broker.ledger.queued_bytes == 0
 
 
+def test_what_a_slow_client_missed_ends_with_its_connection(join: Join, broker: Broker, version):
+    """QoS 0 is not kept for who is not there, nor for when it is back."""
+    subscriber = join("subscriber", version=version, **lasting(version))
+    subscriber.subscribe("#")
+    subscriber.slow()
+    join("publisher").publish("a", b"missed")
+    subscriber.lose()
+    assert broker.ledger.queued_bytes == 0
+    subscriber = join("subscriber", version=version, **lasting(version))
+    subscriber.fast()
+    assert subscriber.messages() == []
+
+
 @pytest.mark.parametrize("limits", [Limits(queue_messages=3, queue_bytes=6000)])
 def test_what_waits_for_a_slow_client_is_bounded(join: Join, broker: Broker):
     subscriber = join("subscriber")
@@ -1159,6 +1175,20 @@ def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store:
     store.commit()
     publisher.only(Puback)
     assert publisher.wire.closed
+
+
+def test_the_store_knows_what_is_retained(join: Join, broker: Broker, store: FakeStore):
+    """Port Store: kept, replaced, deleted, expired"""
+    publisher = join("publisher")
+    publisher.publish("a", b"1", retain=True)
+    publisher.publish("a", b"2", retain=True)
+    publisher.publish("b", b"3", retain=True)
+    publisher.publish("c", b"4", retain=True, properties={MESSAGE_EXPIRY: 1})
+    assert store.kept == {"a": b"2", "b": b"3", "c": b"4"}
+    publisher.publish("b", b"", retain=True)
+    broker.tick(broker.now + 1)
+    retained(broker, 5)
+    assert store.kept == {"a": b"2"}
 
 
 def test_the_store_knows_what_is_owed(join: Join, broker: Broker, store: FakeStore):

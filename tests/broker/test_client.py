@@ -530,13 +530,14 @@ def test_no_more_in_flight_than_the_client_can_take(join: Join, qos):
     assert [m.payload for m in peer.drain()] == [b"%d" % n for n in range(4, 10)]
 
 
-def test_a_smaller_window_holds_for_what_is_sent_again(join: Join):
+@pytest.mark.parametrize("qos", [1, 2])
+def test_a_smaller_window_holds_for_what_is_sent_again(join: Join, qos):
     """v5 [MQTT-3.3.4-9] [MQTT-4.4.0-1]: sent again with the old ids, and not too many at once"""
     peer = join(**lasting(5))
-    peer.subscribe("#", 1)
+    peer.subscribe("#", qos)
     publisher = join("publisher")
     for n in range(30):
-        publisher.publish("a", b"%d" % n, 1)
+        publisher.publish("a", b"%d" % n, qos)
     ids = [message.packet_id for message in peer.messages()]
     assert len(ids) == 20
     peer.lose()
@@ -547,7 +548,7 @@ def test_a_smaller_window_holds_for_what_is_sent_again(join: Join):
     assert [m.packet_id for m in messages] == ids[:3]
     received = list(messages)
     while messages:
-        peer.send(Puback(messages[0].packet_id))
+        peer.acknowledge(messages[0])
         new = peer.messages()
         received += new
         messages = messages[1:] + new
