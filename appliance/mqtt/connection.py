@@ -13,7 +13,7 @@ standard says is absent, and `tests/mqtt/test_connection.py` holds them against 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import TypeAlias
 
@@ -121,15 +121,30 @@ class Connection:
         self._chunks.clear()
         self._have = 0
 
-    def receive_data(self, data: bytes) -> Iterator[Event]:
-        """Yield what `data`, behind what came before it, completes.
+    def receive_data(self, data: bytes) -> Iterable[Event]:
+        """What `data`, behind what came before it, completes.
 
-        A generator, so that what one packet changes (refused, paused, closed) holds for the next.
-        It is to be run to its end.
+        It is taken apart as it is iterated over, so that what one packet changes (refused, paused,
+        closed) holds for the next; it is to be iterated to its end.
 
         Raises:
             ProtocolError: the bytes or their order are wrong; the connection is closed.
         """
+        # A chunk that is one acknowledgement, or one PUBLISH like the last, is answered at once:
+        # for clients that send one packet at a time the generator would be a fifth of the cost.
+        size = len(data)
+        if size >= 4 and not self._have and self._reading and self.state is State.CONNECTED:
+            if size == 4 and data[0] in _ACKNOWLEDGEMENTS and data[1] == 2:
+                if data[2] or data[3]:
+                    return (_ACKNOWLEDGEMENTS[data[0]] | data[2] << 8 | data[3],)
+            elif size == self._head_size and data.startswith(self._head):
+                event = self._repeated(data, 0, size)
+                if event is not None:
+                    return (event,)
+        return self._take_apart(data)
+
+    def _take_apart(self, data: bytes) -> Iterator[Event]:
+        """`receive_data`, the way that always works."""
         if self._have:
             # A packet cut into many chunks is joined once, when it is whole: joining at every
             # chunk would copy a 16 MiB packet a hundred times over.

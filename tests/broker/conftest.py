@@ -63,6 +63,7 @@ class FakeStore(MemoryStore):
     def __init__(self) -> None:
         self.holding = False
         self.sessions: set[str] = set()
+        self.subscriptions: dict[tuple[str, str], int] = {}
         self.kept: dict[str, bytes] = {}
         self.owed: Counter[tuple[str, Message]] = Counter()
         self._callbacks: list[Callable[[bool], None]] = []
@@ -85,8 +86,15 @@ class FakeStore(MemoryStore):
 
     def session_removed(self, session: Session) -> None:
         self.sessions.discard(session.client_id)
-        for key in [key for key in self.owed if key[0] == session.client_id]:
-            del self.owed[key]
+        for kept in (self.owed, self.subscriptions):
+            for key in [key for key in kept if key[0] == session.client_id]:
+                del kept[key]
+
+    def subscribed(self, session: Session, subscription: Subscription) -> None:
+        self.subscriptions[session.client_id, subscription.filter] = subscription.qos
+
+    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+        del self.subscriptions[session.client_id, topic_filter]
 
     def retained(self, message: Message) -> None:
         self.kept[message.topic] = message.payload

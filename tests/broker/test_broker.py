@@ -1166,6 +1166,14 @@ def test_a_failed_commit_closes_the_connections_concerned(join: Join, store: Fak
     other.only(Puback)
 
 
+def test_a_failed_commit_closes_a_connection_that_was_ending(join: Join, store: FakeStore):
+    publisher = join("publisher")
+    store.holding = True
+    publisher.send(Publish("a", b"x", 1, packet_id=1), bytes((0xE0, 0)))
+    store.commit(kept=False)
+    assert publisher.received() == [] and publisher.wire.closed
+
+
 def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store: FakeStore):
     """Rule 2: the acknowledgement does not leave ahead of it with the last bytes."""
     publisher = join("publisher")
@@ -1175,6 +1183,66 @@ def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store:
     store.commit()
     publisher.only(Puback)
     assert publisher.wire.closed
+
+
+def test_the_store_knows_the_subscriptions_of_lasting_sessions(join: Join, store: FakeStore):
+    """Port Store"""
+    peer, other = join("peer", **lasting(5)), join("other")
+    for client in (peer, other):
+        client.subscribe("a", 1)
+        client.subscribe("b")
+        client.subscribe("a", 2)
+        client.unsubscribe("b")
+    assert store.subscriptions == {("peer", "a"): 2}
+
+
+def test_observers_are_told_what_happens(join: Join, broker: Broker, access: FakeAccess):
+    """Port Observer: amqtt's plugins listen there"""
+    told: list[tuple[object, ...]] = []
+
+    class Listening:
+        def connected(self, session) -> None:
+            told.append(("connected", session.client_id))
+
+        def disconnected(self, session) -> None:
+            told.append(("disconnected", session.client_id))
+
+        def subscribed(self, session, topic_filter: str, qos: int) -> None:
+            told.append(("subscribed", session.client_id, topic_filter, qos))
+
+        def unsubscribed(self, session, topic_filter: str) -> None:
+            told.append(("unsubscribed", session.client_id, topic_filter))
+
+        def published(self, session, message: Message) -> None:
+            told.append(("published", session.client_id, message.topic))
+
+        def refused(self, session, message: Message) -> None:
+            told.append(("refused", session.client_id, message.topic))
+
+        def retained(self, message: Message) -> None:
+            told.append(("retained", message.topic, message.payload))
+
+    broker.observer = Listening()
+    access.deny("user", Action.PUBLISH, "no")
+    peer = join("peer", version=4, will=Will("w", b"gone"))
+    peer.subscribe("a", 1)
+    peer.unsubscribe("a", "never")
+    for qos in (0, 1, 2):
+        peer.publish("a", b"x", qos)
+    peer.publish("no")
+    peer.publish("r", b"x", retain=True)
+    peer.lose()
+    assert told == [
+        ("connected", "peer"),
+        ("subscribed", "peer", "a", 1),
+        ("unsubscribed", "peer", "a"),
+        *[("published", "peer", "a")] * 3,
+        ("refused", "peer", "no"),
+        ("published", "peer", "r"),
+        ("retained", "r", b"x"),
+        ("disconnected", "peer"),
+        ("published", "peer", "w"),
+    ]
 
 
 def test_the_store_knows_what_is_retained(join: Join, broker: Broker, store: FakeStore):

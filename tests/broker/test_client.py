@@ -559,6 +559,26 @@ def test_a_smaller_window_holds_for_what_is_sent_again(join: Join, qos):
     assert not peer.session.inflight
 
 
+def test_a_connection_that_is_lost_while_it_is_sent_again(join: Join):
+    """[MQTT-4.4.0-1], twice"""
+    peer = join(**lasting(5))
+    peer.subscribe("#", 1)
+    publisher = join("publisher")
+    for n in range(10):
+        publisher.publish("a", b"%d" % n, 1)
+    ids = [message.packet_id for message in peer.messages()]
+    options = lasting(5)
+    options["properties"][P.RECEIVE_MAXIMUM] = 3  # type: ignore[index]
+    for _ in range(2):
+        peer.lose()
+        peer = join(**options)
+        assert [m.packet_id for m in peer.messages()] == ids[:3]
+    peer.lose()
+    peer = join(**lasting(5))
+    assert [m.packet_id for m in peer.drain()] == ids
+    assert not peer.session.inflight
+
+
 def test_what_waits_to_be_sent_again_may_be_acknowledged(join: Join):
     peer = join(**lasting(5))
     peer.subscribe("#", 1)
@@ -596,6 +616,18 @@ def test_no_packet_is_larger_than_the_client_takes(join: Join, broker: Broker, q
     assert [len(m.payload) for m in messages] == [largest - around, 4]
     assert not peer.session.inflight
     assert broker.counters.publish_dropped == 2
+
+
+def test_a_large_packet_size_lets_everything_through(join: Join):
+    peer = join(properties={P.MAXIMUM_PACKET_SIZE: 10_000})
+    properties = {P.SUBSCRIPTION_IDENTIFIER: [1]}
+    peer.subscribe("a/#", 1, properties=properties)
+    peer.subscribe("b", 1)
+    publisher = join("publisher", version=4)
+    for topic in ("a", "b"):
+        for size in (0, 100, 9_000, 9_980, 10_000):
+            publisher.publish(topic, bytes(size), size % 3)
+    assert [len(m.payload) for m in peer.drain()] == [0, 100, 9_000, 9_980] * 2
 
 
 def test_what_is_in_flight_is_dropped_when_the_client_takes_no_more(join: Join):

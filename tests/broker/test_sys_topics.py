@@ -106,6 +106,16 @@ def test_the_figures(sys_topics: SysTopics, broker: Broker, join: Join):
     assert (changed["clients/disconnected"], changed["subscriptions/count"]) == ("0", "0")
 
 
+def test_what_goes_out_as_it_came_in_is_counted_too(sys_topics: SysTopics, join: Join, version):
+    subscriber, other = join("subscriber", version=version), join("other", version=9 - version)
+    for peer in (subscriber, other):
+        peer.subscribe("a")
+    subscriber.publish("a", b"12345")
+    figures = values(sys_topics)
+    assert figures["publish/messages/received"] == "1" and figures["publish/bytes/received"] == "5"
+    assert figures["publish/messages/sent"] == "2" and figures["publish/bytes/sent"] == "10"
+
+
 def test_what_waits_is_counted_once_wherever_it_waits(
     sys_topics: SysTopics, broker: Broker, join: Join
 ):
