@@ -45,10 +45,6 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 log = logging.getLogger(__name__)
 
-#: Session Expiry Interval that means "never" in CONNECT.
-NEVER = 0xFFFF_FFFF
-
-
 #: Bytes that a client is sent before the next flush. What waits in its session waits on, until the
 #: network has taken these: it is the network that says how fast a client is.
 OUTPUT_LIMIT = 1024 * 1024
