@@ -327,8 +327,7 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
-        if retain and not self._retain(message):
-            return ReasonCode.QUOTA_EXCEEDED
+        kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
         outcome = ReasonCode.NO_MATCHING_SUBSCRIBERS
         published_qos = message.qos
         for session, qos, as_published, subscription_ids in targets:
@@ -340,7 +339,7 @@ class Broker:
                 self._tell_full(session)
                 if outcome:
                     outcome = ReasonCode.QUOTA_EXCEEDED
-        return outcome
+        return outcome if kept else ReasonCode.QUOTA_EXCEEDED
 
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
@@ -350,8 +349,11 @@ class Broker:
         log.warning("%s may not publish to '%s': %s", session, route.topic, route.reason)
 
     def _tell_full(self, session: Session) -> None:
-        if session.full_since is None or self.now - session.full_since >= FULL_QUEUE_LOG_INTERVAL:
-            session.full_since = self.now
+        if (
+            session.told_full_at is None
+            or self.now - session.told_full_at >= FULL_QUEUE_LOG_INTERVAL
+        ):
+            session.told_full_at = self.now
             log.warning(
                 "%s: the queue is full (%d messages, %d bytes); newer messages are dropped",
                 session,

@@ -91,7 +91,6 @@ class Session:
         "ends_at",
         "epoch",
         "expiry",
-        "full_since",
         "identity",
         "inflight",
         "latest",
@@ -103,6 +102,7 @@ class Session:
         "resends",
         "routes",
         "subscriptions",
+        "told_full_at",
         "will",
         "will_at",
         "window",
@@ -133,8 +133,8 @@ class Session:
         #: QoS 2 from the client, waiting for PUBREL.
         self.received: dict[int, Message] = {}
         self.bytes = 0
-        #: The clock when the queue filled, for one line in the log each time; None while it is not.
-        self.full_since: float | None = None
+        #: The clock when the log was last told that the queue is full; None before that.
+        self.told_full_at: float | None = None
         #: Where this session's messages go, by topic; valid while `epoch` is the broker's.
         self.routes: dict[bytes, Route] = {}
         self.epoch = -1

@@ -408,6 +408,20 @@ def test_the_number_of_retained_messages_is_bounded(join: Join, broker: Broker):
     assert broker.counters.publish_dropped == 1
 
 
+@pytest.mark.parametrize("limits", [Limits(retained_messages=1)])
+def test_who_is_there_gets_a_message_that_cannot_be_retained(join: Join, broker: Broker):
+    publisher = join("publisher")
+    subscriber = join("subscriber")
+    subscriber.subscribe("#", 1)
+    publisher.publish("a", b"1", 1, retain=True)
+    assert publisher.publish("alarm", b"fire", 1, retain=True) == ReasonCode.QUOTA_EXCEEDED
+    assert [(m.topic, m.payload) for m in subscriber.messages()] == [
+        ("a", b"1"),
+        ("alarm", b"fire"),
+    ]
+    assert len(broker.retained) == 1
+
+
 @pytest.mark.parametrize("limits", [Limits(retained_bytes=4000)])
 def test_the_bytes_of_retained_messages_are_bounded(join: Join, broker: Broker):
     publisher = join("publisher")
