@@ -95,6 +95,7 @@ class App:
         listeners = Listeners(
             broker,
             frame.authenticate,
+            access.exchange,
             connections=limits.connections,
             connect_timeout=limits.connect_timeout,
         )
@@ -228,8 +229,12 @@ def _broker_limits(settings: Settings) -> Limits:
         memory=limits.memory,
         queue_messages=limits.queue_messages,
         queue_bytes=limits.queue_bytes,
+        queue_full=limits.queue_full,
+        keep=0 if limits.keep == "latest" else limits.keep,
         inflight=limits.inflight,
+        sessions=limits.sessions,
         subscriptions=limits.subscriptions,
+        topic_length=limits.topic_length,
         topic_levels=limits.topic_levels,
         retained_messages=limits.retained_messages,
         retained_bytes=limits.retained_bytes,

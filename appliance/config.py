@@ -226,6 +226,12 @@ def _check_topic_template(value: str) -> str:
     return value
 
 
+def _check_response_information(value: str) -> str:
+    if not value or any(char in value for char in "+#\0"):
+        raise ValueError("must be the beginning of an MQTT topic, without '+' and '#'")
+    return value
+
+
 def _check_plugins(value: object) -> object:
     if not isinstance(value, dict):
         return value
@@ -263,6 +269,7 @@ Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
 Count = Annotated[int, Field(ge=1)]
 Encoding = Literal["json", "text", "cdr"]
 Direction = Literal["mqtt", "ros", "both"]
+QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
 Level = Literal["debug", "info", "warning", "error"]
 
 
@@ -298,13 +305,20 @@ class Limits(_Section):
     """What one client, and all together, may use. Sizes in bytes, times in seconds."""
 
     connections: Count = 1000
+    connections_per_address: Count = 250
+    connection_rate: Count = 100
     packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
     memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
     queue_messages: Count = 1000
     queue_bytes: Annotated[Size, Field(ge=1)] = 16 << 20
+    queue_full: QueueFull = "refuse"
+    keep: Keep = "latest"
+    publish_rate: Count = 100_000
     inflight: Annotated[int, Field(ge=1, le=65535)] = 20
+    sessions: Count = 10_000
     subscriptions: Count = 1000
-    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 128
+    topic_length: Annotated[Size, Field(ge=1, le=65535)] = 65535
+    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 200
     retained_messages: Annotated[int, Field(ge=0)] = 100_000
     retained_bytes: Annotated[Size, Field(ge=0)] = 64 << 20
     connect_timeout: Annotated[Duration, Field(gt=0)] = 10.0
@@ -328,6 +342,9 @@ class Broker(_Section):
     anonymous: bool = False
     tls: Tls = _section()
     limits: Limits = _section()
+    check_payload_format: bool = False
+    reason_strings: bool = False
+    response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None
     sys_interval: Annotated[Duration, Field(ge=0)] = 10.0
     plugins: Annotated[
         dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)

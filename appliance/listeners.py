@@ -13,7 +13,7 @@ from typing import TypeAlias, cast
 
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
-from appliance.broker.ports import Identity, Refusal
+from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.mqtt.connection import State
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
@@ -66,12 +66,14 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
+        exchange: Callable[[str], Exchange | None],
         *,
         connections: int,
         connect_timeout: float,
     ) -> None:
         self.broker = broker
         self.authenticate = authenticate
+        self.exchange = exchange
         self.connections = connections
         self.connect_timeout = connect_timeout
         self.open: set[ClientProtocol] = set()
@@ -309,6 +311,20 @@ class ClientProtocol(asyncio.Protocol):
             self._client.accept(who.username)
         self._broker.flush()
         self._read_on()
+
+    def exchange(self, method: str) -> Exchange | None:
+        """Begin an enhanced authentication; None when the method is not offered."""
+        return self._listeners.exchange(method)
+
+    def later(self) -> None:
+        """Let the others have their turn, then send on."""
+        self._loop.call_soon(self._send_on)
+
+    def _send_on(self) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self._broker.ledger.now = self._loop.time()
+            self._client.resume_writing()
+            self._broker.flush()
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined when small."""

@@ -83,7 +83,11 @@ class House:
 
     def make(self, connections: int = 100, connect_timeout: float = PATIENCE) -> Listeners:
         self.listeners = Listeners(
-            self.broker, self._ask, connections=connections, connect_timeout=connect_timeout
+            self.broker,
+            self._ask,
+            lambda method: None,
+            connections=connections,
+            connect_timeout=connect_timeout,
         )
         return self.listeners
 

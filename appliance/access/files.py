@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from appliance.broker.ports import Action, Decision, Identity, Refusal
+from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 
 from .acl import Acl
@@ -82,6 +82,10 @@ class FileAccess:
     def users(self) -> list[str]:
         """The names of all users, sorted."""
         return self._passwords.users()
+
+    def exchange(self, method: str) -> Exchange | None:
+        """Begins an enhanced authentication; None when the method is not offered."""
+        return None
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the rules in force let the client do this; see `Acl.decide`."""

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from appliance.broker.broker import Broker, Route
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity
+from appliance.broker.ports import Exchange, Identity
 from appliance.broker.session import PendingWill, Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.connection import (
@@ -58,6 +58,12 @@ class Wire(Protocol):
 
     def authenticate(self, connect: Connect) -> None:
         """Find out who it is, in the background; `Client.accept` or `Client.refuse` ends it."""
+
+    def exchange(self, method: str) -> Exchange | None:
+        """Begin an enhanced authentication; None when the method is not offered."""
+
+    def later(self) -> None:
+        """Call `Client.resume_writing` in a later turn of the loop, when others had theirs."""
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, one behind the other."""

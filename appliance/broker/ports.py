@@ -58,6 +58,21 @@ class Refusal:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """An enhanced authentication succeeded; `data` is the last that the client is sent."""
+
+    username: str
+    data: bytes
+
+
+class Exchange(Protocol):
+    """One enhanced authentication under way (5.0 section 4.12): AUTH packets to and fro."""
+
+    def step(self, data: bytes) -> bytes | Accepted | Refusal:
+        """Take what the client sent; returns the next challenge, or how it ended. No I/O."""
+
+
 class Access(Protocol):
     """The access rules in force. `epoch` grows by one whenever they change."""
 
@@ -164,9 +179,13 @@ class Limits:
     memory: int = 256 * 1024 * 1024
     queue_messages: int = 1000
     queue_bytes: int = 16 * 1024 * 1024
+    queue_full: str = "refuse"
+    #: QoS 0 messages that wait for a slow client; 0: the latest of each topic.
+    keep: int = 0
     inflight: int = 20
     subscriptions: int = 1000
-    topic_levels: int = 128
+    topic_length: int = 65535
+    topic_levels: int = 200
     retained_messages: int = 100_000
     retained_bytes: int = 64 * 1024 * 1024
     session_expiry: int = 7 * 24 * 3600

@@ -10,7 +10,7 @@ import pytest
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, Limits
+from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
@@ -119,9 +119,19 @@ class FakeWire:
         self.asked: Connect | None = None
         self.written = bytearray()
         self.closed = False
+        #: What `exchange` gives, by method, once each.
+        self.exchanges: dict[str, Exchange] = {}
+        #: Turns of the loop that were asked for and have not come.
+        self.laters = 0
 
     def authenticate(self, connect: Connect) -> None:
         self.asked = connect
+
+    def exchange(self, method: str) -> Exchange | None:
+        return self.exchanges.pop(method, None)
+
+    def later(self) -> None:
+        self.laters += 1
 
     def write(self, chunks: list[bytes]) -> None:
         assert not self.closed, "written to after the close"
