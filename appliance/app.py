@@ -16,7 +16,7 @@ from appliance.access import AccessFileError, FileAccess
 from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Limits
+from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import server_context
 from appliance.config import Settings, TopicRoute
@@ -74,7 +74,9 @@ class App:
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
-        self.broker = broker = Broker(access, MemoryStore(), _broker_limits(settings))
+        self.broker = broker = Broker(
+            access, MemoryStore(), _broker_limits(settings), _features(settings)
+        )
         broker.tick(loop.time())
 
         async def listen() -> None:
@@ -218,6 +220,9 @@ class _Deaf:
     def pubrel(self, packet_id: int) -> None:
         """Nor is this."""
 
+    def later(self) -> None:
+        """Nor is this."""
+
     def close(self, reason: object, message: str) -> None:
         """There is no connection to close."""
 
@@ -241,6 +246,14 @@ def _broker_limits(settings: Settings) -> Limits:
         session_expiry=round(limits.session_expiry),
         topic_alias=limits.topic_alias,
         keep_alive=round(limits.keep_alive),
+    )
+
+
+def _features(settings: Settings) -> Features:
+    return Features(
+        check_payload_format=settings.broker.check_payload_format,
+        reason_strings=settings.broker.reason_strings,
+        response_information=settings.broker.response_information or "",
     )
 
 

@@ -35,8 +35,9 @@ from appliance.document import Document, KeyPath, Problem
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Where the configuration is looked for when no file is named; the first that exists is used."""
 
-PACKET_SIZE_MAX = 268_435_455
-"""The largest Remaining Length that MQTT can say (section 1.5.5: four bytes of 7 bits)."""
+PACKET_SIZE_MAX = 255 << 20
+"""Less than the largest Remaining Length that MQTT can say (section 1.5.5: four bytes of 7 bits): a
+packet may grow by some properties on its way from one client to another."""
 
 SIZE_UNITS = {"B": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 DURATION_UNITS = {"ms": 1, "s": 1000, "min": 60_000, "h": 3_600_000, "d": 86_400_000}  # in ms

@@ -104,6 +104,9 @@ class _NoLink:
     def pubrel(self, packet_id: int) -> None:
         """Nor is this."""
 
+    def later(self) -> None:
+        """Nor is this."""
+
     def close(self, reason: object, message: str) -> None:
         """There is no connection to close."""
 

@@ -14,10 +14,30 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
+from appliance.broker.complaints import Complaints
 from appliance.broker.message import Message
-from appliance.broker.ports import Access, Action, Decision, Identity, Limits, Link, Observer, Store
-from appliance.broker.session import Delivery, Ledger, PendingWill, Session
-from appliance.mqtt.codec import Property, decode_string
+from appliance.broker.ports import (
+    Access,
+    Action,
+    Decision,
+    Features,
+    Identity,
+    Limits,
+    Link,
+    Observer,
+    Store,
+)
+from appliance.broker.session import (
+    LEVEL_SIZE,
+    Delivery,
+    Held,
+    Ledger,
+    PendingWill,
+    Session,
+    subscription_size,
+)
+from appliance.broker.shared import Share, Target
+from appliance.mqtt.codec import Property, decode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import (
@@ -37,9 +57,6 @@ CACHED_ROUTES = 1024
 #: And the longest of these topics, in bytes.
 CACHED_TOPIC = 512
 
-#: Seconds between two lines in the log about the same full queue.
-FULL_QUEUE_LOG_INTERVAL = 60.0
-
 _ALLOWED = Decision(True, "the appliance itself")
 
 
@@ -56,10 +73,6 @@ class Ticking(Protocol):
         """Check its keep alive."""
 
 
-#: session, granted QoS, retain as published, subscription identifiers
-Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
-
-
 @dataclass(slots=True)
 class Route:
     """What is known about one topic for one publishing session, until the epoch changes."""
@@ -71,15 +84,34 @@ class Route:
     #: What the client is told when it is not allowed.
     refusal: ReasonCode
     targets: list[Target]
+    #: Shared subscriptions, and those of their members that may receive the topic.
+    shares: list[tuple[Share, list[Target]]]
+
+
+#: Who a message may be owed to: a session, or one of a group.
+Receiver: TypeAlias = "Session | Share"
+
+
+def retained_size(message: Message) -> int:
+    """Bytes that are counted for a retained message: it, and its topic's levels in the tree."""
+    return message.size + LEVEL_SIZE * message.topic.count("/")
 
 
 class Broker:
     """All sessions, subscriptions and retained messages, and the rules that join them."""
 
-    def __init__(self, access: Access, store: Store, limits: Limits | None = None) -> None:
+    def __init__(
+        self,
+        access: Access,
+        store: Store,
+        limits: Limits | None = None,
+        features: Features | None = None,
+    ) -> None:
         self.access = access
         self.store = store
         self.limits = limits or Limits()
+        self.features = features or Features()
+        self.complaints = Complaints()
         self.ledger = Ledger(self.limits, store)
         #: What the broker counts.
         self.counters = self.ledger.counters
@@ -93,7 +125,11 @@ class Broker:
         self.unflushed: list[Ticking] = []
         #: Grows whenever a cached route may be wrong.
         self.epoch = 0
-        self._subscriptions: SubscriptionTree[tuple[Session, Subscription]] = SubscriptionTree()
+        self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
+            SubscriptionTree()
+        )
+        #: Shared subscriptions by their whole filter.
+        self._shares: dict[str, Share] = {}
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
 
@@ -104,8 +140,13 @@ class Broker:
 
     @property
     def subscription_count(self) -> int:
-        """Subscriptions of all sessions."""
+        """Subscriptions of all sessions; a shared one counts once."""
         return len(self._subscriptions)
+
+    @property
+    def shared_subscription_count(self) -> int:
+        """Shared subscriptions, whatever the number of their members."""
+        return len(self._shares)
 
     # --- sessions ------------------------------------------------------------------------------
 
@@ -122,8 +163,10 @@ class Broker:
 
         Raises:
             ProtocolError: 0x85, the client id belongs to another user's session, which is not
-                touched; 0x97, no more sessions are kept.
+                touched; 0x97, no more sessions are kept, or its will has no room.
         """
+        if will is not None and (self.ledger.queued_bytes + will.message.size > self.limits.memory):
+            raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, "no room for its will")
         session = self.sessions.get(identity.client_id)
         if session is not None:
             owner = session.identity
@@ -150,7 +193,7 @@ class Broker:
         session.identity = identity
         session.link = link
         session.ends_at = None
-        session.will = will
+        session.set_will(will)
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
         self._set_expiry(session, expiry)
         return session, present
@@ -194,13 +237,14 @@ class Broker:
             return
         session.link = None
         session.forget_transient()
+        self._hand_over(session)
         if expiry is not None:
             self._set_expiry(session, min(expiry, self.limits.session_expiry))
         if self.observer is not None:
             self.observer.disconnected(session)
-        will = session.will
         if not publish_will:
-            session.will = will = None
+            session.set_will(None)
+        will = session.will
         if not session.persistent:
             self._end(session)
             return
@@ -220,16 +264,47 @@ class Broker:
         self._publish_will(session)
         session.ends_at = None
         for topic_filter in session.subscriptions:
-            self._subscriptions.remove(topic_filter, session)
+            self._leave(session, topic_filter)
         if session.subscriptions:
             self.epoch += 1
-        session.subscriptions.clear()
+        orphans = session.take_shared(None, sent=True)
         session.clear()
+        self._redeliver(orphans)
         if session.persistent:
             self.store.session_removed(session)
 
+    def _leave(self, session: Session, topic_filter: str) -> None:
+        """Take a subscription out of the tree, or a member out of its group."""
+        share = self._shares.get(topic_filter)
+        if share is None:
+            self._subscriptions.remove(topic_filter, session)
+            return
+        share.members.pop(session, None)
+        if not share.members:
+            del self._shares[topic_filter]
+            _, inner = parse_shared(topic_filter) or ("", "")
+            self._subscriptions.remove(inner, topic_filter)
+
+    def _hand_over(self, session: Session) -> None:
+        """A client is gone: what its groups gave it goes to the members who are there."""
+        for topic_filter in session.subscriptions:
+            share = self._shares.get(topic_filter)
+            if share is not None and any(member.link is not None for member in share.members):
+                self._redeliver(session.take_shared(share, sent=True))
+
+    def _redeliver(self, deliveries: list[Delivery]) -> None:
+        """Give what one member of a group cannot get to another."""
+        for message, _, _, _, share in deliveries:
+            assert share is not None
+            target = share.choose(self._members(share, message.topic), message)
+            if target is None:
+                self.counters.publish_dropped += 1
+            else:
+                self._deliver_shared(target, message, share)
+
     def _publish_will(self, session: Session) -> None:
-        will, session.will, session.will_at = session.will, None, None
+        will = session.set_will(None)
+        session.will_at = None
         if will is None:
             return
         message = will.message
@@ -267,25 +342,45 @@ class Broker:
         except ValueError as error:
             raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
         decision, refusal = self._may_publish(session, topic)
-        targets = self._targets(session, topic) if decision else []
-        return Route(topic, decision.allowed, decision.reason, refusal, targets)
+        targets, shares = self._targets(session, topic) if decision else ([], [])
+        return Route(topic, decision.allowed, decision.reason, refusal, targets, shares)
 
     def _may_publish(self, session: Session, topic: str) -> tuple[Decision, ReasonCode]:
         if session.identity is None:
             return _ALLOWED, ReasonCode.SUCCESS
-        if topic.count("/") >= self.limits.topic_levels:
-            reason = f"more than {self.limits.topic_levels} levels (broker.limits.topic_levels)"
-            return Decision(False, reason), ReasonCode.TOPIC_NAME_INVALID
+        excess = self._excess(topic)
+        if excess:
+            return Decision(False, excess), ReasonCode.TOPIC_NAME_INVALID
         if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
             reason = "topics that begin with $ are the broker's own"
             return Decision(False, reason), ReasonCode.NOT_AUTHORIZED
         decision = self.access.decide(session.identity, Action.PUBLISH, topic)
         return decision, ReasonCode.NOT_AUTHORIZED
 
-    def _targets(self, origin: Session, topic: str) -> list[Target]:
-        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1]."""
+    def _excess(self, topic: str) -> str:
+        """Which limit the topic or filter is over, if any."""
+        limits = self.limits
+        if topic.count("/") >= limits.topic_levels:
+            return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
+        if len(topic) > limits.topic_length // 4 and len(topic.encode()) > limits.topic_length:
+            return f"longer than {limits.topic_length} bytes (broker.limits.topic_length)"
+        return ""
+
+    def _targets(
+        self, origin: Session, topic: str
+    ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
+        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1].
+
+        Shared subscriptions come on top: a session gets a message once more for each that chooses
+        it (5.0 section 4.8.2).
+        """
         merged: dict[str, Target] = {}
-        for session, subscription in self._subscriptions.match(topic):
+        shares: list[tuple[Share, list[Target]]] = []
+        for match in self._subscriptions.match(topic):
+            if isinstance(match, Share):
+                shares.append((match, self._members(match, topic)))
+                continue
+            session, subscription = match
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
                 continue
             _, qos, as_published, ids = merged.get(session.client_id, (session, 0, False, None))
@@ -297,19 +392,43 @@ class Broker:
                 as_published or subscription.retain_as_published,
                 ids,
             )
-        return [target for target in merged.values() if self.may_receive(target[0], topic)]
+        targets = [target for target in merged.values() if self.may_receive(target[0], topic)]
+        return targets, shares
+
+    def _members(self, share: Share, topic: str) -> list[Target]:
+        return [
+            (
+                session,
+                subscription.qos,
+                subscription.retain_as_published,
+                [subscription.identifier] if subscription.identifier else None,
+            )
+            for session, subscription in share.members.items()
+            if self.may_receive(session, topic)
+        ]
 
     def may_receive(self, session: Session, topic: str) -> bool:
         """Whether the rules in force let the session receive the topic's messages."""
         if session.identity is None:
             return True
-        return self.access.decide(session.identity, Action.RECEIVE, topic).allowed
+        # Kept beside the routes: those are made anew with every subscription of anybody, which
+        # would ask the rules about all receivers of a topic again.
+        readable = session.readable
+        if session.readable_epoch != self.access.epoch or len(readable) >= CACHED_ROUTES:
+            readable.clear()
+            session.readable_epoch = self.access.epoch
+        allowed = readable.get(topic)
+        if allowed is None:
+            allowed = self.access.decide(session.identity, Action.RECEIVE, topic).allowed
+            if len(topic) <= CACHED_TOPIC:
+                readable[topic] = allowed
+        return allowed
 
     def publish(self, message: Message, origin: Session) -> ReasonCode:
         """Deliver the message to every session that subscribed to its topic.
 
         Returns 0x00, 0x10 when nobody did, 0x87 or 0x90 when `origin` may not publish it (told in
-        the log), 0x97 when there was no room for it anywhere.
+        the log), 0x97 when somebody who subscribed, or the retained messages, had no room for it.
 
         Raises:
             ProtocolError: the topic is not valid.
@@ -328,57 +447,114 @@ class Broker:
             self.observer.published(origin, message)
         retain = message.retain
         kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
-        outcome = ReasonCode.NO_MATCHING_SUBSCRIBERS
+        matched = False
         published_qos = message.qos
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
             if session.deliver(message, qos, retain and as_published, subscription_ids):
-                outcome = ReasonCode.SUCCESS
+                matched = True
             elif qos:
                 self._tell_full(session)
-                if outcome:
-                    outcome = ReasonCode.QUOTA_EXCEEDED
-        return outcome if kept else ReasonCode.QUOTA_EXCEEDED
+                kept = False
+        for share, members in route.shares:
+            chosen = share.choose(members, message)
+            if chosen is not None:
+                matched = self._deliver_shared(chosen, message, share) or matched
+            elif published_qos and members:
+                self._tell_full(members[0][0])
+                kept = False
+        if kept:
+            return ReasonCode.SUCCESS if matched else ReasonCode.NO_MATCHING_SUBSCRIBERS
+        return ReasonCode.QUOTA_EXCEEDED
+
+    def _deliver_shared(self, target: Target, message: Message, share: Share) -> bool:
+        session, qos, as_published, subscription_ids = target
+        retain = message.retain and as_published
+        return session.deliver(message, min(qos, message.qos), retain, subscription_ids, share)
+
+    def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
+        """Who could not keep a QoS 2 message now, and whether that is everybody.
+
+        It can be refused only as a whole, at its PUBREC: so it is when nobody has room. When some
+        have, it is theirs, and those who have none miss it, counted and logged: one slow reader
+        does not keep it from the others.
+        """
+        full: set[Receiver] = set()
+        receivers = 0
+        for session, qos, _, _ in route.targets:
+            if qos:
+                receivers += 1
+                if not session.has_room(message):
+                    full.add(session)
+        for share, members in route.shares:
+            asked = [session for session, qos, _, _ in members if qos]
+            if asked:
+                receivers += 1
+                if not any(session.has_room(message) for session in asked):
+                    full.add(share)
+        return frozenset(full), bool(receivers) and len(full) == receivers
+
+    def release(self, held: Held, origin: Session) -> None:
+        """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
+
+        Raises:
+            ProtocolError: the topic is not valid.
+        """
+        message, full = held
+        route = self.route(origin, message.topic_wire)
+        targets: list[Target] = []
+        for target in route.targets:
+            session, qos, as_published, ids = target
+            qos = min(qos, message.qos)
+            if qos and route.allowed and session not in full and not session.has_room(message):
+                session.deliver_promised((message, qos, message.retain and as_published, ids, None))
+            else:
+                targets.append(target)
+        self.publish_to(targets, route, message, origin)
 
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
         if self.observer is not None:
             self.observer.refused(session, message)
-        log.warning("%s may not publish to '%s': %s", session, route.topic, route.reason)
+        self.complain(session, "may not publish to %s: %s", quote(route.topic), route.reason)
+
+    def complain(self, session: Session, message: str, *args: object) -> None:
+        """Log what a client does wrong, but not every time that it does it again."""
+        key = session.client_id, message
+        self.complaints.tell(self.now, key, f"%s {message}", session, *args)
 
     def _tell_full(self, session: Session) -> None:
-        if (
-            session.told_full_at is None
-            or self.now - session.told_full_at >= FULL_QUEUE_LOG_INTERVAL
-        ):
-            session.told_full_at = self.now
-            log.warning(
-                "%s: the queue is full (%d messages, %d bytes); newer messages are dropped",
-                session,
-                len(session.queue),
-                session.bytes,
-            )
+        self.complain(
+            session,
+            "takes its messages too slowly, its queue is full (%d messages, %d bytes)",
+            len(session.queue),
+            session.bytes,
+        )
 
     def _retain(self, message: Message) -> bool:
         old = self.retained.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
             if old is None:
                 return True
-            self.retained_bytes -= old.size
+            self.retained_bytes -= retained_size(old)
             self.retained.delete(message.topic)
         else:
-            grown = self.retained_bytes + message.size - (old.size if old is not None else 0)
+            message.settle()
+            grown = self.retained_bytes + retained_size(message)
+            grown -= retained_size(old) if old is not None else 0
             limits = self.limits
             if grown > limits.retained_bytes or (
                 old is None and len(self.retained) >= limits.retained_messages
             ):
                 self.counters.publish_dropped += 1
-                log.warning(
-                    "no room to retain '%s': %d messages and %d bytes are retained "
+                self.complaints.tell(
+                    self.now,
+                    "retained",
+                    "no room to retain %s: %d messages and %d bytes are retained "
                     "(broker.limits.retained_messages, broker.limits.retained_bytes)",
-                    message.topic,
+                    quote(message.topic),
                     len(self.retained),
                     self.retained_bytes,
                 )
@@ -397,11 +573,12 @@ class Broker:
         refusal = self._check_subscription(session, subscription)
         if refusal is not None:
             code, reason = refusal
-            log.warning("%s may not subscribe to '%s': %s", session, subscription.filter, reason)
+            name = quote(subscription.filter)
+            self.complain(session, "may not subscribe to %s: %s", name, reason)
             return code
         if session.subscriptions.get(subscription.filter) != subscription:
-            session.subscriptions[subscription.filter] = subscription
-            self._subscriptions.add(subscription.filter, session, (session, subscription))
+            session.subscribe(subscription)
+            self._join(session, subscription)
             self.epoch += 1
         if session.persistent:
             self.store.subscribed(session, subscription)
@@ -409,30 +586,41 @@ class Broker:
             self.observer.subscribed(session, subscription.filter, subscription.qos)
         return ReasonCode(subscription.qos)
 
+    def _join(self, session: Session, subscription: Subscription) -> None:
+        """Put a subscription into the tree, or a member into its group."""
+        topic_filter = subscription.filter
+        shared = parse_shared(topic_filter)
+        if shared is None:
+            self._subscriptions.add(topic_filter, session, (session, subscription))
+            return
+        share = self._shares.get(topic_filter)
+        if share is None:
+            share = self._shares[topic_filter] = Share()
+            self._subscriptions.add(shared[1], topic_filter, share)
+        share.members[session] = subscription
+
     def _check_subscription(
         self, session: Session, subscription: Subscription
     ) -> tuple[ReasonCode, str] | None:
         topic_filter = subscription.filter
         try:
             check_filter(topic_filter)
-            shared = parse_shared(topic_filter)
+            parse_shared(topic_filter)
         except ValueError as error:
             return ReasonCode.TOPIC_FILTER_INVALID, str(error)
-        limits = self.limits
-        if shared is not None:
-            reason = "shared subscriptions are not supported by this version"
-            return ReasonCode.SHARED_SUBSCRIPTIONS_NOT_SUPPORTED, reason
-        if topic_filter.count("/") >= limits.topic_levels:
-            reason = f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
-            return ReasonCode.TOPIC_FILTER_INVALID, reason
+        excess = self._excess(topic_filter)
+        if excess:
+            return ReasonCode.TOPIC_FILTER_INVALID, excess
         if session.identity is None:
             return None
-        if (
-            topic_filter not in session.subscriptions
-            and len(session.subscriptions) >= limits.subscriptions
-        ):
-            reason = f"it has {limits.subscriptions} subscriptions (broker.limits.subscriptions)"
-            return ReasonCode.QUOTA_EXCEEDED, reason
+        if topic_filter not in session.subscriptions:
+            maximum = self.limits.subscriptions
+            if len(session.subscriptions) >= maximum:
+                reason = f"it has {maximum} subscriptions (broker.limits.subscriptions)"
+                return ReasonCode.QUOTA_EXCEEDED, reason
+            if not session.fits(subscription_size(topic_filter)):
+                reason = "no memory for it (broker.limits.queue_bytes, broker.limits.memory)"
+                return ReasonCode.QUOTA_EXCEEDED, reason
         decision = self.access.decide(session.identity, Action.SUBSCRIBE, topic_filter)
         if not decision:
             return ReasonCode.NOT_AUTHORIZED, decision.reason
@@ -440,28 +628,38 @@ class Broker:
 
     def send_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
         """Send the retained messages that a subscription asks for, behind its SUBACK."""
+        if parse_shared(subscription.filter) is not None:
+            return  # the group's members have not asked for them (5.0 section 4.8.2)
         handling = subscription.retain_handling
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
         session.replay(subscription.filter, self._find_retained(session, subscription.filter))
 
-    def _find_retained(self, session: Session, topic_filter: str) -> Iterator[Delivery]:
-        """What a subscription asks for, checked message by message as the client takes them."""
+    def _find_retained(self, session: Session, topic_filter: str) -> Iterator[Delivery | None]:
+        """What a subscription asks for, checked message by message as the client takes them.
+
+        None stands for what it may not see, so that passing over many of these takes turns, too.
+        """
         for topic, message in self.retained.find(topic_filter):
             if message.expires_at is not None and message.expires_at <= self.now:
                 self._retain(Message(topic, b"", retain=True))
-            elif self.may_receive(session, topic):
+                yield None
+            elif not self.may_receive(session, topic):
+                yield None
+            else:
                 subscription = session.subscriptions[topic_filter]
                 ids = [subscription.identifier] if subscription.identifier else None
-                yield message, min(message.qos, subscription.qos), True, ids
+                yield message, min(message.qos, subscription.qos), True, ids, None
 
     def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:
         """Unsubscribe; returns 0x00, or 0x11 when there was no such subscription."""
-        if session.subscriptions.pop(topic_filter, None) is None:
+        if not session.unsubscribe(topic_filter):
             return ReasonCode.NO_SUBSCRIPTION_EXISTED
-        session.replays.pop(topic_filter, None)
-        self._subscriptions.remove(topic_filter, session)
+        share = self._shares.get(topic_filter)
+        self._leave(session, topic_filter)
         self.epoch += 1
+        if share is not None:
+            self._redeliver(session.take_shared(share, sent=False))
         if session.persistent:
             self.store.unsubscribed(session, topic_filter)
         if self.observer is not None:
@@ -504,6 +702,7 @@ class Broker:
         `ledger.now` may be moved on, so that what begins then is not cut short.
         """
         self.ledger.now = now
+        self.complaints.tick(now)
         for client in tuple(self.clients):
             client.tick(now)
         while self._deadlines and self._deadlines[0][0] <= now:
@@ -525,6 +724,11 @@ class Broker:
 
         With something staged in the store this waits for its commit: acknowledged means kept.
         """
+        overflowed = self.ledger.overflowed
+        while overflowed:
+            overflowed.pop().close_link(
+                ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
+            )
         while self.unflushed:  # what was written makes room for what waited
             if self.store.staged:
                 self.store.after_commit(self._committed)
@@ -544,7 +748,7 @@ class Broker:
     def close(self, close: Callable[[Session], None]) -> None:
         """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""
         for session in list(self.sessions.values()):
-            session.will = None
+            session.set_will(None)
             if session.link is not None and session.identity is not None:
                 close(session)
         self.flush()

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import logging
 import secrets
-from dataclasses import dataclass
 from typing import Protocol
 
 from appliance.broker.broker import Broker, Route
+from appliance.broker.handshake import agree, connack_properties, is_text, pending_will
 from appliance.broker.message import Message
-from appliance.broker.ports import Exchange, Identity
-from appliance.broker.session import PendingWill, Session
-from appliance.mqtt.codec import Properties, Property
+from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.session import Held, Session
+from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
     PUBACK,
     PUBREC,
@@ -50,6 +50,10 @@ log = logging.getLogger(__name__)
 OUTPUT_LIMIT = 1024 * 1024
 
 
+#: What a refusal is sent as when it has a reason string, by its first byte.
+_REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
+
+
 class Wire(Protocol):
     """The connection under a client, as a listener implements it."""
 
@@ -62,24 +66,17 @@ class Wire(Protocol):
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
 
+    def accepted(self) -> None:
+        """The client has logged in: the time limit for that is over."""
+
     def later(self) -> None:
-        """Call `Client.resume_writing` in a later turn of the loop, when others had theirs."""
+        """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, one behind the other."""
 
     def close(self) -> None:
         """Write what was written so far, then close."""
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectOptions:
-    """What a CONNECT asked for, as far as it outlives the handshake."""
-
-    keep_alive: int
-    expiry: int
-    window: int
-    maximum_packet_size: int
 
 
 class Client:
@@ -100,6 +97,14 @@ class Client:
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
         self._maximum_packet_size = 0
+        #: Numbers of the topic names that the client was sent; None when it takes none.
+        self._aliases: dict[str, int] | None = None
+        self._alias_maximum = 0
+        #: Whether a packet may go out as it came in from another client.
+        self._mirrors = True
+        self._explain = False
+        self._method = ""  # of its enhanced authentication
+        self._exchange: Exchange | None = None
         self._unfinished_maximum = 0
         self._version = 0
         self._closed = False
@@ -156,7 +161,7 @@ class Client:
                 or target[0].link is None
                 or not target[0].link.mirror(head, self._version, len(payload))
             ]
-            if not targets:
+            if not targets and not route.shares:
                 return
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
@@ -170,7 +175,7 @@ class Client:
             return
         code = broker.publish_to(targets, route, message, session)
         if qos:
-            self._acknowledge(0x40, packet_id, code)
+            self._acknowledge(0x40, packet_id, code, route.reason)
 
     def _on_publish(self, packet: Publish) -> None:
         """A PUBLISH that the full decoder has read: with properties, most likely."""
@@ -188,15 +193,24 @@ class Client:
             packet.properties,
             self._expires_at(packet.properties),
         )
-        if packet.qos == 2:
-            assert packet.packet_id is not None
-            route = broker.route(session, message.topic_wire)
-            self._on_publish_qos2(session, packet.packet_id, message, route)
-            return
-        code = broker.publish(message, session)
-        if packet.qos:
-            assert packet.packet_id is not None
-            self._acknowledge(0x40, packet.packet_id, code)
+        route = broker.route(session, message.topic_wire)
+        packet_id = packet.packet_id or 0
+        if broker.features.check_payload_format and not is_text(message.payload, packet.properties):
+            self._refuse_payload(session, message, packet_id)
+        elif packet.qos == 2:
+            self._on_publish_qos2(session, packet_id, message, route)
+        else:
+            code = broker.publish_to(route.targets, route, message, session)
+            if packet.qos:
+                self._acknowledge(0x40, packet_id, code, route.reason)
+
+    def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
+        self._counters.publish_refused += 1
+        reason = "the payload is marked as UTF-8 text and is not"
+        self.broker.complain(session, "may not publish to %s: %s", quote(message.topic), reason)
+        if message.qos:
+            first = 0x40 if message.qos == 1 else 0x50
+            self._acknowledge(first, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
 
     def _on_publish_qos2(
         self, session: Session, packet_id: int, message: Message, route: Route
@@ -214,13 +228,17 @@ class Client:
                 ReasonCode.RECEIVE_MAXIMUM_EXCEEDED,
                 f"more than {self.broker.limits.inflight} unfinished QoS 2 messages",
             )
-        elif not session.hold(packet_id, message):
-            code = ReasonCode.QUOTA_EXCEEDED
-            if self._version != 5:
-                raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
-        elif not route.targets:
-            code = ReasonCode.NO_MATCHING_SUBSCRIBERS
-        self._acknowledge(0x50, packet_id, code)
+        else:
+            full, everybody = self.broker.without_room(route, message)
+            refuses = self._version == 5 and self.broker.limits.queue_full == "refuse"
+            if everybody and refuses:
+                code = ReasonCode.QUOTA_EXCEEDED
+                self._counters.publish_dropped += 1
+            elif not session.hold(packet_id, Held(message, full)):
+                code = ReasonCode.QUOTA_EXCEEDED
+                if self._version != 5:
+                    raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
+        self._acknowledge(0x50, packet_id, code, route.reason)
 
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
@@ -236,11 +254,11 @@ class Client:
                 reason = ReasonCode.SUCCESS if known else ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
                 self._acknowledge(0x62, packet_id, reason)
         elif kind == PUBREL:
-            message = session.unhold(packet_id)
+            held = session.unhold(packet_id)
             reason = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
-            if message is not None:
+            if held is not None:
                 reason = ReasonCode.SUCCESS
-                self.broker.publish(message, session)
+                self.broker.release(held, session)
             self._acknowledge(0x70, packet_id, reason)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
@@ -264,9 +282,7 @@ class Client:
         elif isinstance(packet, Connect):
             self._on_connect(packet)
         elif isinstance(packet, Auth):
-            raise ProtocolError(  # [MQTT-4.12.0-7]
-                ReasonCode.PROTOCOL_ERROR, "AUTH, but no authentication method in CONNECT"
-            )
+            self._on_auth(packet)
 
     def _on_subscribe(self, packet: Subscribe) -> None:
         session = self.session
@@ -284,6 +300,8 @@ class Client:
             if code <= ReasonCode.GRANTED_QOS_2:
                 granted.append((subscription, is_new))
         self._send(Suback(packet.packet_id, codes))  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
+        if self._closed:
+            return
         for subscription, is_new in granted:
             self.broker.send_retained(session, subscription, is_new)
 
@@ -296,7 +314,9 @@ class Client:
     def _on_disconnect(self, packet: Disconnect) -> None:
         expiry = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
         session = self.session
-        assert session is not None
+        if session is None:  # it gives up in the middle of its authentication
+            self._shut()
+            return
         if isinstance(expiry, int) and expiry and not session.expiry:  # [MQTT-3.14.2-2]
             raise ProtocolError(
                 ReasonCode.PROTOCOL_ERROR, "a session expiry in DISCONNECT, but none in CONNECT"
@@ -314,18 +334,76 @@ class Client:
         self._connect = packet
         properties = packet.properties or {}
         properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
-        if Property.AUTHENTICATION_METHOD in properties:
-            self.refuse(
-                ReasonCode.BAD_AUTHENTICATION_METHOD, "enhanced authentication is not offered"
-            )
-            return
         if not packet.client_id and not packet.clean_start and packet.version != 5:
             # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
+        will = packet.will
+        checked = self.broker.features.check_payload_format
+        if will is not None and checked and not is_text(will.payload, will.properties):
+            reason = "its will is marked as text and is not"
+            self.refuse(ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+            return
+        method = properties.get(Property.AUTHENTICATION_METHOD)
+        if isinstance(method, str):
+            self._method = method
+            self._exchange = self.wire.exchange(method)
+            if self._exchange is None:  # [MQTT-4.12.0-1]
+                reason = f"it wants to authenticate with {quote(method)}, which is not offered"
+                self.refuse(ReasonCode.BAD_AUTHENTICATION_METHOD, reason)
+                return
+            self._authenticate(self._exchange, properties)
+            return
         # What follows a CONNECT is read only once it is known who sent it.
         self.connection.pause()
         self.wire.authenticate(packet)
+
+    def _on_auth(self, packet: Auth) -> None:
+        """A step of an enhanced authentication (5.0 section 4.12)."""
+        properties = packet.properties or {}
+        code = packet.reason_code
+        if not self._method:  # [MQTT-4.12.0-7]
+            problem = "AUTH, but no authentication method in CONNECT"
+        elif properties.get(Property.AUTHENTICATION_METHOD) != self._method:  # [MQTT-4.12.0-5]
+            problem = "AUTH with another authentication method than CONNECT"
+        elif code == ReasonCode.RE_AUTHENTICATE and self.session and not self._exchange:
+            self._exchange = self.wire.exchange(self._method)
+            problem = "" if self._exchange else "its authentication method is not offered any more"
+        elif code == ReasonCode.CONTINUE_AUTHENTICATION and self._exchange:
+            problem = ""
+        else:
+            problem = f"AUTH 0x{code:02X} {'in' if self._exchange else 'without'} an authentication"
+        if problem or self._exchange is None:
+            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, problem)
+        self._authenticate(self._exchange, properties)
+
+    def _authenticate(self, exchange: Exchange, properties: Properties) -> None:
+        data = properties.get(Property.AUTHENTICATION_DATA, b"")
+        assert isinstance(data, bytes)
+        outcome = exchange.step(data)
+        if isinstance(outcome, bytes):
+            answer = self._authentication(outcome)
+            self._send(Auth(ReasonCode.CONTINUE_AUTHENTICATION, answer))  # [MQTT-4.12.0-2]
+            return
+        self._exchange = None
+        session = self.session
+        if isinstance(outcome, Refusal):
+            if session is None:  # [MQTT-4.12.0-4]
+                self.refuse(outcome.code, outcome.reason)
+            else:  # [MQTT-4.12.1-2]
+                self.close(outcome.code, f"it did not authenticate again: {outcome.reason}")
+        elif session is None:
+            self.accept(outcome.username, self._authentication(outcome.data))
+        elif session.identity is None or session.identity.username != outcome.username:
+            self.close(ReasonCode.NOT_AUTHORIZED, "it authenticated again as somebody else")
+        else:
+            self._send(Auth(ReasonCode.SUCCESS, self._authentication(outcome.data)))
+
+    def _authentication(self, data: bytes) -> Properties:
+        properties: Properties = {Property.AUTHENTICATION_METHOD: self._method}
+        if data:
+            properties[Property.AUTHENTICATION_DATA] = data
+        return properties
 
     def refuse(self, code: ReasonCode, reason: str) -> None:
         """Answer CONNECT with the code and close; nothing that came behind it has any effect."""
@@ -333,10 +411,10 @@ class Client:
             return
         user = self._connect.username if self._connect else None
         name = self._connect.client_id if self._connect else ""
-        log.warning(
-            "client '%s' (%s) at %s refused: %s",
-            name,
-            f"user '{user}'" if user is not None else "no user name",
+        self._complain(
+            "client %s (%s) at %s refused: %s",
+            quote(name),
+            f"user {quote(user)}" if user is not None else "no user name",
             self.wire.address,
             reason,
         )
@@ -344,102 +422,66 @@ class Client:
         self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
 
-    def accept(self, username: str | None) -> None:
-        """The client is who it says: open its session, send CONNACK, read on."""
+    def accept(self, username: str | None, authentication: Properties | None = None) -> None:
+        """The client is who it says: open its session, send CONNACK, read on.
+
+        `authentication` goes into the CONNACK: the end of an enhanced authentication.
+        """
         packet, self._connect = self._connect, None
         if self._closed or packet is None:
             return
         assigned = None if packet.client_id else f"auto-{secrets.token_hex(12)}"
         identity = Identity(username, assigned or packet.client_id)
-        options = self._options(packet)
         try:
+            agreement = agree(packet, self.broker.limits)
             session, present = self.broker.connect(
                 self,
                 identity,
                 clean_start=packet.clean_start,
-                expiry=options.expiry,
-                will=self._will(packet),
+                expiry=agreement.expiry,
+                will=pending_will(packet),
             )
         except ProtocolError as error:
             self._connect = packet
             self.refuse(error.code, str(error))
             return
-        session.window = options.window
+        self.wire.accepted()
+        session.window = agreement.window
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         self.session = session
-        self._maximum_packet_size = options.maximum_packet_size
-        self._silence = 1.5 * options.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
+        self._maximum_packet_size = agreement.maximum_packet_size
+        self._alias_maximum = agreement.aliases
+        self._aliases = {} if agreement.aliases else None
+        self._mirrors = not (agreement.maximum_packet_size or agreement.aliases)
+        self._explain = agreement.explain and self.broker.features.reason_strings
+        self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
         self._heard_at = self._ledger.now
         self.connection.accept()
         counters = self._counters
         counters.connects += 1
         self.broker.clients.add(self)
         counters.clients_maximum = max(counters.clients_maximum, len(self.broker.clients))
-        properties = self._connack_properties(packet, assigned, options)
+        properties = connack_properties(
+            packet,
+            agreement,
+            identity,
+            self.broker.limits,
+            self.broker.features,
+            authentication or {},
+        )
         self._send(Connack(present, ReasonCode.SUCCESS, properties))
+        if self._closed:
+            return
         log.info(
             "%s connected: MQTT %s, keep alive %d s%s",
             self,
             "5" if packet.version == 5 else "3.1.1",
-            options.keep_alive,
+            agreement.keep_alive,
             ", session continued" if present else "",
         )
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
-
-    def _options(self, packet: Connect) -> ConnectOptions:
-        properties = packet.properties or {}
-        limits = self.broker.limits
-        expiry = properties.get(Property.SESSION_EXPIRY_INTERVAL, 0)
-        if packet.version != 5:
-            expiry = 0 if packet.clean_start else limits.session_expiry
-        window = properties.get(Property.RECEIVE_MAXIMUM, 65535)
-        size = properties.get(Property.MAXIMUM_PACKET_SIZE, 0)
-        assert isinstance(expiry, int) and isinstance(window, int) and isinstance(size, int)
-        return ConnectOptions(
-            keep_alive=self._keep_alive(packet.keep_alive),
-            expiry=min(expiry, limits.session_expiry),
-            window=min(window, limits.inflight),
-            maximum_packet_size=size,
-        )
-
-    def _keep_alive(self, asked: int) -> int:
-        """Seconds, 0 for none; only a limit below the protocol's own caps what was asked for."""
-        limit = self.broker.limits.keep_alive
-        return asked if limit == 0xFFFF else min(asked or limit, limit)
-
-    def _connack_properties(
-        self, packet: Connect, assigned: str | None, options: ConnectOptions
-    ) -> Properties | None:
-        """What the client must know to keep within the limits, in mosquitto's order."""
-        if packet.version != 5:
-            return None
-        limits = self.broker.limits
-        properties: Properties = {}
-        if limits.topic_alias:
-            properties[Property.TOPIC_ALIAS_MAXIMUM] = limits.topic_alias
-        if assigned is not None:  # [MQTT-3.2.2-16]
-            properties[Property.ASSIGNED_CLIENT_IDENTIFIER] = assigned
-        if packet.keep_alive != options.keep_alive:  # [MQTT-3.1.2-21]
-            properties[Property.SERVER_KEEP_ALIVE] = options.keep_alive
-        asked = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL, 0)
-        if asked != options.expiry:
-            properties[Property.SESSION_EXPIRY_INTERVAL] = options.expiry
-        properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size
-        properties[Property.RECEIVE_MAXIMUM] = limits.inflight
-        properties[Property.SHARED_SUBSCRIPTION_AVAILABLE] = 0
-        return properties
-
-    def _will(self, packet: Connect) -> PendingWill | None:
-        will = packet.will
-        if will is None:
-            return None
-        properties = dict(will.properties or {})
-        delay = properties.pop(Property.WILL_DELAY_INTERVAL, 0)
-        assert isinstance(delay, int)
-        message = Message(will.topic, will.payload, will.qos, will.retain, properties or None)
-        return PendingWill(message, delay)
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
@@ -469,8 +511,10 @@ class Client:
         out = self._out
         if not out:
             self.broker.unflushed.append(self)
-        if version == 5 and (subscription_ids or message.expires_at is not None):
-            out.append(message.encode_for(first, packet_id, subscription_ids, self._ledger.now))
+        if version == 5 and (
+            subscription_ids or message.expires_at is not None or self._aliases is not None
+        ):
+            out.append(self._encode(first, packet_id, message, subscription_ids))
         else:
             if message.wire_key == version << 8 | first:
                 out.append(message.wire_head)
@@ -478,7 +522,9 @@ class Client:
                 out.append(message.head(version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
-                out.append(message.payload if version == 4 else message.tail(5))
+                if version == 5:
+                    out.append(message.properties_wire)
+                out.append(message.payload)
         self._out_size += len(out[-1])
         if self._out_size > OUTPUT_LIMIT:
             self._full = True
@@ -489,7 +535,7 @@ class Client:
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
-        if version != self._version or not self.writable or self._maximum_packet_size:
+        if version != self._version or not self.writable or not self._mirrors:
             return False
         out = self._out
         if not out:
@@ -499,6 +545,24 @@ class Client:
         counters.publish_sent += 1
         counters.publish_bytes_sent += payload_size
         return True
+
+    def _encode(
+        self, first: int, packet_id: int, message: Message, subscription_ids: list[int] | None
+    ) -> bytes:
+        """An MQTT 5 packet with what is this client's own: the slow way."""
+        alias, named = 0, True
+        aliases = self._aliases
+        if aliases is not None:
+            alias = aliases.get(message.topic, 0)
+            if alias:
+                named = False
+            elif len(aliases) < self._alias_maximum and (
+                not self._maximum_packet_size or message.size < self._maximum_packet_size
+            ):
+                alias = aliases[message.topic] = len(aliases) + 1
+        return message.encode_for(
+            first, packet_id, subscription_ids, self._ledger.now, alias, named=named
+        )
 
     def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
         limit = self._maximum_packet_size
@@ -510,8 +574,14 @@ class Client:
         """Send a PUBREL."""
         self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
 
-    def _acknowledge(self, first: int, packet_id: int, code: int) -> None:
-        """Send PUBACK, PUBREC, PUBREL or PUBCOMP in its shortest form."""
+    def _acknowledge(self, first: int, packet_id: int, code: int, reason: str = "") -> None:
+        """Send PUBACK, PUBREC, PUBREL or PUBCOMP in its shortest form.
+
+        `reason` is for a refusal, and for clients that are to be told.
+        """
+        if code >= 0x80 and self._explain and reason:
+            self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
+            return
         out = self._out
         if not out:
             self.broker.unflushed.append(self)
@@ -522,10 +592,27 @@ class Client:
         self._counters.control_sent += 1
 
     def _send(self, packet: Packet) -> None:
+        data = packet.encode(self._version or 4)
+        limit = self._maximum_packet_size
+        if limit and len(data) > limit:  # [MQTT-3.1.2-24]
+            self._cannot_send(packet)
+            return
         if not self._out:
             self.broker.unflushed.append(self)
-        self._out.append(packet.encode(self._version or 4))
+        self._out.append(data)
         self._counters.control_sent += 1
+
+    def _cannot_send(self, packet: Packet) -> None:
+        """A packet is larger than the client takes: it goes without its words, or not at all."""
+        if isinstance(packet, Puback | Pubrec | Suback | Disconnect) and packet.properties:
+            packet.properties = None  # [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.14.2-3]
+            self._send(packet)
+        elif isinstance(packet, Connack):
+            log.warning("%s: its Maximum Packet Size is too small for a CONNACK", self)
+            self.lost()
+        elif not isinstance(packet, Disconnect):
+            reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
+            self.close(ReasonCode.PACKET_TOO_LARGE, reason)
 
     def flush(self) -> None:
         """Write what was sent since the last flush, and close if it was the last."""
@@ -552,14 +639,22 @@ class Client:
     def resume_writing(self) -> None:
         """The network takes bytes again: send what waited."""
         self.writable = True
-        if self.session is not None:
+        self.send_on()
+
+    def later(self) -> None:
+        """Let the other clients have their turn."""
+        self.wire.later()
+
+    def send_on(self) -> None:
+        """Send what waits, as far as the client takes it."""
+        if self.session is not None and self.session.link is self:
             self.session.pump()
 
     # --- the end -------------------------------------------------------------------------------
 
     def fail(self, error: ProtocolError) -> None:
         """The client broke the protocol: tell it why, where it can be told, and close."""
-        log.warning("%s broke the protocol: %s (0x%02X)", self, error, error.code)
+        self._complain("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
             # Before CONNECT there is nothing to answer; a CONNECT of an unknown version gets the
             # refusal in the form that every version can read [MQTT-3.1.2-2].
@@ -567,15 +662,23 @@ class Client:
                 self._send(Connack(False, error.code))
             self._shut()
         else:
-            self.close(error.code, "")
+            self._end(error.code, str(error))
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
-        if message:
-            log.info("%s: connection closed: %s", self, message)
+        log.info("%s: connection closed: %s", self, message)
+        self._end(reason, message)
+
+    def _end(self, reason: ReasonCode, message: str) -> None:
         if self._version == 5:
-            self._send(Disconnect(reason))
+            words: Properties | None = {Property.REASON_STRING: message} if self._explain else None
+            self._send(Disconnect(reason, words))
         self._leave(publish_will=True)
+
+    def _complain(self, message: str, *args: object) -> None:
+        """Log what came from the client's address, unless it is a flood."""
+        host, _, _ = self.wire.address.rpartition(":")
+        self.broker.complaints.tell(self._ledger.now, (host, message), message, *args)
 
     def lost(self) -> None:
         """The connection ended without a DISCONNECT."""

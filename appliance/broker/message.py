@@ -17,6 +17,10 @@ OVERHEAD = 512
 PAIR_OVERHEAD = 160
 
 
+#: Payloads from this size on, in bytes, are not kept a second time while a message waits.
+LARGE = 1024
+
+
 class Message:
     """An application message; immutable by convention, shared by all sessions that it is owed to.
 
@@ -26,7 +30,7 @@ class Message:
 
     __slots__ = (
         "_heads",
-        "_tail5",
+        "_properties_wire",
         "expires_at",
         "payload",
         "properties",
@@ -61,7 +65,7 @@ class Message:
         self.wire_key = 0
         self.wire_head = b""
         self._heads: dict[int, bytes] | None = None
-        self._tail5: bytes | None = None
+        self._properties_wire: bytes | None = None
         #: Bytes that a queue counts for this message.
         self.size = len(payload) + len(self.topic_wire) + OVERHEAD
         if properties:
@@ -78,37 +82,59 @@ class Message:
             self._heads = {}
         head = self._heads.get(key)
         if head is None:
-            tail = self.tail(version)
             packet_id = 2 if first & 0x06 else 0
-            size = len(self.topic_wire) + packet_id + len(tail)
+            properties = self.properties_wire if version == 5 else b""
+            size = len(self.topic_wire) + packet_id + len(properties) + len(self.payload)
             head = bytes((first,)) + encode_varint(size) + self.topic_wire
             if not packet_id:
-                head += tail
+                head += properties + self.payload
+                if len(self.payload) >= LARGE:
+                    return head
             self._heads[key] = head
         return head
 
-    def tail(self, version: int) -> bytes:
-        """The packet's bytes behind the packet id: in MQTT 5 the properties, and the payload."""
-        if version != 5:
-            return self.payload
-        if self._tail5 is None:
-            self._tail5 = encode_properties(self.properties) + self.payload
-        return self._tail5
+    @property
+    def properties_wire(self) -> bytes:
+        """The properties as they stand in an MQTT 5 packet, between packet id and payload."""
+        if self._properties_wire is None:
+            self._properties_wire = encode_properties(self.properties) if self.properties else b"\0"
+        return self._properties_wire
+
+    def settle(self) -> None:
+        """The message is going to wait: what can be encoded again is not kept, if it is large."""
+        if len(self.payload) >= LARGE:
+            if self.wire_key & 0x06 == 0:  # QoS 0: the whole packet
+                self.wire_key = 0
+                self.wire_head = b""
+            self._heads = None
 
     def encode_for(
-        self, first: int, packet_id: int, subscription_ids: list[int] | None, now: float
+        self,
+        first: int,
+        packet_id: int,
+        subscription_ids: list[int] | None,
+        now: float,
+        alias: int = 0,
+        *,
+        named: bool = True,
     ) -> bytes:
         """A whole MQTT 5 packet with what differs a receiver: the slow way.
 
-        Subscription identifiers of the receiver [MQTT-3.3.4-3], and the time that is left of the
-        expiry interval [MQTT-3.3.2-6].
+        Subscription identifiers of the receiver [MQTT-3.3.4-3], its alias for the topic, which
+        stands for the name when not `named`, and the time that is left of the expiry interval
+        [MQTT-3.3.2-6]. The properties are in mosquitto's order.
         """
-        properties = dict(self.properties or {})
+        properties: Properties = {}
+        if alias:
+            properties[Property.TOPIC_ALIAS] = alias
         if subscription_ids:
             properties[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
+        properties |= self.properties or {}
         if self.expires_at is not None:
-            properties[Property.MESSAGE_EXPIRY_INTERVAL] = max(0, round(self.expires_at - now))
-        body = self.topic_wire
+            del properties[Property.MESSAGE_EXPIRY_INTERVAL]
+            left = max(0, round(self.expires_at - now))
+            properties[Property.MESSAGE_EXPIRY_INTERVAL] = left
+        body = self.topic_wire if named else b"\0\0"
         if first & 0x06:
             body += packet_id.to_bytes(2, "big")
         body += encode_properties(properties) + self.payload

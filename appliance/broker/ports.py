@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
+from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 
@@ -31,8 +32,8 @@ class Identity:
     client_id: str
 
     def __str__(self) -> str:
-        user = "anonymous" if self.username is None else f"user '{self.username}'"
-        return f"client '{self.client_id}' ({user})"
+        user = "anonymous" if self.username is None else f"user {quote(self.username)}"
+        return f"client {quote(self.client_id)} ({user})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +109,9 @@ class Link(Protocol):
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""
 
+    def later(self) -> None:
+        """Call `Session.pump` once more when the other clients have had their turn."""
+
     def close(self, reason: ReasonCode, message: str) -> None:
         """Tell the client why, where the protocol can, and end the connection."""
 
@@ -172,10 +176,24 @@ class Observer(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Features:
+    """What the standard leaves to the server's operator; see `broker` in appliance.yaml."""
+
+    check_payload_format: bool = False
+    reason_strings: bool = False
+    #: With %c and %u for the client id and the user name; empty for none.
+    response_information: str = ""
+
+
+#: The largest packet that a client can count on without being told, in bytes.
+USUAL_PACKET_SIZE = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
 class Limits:
     """Bounds of everything that a client can make grow; see `broker.limits` in appliance.yaml."""
 
-    packet_size: int = 16 * 1024 * 1024
+    packet_size: int = USUAL_PACKET_SIZE
     memory: int = 256 * 1024 * 1024
     queue_messages: int = 1000
     queue_bytes: int = 16 * 1024 * 1024

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -14,9 +15,24 @@ from appliance.mqtt.reason import ReasonCode
 
 if TYPE_CHECKING:
     from appliance.broker.broker import Route
+    from appliance.broker.shared import Share
 
-#: message, QoS, retain flag, subscription identifiers of the subscriptions that matched
-Delivery: TypeAlias = "tuple[Message, int, bool, list[int] | None]"
+#: message, QoS, retain flag, subscription identifiers of the subscriptions that matched, and the
+#: shared subscription that chose this session among others
+Delivery: TypeAlias = "tuple[Message, int, bool, list[int] | None, Share | None]"
+
+#: Retained messages that a new subscription is sent in one turn of the event loop, and those it may
+#: not see that are passed over: some milliseconds, then it is the turn of other clients.
+REPLAYED_A_TURN = 512
+
+#: What a subscription takes, roughly, in bytes: itself, and each level that its filter has.
+SUBSCRIPTION_SIZE = 600
+LEVEL_SIZE = 350
+
+
+def subscription_size(topic_filter: str) -> int:
+    """Bytes that are counted for a subscription."""
+    return SUBSCRIPTION_SIZE + len(topic_filter) + LEVEL_SIZE * topic_filter.count("/")
 
 
 @dataclass(slots=True)
@@ -59,8 +75,10 @@ class Ledger:
     counters: Counters = field(default_factory=Counters)
     #: Seconds of the clock that `Broker.tick` was last given.
     now: float = 0.0
-    #: Bytes that the queues of all sessions hold.
+    #: Bytes that the queues, subscriptions and wills of all sessions hold, and the output buffers.
     queued_bytes: int = 0
+    #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
+    overflowed: list[Session] = field(default_factory=list)
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     memory: int = field(init=False)
@@ -68,6 +86,17 @@ class Ledger:
     def __post_init__(self) -> None:
         self.queue_bytes = self.limits.queue_bytes
         self.memory = self.limits.memory
+
+
+#: Keys for messages that wait, in the order of their coming.
+_NUMBERS = itertools.count()
+
+
+class Held(NamedTuple):
+    """A QoS 2 message that waits for PUBREL, and who had no room for it at its PUBREC."""
+
+    message: Message
+    full: frozenset[Session | Share]
 
 
 class PendingWill(NamedTuple):
@@ -97,12 +126,13 @@ class Session:
         "ledger",
         "link",
         "queue",
+        "readable",
+        "readable_epoch",
         "received",
         "replays",
         "resends",
         "routes",
         "subscriptions",
-        "told_full_at",
         "will",
         "will_at",
         "window",
@@ -127,14 +157,16 @@ class Session:
         self.queue: deque[Delivery] = deque()
         #: Retained messages of new subscriptions, by filter; they go before anything newer. They
         #: are looked up when their turn comes, so that a slow client's take no memory.
-        self.replays: dict[str, Iterator[Delivery]] = {}
-        #: QoS 0, waiting for a slow client: the newest of each topic.
-        self.latest: dict[str, Delivery] = {}
+        self.replays: dict[str, Iterator[Delivery | None]] = {}
+        #: QoS 0, waiting for a slow client, oldest first: the newest of each topic, or by number
+        #: when the limit `keep` says how many.
+        self.latest: dict[str | int, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
-        self.received: dict[int, Message] = {}
+        self.received: dict[int, Held] = {}
         self.bytes = 0
-        #: The clock when the log was last told that the queue is full; None before that.
-        self.told_full_at: float | None = None
+        #: Topics that the client may receive, or not; valid while the epoch is the access rules'.
+        self.readable: dict[str, bool] = {}
+        self.readable_epoch = -1
         #: Where this session's messages go, by topic; valid while `epoch` is the broker's.
         self.routes: dict[bytes, Route] = {}
         self.epoch = -1
@@ -150,8 +182,25 @@ class Session:
 
     # --- towards the client -------------------------------------------------------------------
 
+    @property
+    def ready(self) -> bool:
+        """Whether a message would be on its way at once."""
+        link = self.link
+        return (
+            link is not None
+            and link.writable
+            and not self.queue
+            and not self.latest
+            and len(self.inflight) < self.window
+        )
+
     def deliver(
-        self, message: Message, qos: int, retain: bool, subscription_ids: list[int] | None
+        self,
+        message: Message,
+        qos: int,
+        retain: bool,
+        subscription_ids: list[int] | None,
+        share: Share | None = None,
     ) -> bool:
         """Send the message, or keep it for later; False when it was dropped, and counted."""
         link = self.link
@@ -161,8 +210,8 @@ class Session:
             if link.writable:  # then replays wait for the window only, which is no matter of QoS 0
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
-            return self._keep_latest((message, 0, retain, subscription_ids))
-        # `_has_room` and `_count`, written out here and in `_send`: two calls less a message.
+            return self._keep_latest((message, 0, retain, subscription_ids, share))
+        # `_fits` and `_count`, written out here and in `_send`: two calls less a message.
         ledger = self.ledger
         size = message.size
         if self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory:
@@ -175,18 +224,60 @@ class Session:
             ):
                 if self.expiry:
                     self._owe(message, qos)
-                self._send(link, (message, qos, retain, subscription_ids))
+                self._send(link, (message, qos, retain, subscription_ids, share))
                 return True
             if len(self.queue) < ledger.limits.queue_messages:
-                self._count(message)
-                self.queue.append((message, qos, retain, subscription_ids))
-                self._owe(message, qos)
+                self._enqueue((message, qos, retain, subscription_ids, share))
                 return True
+        if ledger.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
+            self._enqueue((message, qos, retain, subscription_ids, share))
+            return True
+        if ledger.limits.queue_full == "disconnect" and link is not None:
+            ledger.overflowed.append(self)
         ledger.counters.publish_dropped += 1
         return False
 
-    def replay(self, topic_filter: str, deliveries: Iterator[Delivery]) -> None:
-        """Send retained messages, behind those before them; asked for again, they begin anew."""
+    def deliver_promised(self, delivery: Delivery) -> None:
+        """Deliver a QoS 2 message that there was room for at its PUBREC, though it is gone now.
+
+        PUBREL cannot be refused. What is kept like this above the limits is no more than what all
+        publishers have between PUBREC and PUBREL.
+        """
+        if not self.deliver(*delivery):
+            self.ledger.counters.publish_dropped -= 1
+            self._enqueue(delivery)
+
+    def has_room(self, message: Message) -> bool:
+        """Whether a QoS 1 or 2 message would be kept."""
+        limits = self.ledger.limits
+        return limits.queue_full == "drop-oldest" or (
+            len(self.queue) < limits.queue_messages and self._fits(message)
+        )
+
+    def _enqueue(self, delivery: Delivery) -> None:
+        message = delivery[0]
+        message.settle()
+        self._count(message)
+        self.queue.append(delivery)
+        self._owe(message, delivery[1])
+
+    def _drop_oldest_for(self, message: Message) -> bool:
+        """Make room at the old end of the queue; False when even then there is none."""
+        ledger = self.ledger
+        while self.queue and not (
+            len(self.queue) < ledger.limits.queue_messages and self._fits(message)
+        ):
+            oldest = self.queue.popleft()
+            self._uncount(oldest[0])
+            self._settled(oldest[0], oldest[1])
+            ledger.counters.publish_dropped += 1
+        return self._fits(message)
+
+    def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
+        """Send retained messages, behind those before them; asked for again, they begin anew.
+
+        None among the deliveries is a message that is not for this session.
+        """
         self.replays.pop(topic_filter, None)
         self.replays[topic_filter] = deliveries
         self.pump()
@@ -198,8 +289,8 @@ class Session:
             return
         if self.resends:
             self._pump_resends(link)
-        if self.replays and not self.resends:
-            self._pump_replays(link)
+        if self.replays and not self.resends and not self._pump_replays(link):
+            link.later()
         if not self.replays and not self.resends:
             self._pump_queue(link)
         if self.latest:
@@ -212,23 +303,32 @@ class Session:
             packet_id = resends.popleft()
             delivery = self.inflight.get(packet_id)
             if delivery is not None:
-                message, qos, retain, subscription_ids = delivery
+                message, qos, retain, subscription_ids, _ = delivery
                 link.publish(message, qos, packet_id, True, retain, subscription_ids)
 
-    def _pump_replays(self, link: Link) -> None:
+    def _pump_replays(self, link: Link) -> bool:
+        """Send retained messages; False when there are more than one turn is for."""
+        left = REPLAYED_A_TURN
         for topic_filter, deliveries in list(self.replays.items()):
             needs_window = self.subscriptions[topic_filter].qos > 0  # QoS 0 does not [MQTT-3.3.4-8]
             while link.writable and not (needs_window and len(self.inflight) >= self.window):
-                delivery = next(deliveries, None)
-                if delivery is None:
+                if not left:
+                    return False
+                left -= 1
+                try:
+                    delivery = next(deliveries)
+                except StopIteration:
                     del self.replays[topic_filter]
                     break
-                message, qos, retain, subscription_ids = delivery
+                if delivery is None:
+                    continue
+                message, qos, retain, subscription_ids, _ = delivery
                 if qos:
                     self._owe(message, qos)
                     self._send(link, delivery)
                 else:
                     link.publish(message, 0, 0, False, retain, subscription_ids)
+        return True
 
     def _pump_queue(self, link: Link) -> None:
         while self.queue and link.writable and len(self.inflight) < self.window:
@@ -260,7 +360,7 @@ class Session:
         self.pump()
 
     def _send(self, link: Link, delivery: Delivery) -> None:
-        message, qos, retain, subscription_ids = delivery
+        message, qos, retain, subscription_ids, _ = delivery
         inflight = self.inflight
         packet_id = self._last_packet_id % 65535 + 1
         while packet_id in inflight:  # [MQTT-2.2.1-3]
@@ -273,26 +373,36 @@ class Session:
 
     def _pump_latest(self, link: Link) -> None:
         while self.latest and link.writable:
-            topic = next(iter(self.latest))
-            message, _, retain, subscription_ids = self.latest.pop(topic)
+            oldest = next(iter(self.latest))
+            message, _, retain, subscription_ids, _ = self.latest.pop(oldest)
             self._uncount(message)
             if not self._has_expired(message):
                 link.publish(message, 0, 0, False, retain, subscription_ids)
 
     def _keep_latest(self, delivery: Delivery) -> bool:
         message = delivery[0]
-        replaced = self.latest.pop(message.topic, None)
+        limits = self.ledger.limits
+        replaced: Delivery | None = None
+        key: str | int = message.topic
+        if limits.keep:
+            key = next(_NUMBERS)
+            if len(self.latest) >= limits.keep:
+                replaced = self.latest.pop(next(iter(self.latest)))
+        else:
+            replaced = self.latest.pop(key, None)
         if replaced is not None:
             self._uncount(replaced[0])
             self.ledger.counters.publish_dropped += 1
-        if len(self.latest) < self.ledger.limits.queue_messages and self._has_room(message):
+        room = limits.keep or len(self.latest) < limits.queue_messages
+        if room and self._fits(message):
+            message.settle()
             self._count(message)
-            self.latest[message.topic] = delivery
+            self.latest[key] = delivery
             return True
         self.ledger.counters.publish_dropped += 1
         return False
 
-    def _has_room(self, message: Message) -> bool:
+    def _fits(self, message: Message) -> bool:
         ledger = self.ledger
         size = message.size
         return (
@@ -369,36 +479,98 @@ class Session:
 
     # --- QoS 2 from the client -----------------------------------------------------------------
 
-    def hold(self, packet_id: int, message: Message) -> bool:
+    def hold(self, packet_id: int, held: Held) -> bool:
         """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
-        if not self._has_room(message):
+        if not self._fits(held.message):
             return False
-        self.received[packet_id] = message
-        self._count(message)
+        held.message.settle()
+        self.received[packet_id] = held
+        self._count(held.message)
         return True
 
-    def unhold(self, packet_id: int) -> Message | None:
+    def unhold(self, packet_id: int) -> Held | None:
         """The message that PUBREL releases, once."""
-        message = self.received.pop(packet_id, None)
-        if message is not None:
-            self._uncount(message)
-        return message
+        held = self.received.pop(packet_id, None)
+        if held is not None:
+            self._uncount(held.message)
+        return held
+
+    # --- subscriptions and the will ------------------------------------------------------------
+
+    def subscribe(self, subscription: Subscription) -> None:
+        """Count and keep a subscription; it takes the place of one with the same filter."""
+        if subscription.filter not in self.subscriptions:
+            self._take(subscription_size(subscription.filter))
+        self.subscriptions[subscription.filter] = subscription
+
+    def unsubscribe(self, topic_filter: str) -> bool:
+        """Forget a subscription; False when there is none."""
+        if self.subscriptions.pop(topic_filter, None) is None:
+            return False
+        self.replays.pop(topic_filter, None)
+        self._take(-subscription_size(topic_filter))
+        return True
+
+    def set_will(self, will: PendingWill | None) -> PendingWill | None:
+        """Keep a will, or none; returns the one before."""
+        before, self.will = self.will, will
+        self._take((will.message.size if will else 0) - (before.message.size if before else 0))
+        return before
+
+    def fits(self, size: int) -> bool:
+        """Whether the session may take so many bytes more."""
+        ledger = self.ledger
+        return (
+            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
+        )
+
+    def _take(self, size: int) -> None:
+        self.bytes += size
+        self.ledger.queued_bytes += size
+
+    def take_shared(self, share: Share | None, *, sent: bool) -> list[Delivery]:
+        """Give up what a shared subscription (None: each of them) gave this session.
+
+        With `sent` also what is in flight with QoS 1: another member may get it a second time.
+        QoS 2 stays [MQTT-4.8.2-4], [MQTT-4.8.2-5].
+        """
+
+        def is_meant(delivery: Delivery) -> bool:
+            return delivery[4] is not None and share in (None, delivery[4])
+
+        taken: list[Delivery] = []
+        if sent:
+            for packet_id, delivery in list(self.inflight.items()):
+                if delivery is not None and delivery[1] == 1 and is_meant(delivery):
+                    self.give_up(packet_id)
+                    taken.append(delivery)
+        queued = [delivery for delivery in self.queue if is_meant(delivery)]
+        if queued:
+            self.queue = deque(delivery for delivery in self.queue if not is_meant(delivery))
+            for delivery in queued:
+                self._uncount(delivery[0])
+                self._settled(delivery[0], delivery[1])
+        return taken + queued
 
     # --- the session's end, and a change of rules ---------------------------------------------
 
     def revoke(self, allowed: Callable[[str], bool]) -> int:
         """Drop what waits and may no longer be received; returns how many messages."""
         dropped = 0
-        for delivery in list(self.queue):
-            message, qos, _, _ = delivery
-            if not allowed(message.topic):
-                self.queue.remove(delivery)
+        kept: deque[Delivery] = deque()
+        for delivery in self.queue:
+            message, qos = delivery[:2]
+            if allowed(message.topic):
+                kept.append(delivery)
+            else:
                 self._uncount(message)
                 self._settled(message, qos)
                 dropped += 1
-        for topic in [topic for topic in self.latest if not allowed(topic)]:
-            self._uncount(self.latest.pop(topic)[0])
-            dropped += 1
+        self.queue = kept
+        for key, delivery in list(self.latest.items()):
+            if not allowed(delivery[0].topic):
+                self._uncount(self.latest.pop(key)[0])
+                dropped += 1
         self.ledger.counters.publish_dropped += dropped
         return dropped
 
@@ -411,11 +583,14 @@ class Session:
             if not self.subscriptions[topic_filter].qos:
                 del self.replays[topic_filter]
         self.routes.clear()
+        self.readable.clear()
 
     def clear(self) -> None:
-        """Give back what all queues of this session hold."""
+        """Give back all that this session holds."""
         self.ledger.queued_bytes -= self.bytes
         self.bytes = 0
+        self.will = None
+        self.subscriptions.clear()
         for waiting in (self.queue, self.latest, self.inflight, self.received):
             waiting.clear()
         self.resends.clear()

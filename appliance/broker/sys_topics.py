@@ -85,7 +85,7 @@ class SysTopics:
             "bytes/received": counters.bytes_received,
             "bytes/sent": counters.bytes_sent,
             "subscriptions/count": broker.subscription_count,
-            "shared_subscriptions/count": 0,
+            "shared_subscriptions/count": broker.shared_subscription_count,
             "retained messages/count": len(broker.retained),
             "store/messages/count": stored,
             "heap/current": self._heap(),

@@ -54,7 +54,8 @@ class State(Enum):
 # [MQTT-3.1.0-1], [MQTT-3.1.0-2]
 _LEGAL: dict[State, frozenset[PacketType]] = {
     State.NEW: frozenset({PacketType.CONNECT}),
-    State.AUTHENTICATING: frozenset({PacketType.AUTH}),
+    # [MQTT-3.1.2-30]
+    State.AUTHENTICATING: frozenset({PacketType.AUTH, PacketType.DISCONNECT}),
     State.CONNECTED: frozenset(
         {
             PacketType.PUBLISH,

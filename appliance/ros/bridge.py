@@ -326,5 +326,8 @@ class _Link:
     def pubrel(self, packet_id: int) -> None:
         """Its subscriptions are of QoS 0."""
 
+    def later(self) -> None:
+        """It asks for no retained messages, so that there is nothing to go on with."""
+
     def close(self, reason: ReasonCode, message: str) -> None:
         """There is no connection to close."""

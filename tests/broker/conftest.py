@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.broker.broker import Broker
+from appliance.broker.broker import Broker, retained_size
 from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
-from appliance.broker.session import Session
+from appliance.broker.session import Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
@@ -129,6 +129,9 @@ class FakeWire:
 
     def exchange(self, method: str) -> Exchange | None:
         return self.exchanges.pop(method, None)
+
+    def accepted(self) -> None:
+        assert not self.closed
 
     def later(self) -> None:
         self.laters += 1
@@ -348,24 +351,37 @@ def lasting(version: int, seconds: int = 3600) -> dict[str, object]:
     return {"clean": False}
 
 
-def queued_bytes(session: Session) -> int:
-    """What the session's queues hold, counted anew."""
+def waiting_bytes(broker: Broker) -> int:
+    """What the broker has counted for messages that wait: subscriptions and wills not among it."""
+    rest = sum(
+        sum(map(subscription_size, session.subscriptions))
+        + (session.will.message.size if session.will is not None else 0)
+        for session in broker.sessions.values()
+    )
+    return broker.ledger.queued_bytes - rest
+
+
+def held_bytes(session: Session) -> int:
+    """All that the session holds, counted anew."""
     waiting = [delivery[0] for delivery in (*session.queue, *session.latest.values())]
     waiting += [delivery[0] for delivery in session.inflight.values() if delivery is not None]
-    waiting += session.received.values()
-    return sum(message.size for message in waiting)
+    waiting += [held.message for held in session.received.values()]
+    if session.will is not None:
+        waiting.append(session.will.message)
+    subscriptions = sum(map(subscription_size, session.subscriptions))
+    return sum(message.size for message in waiting) + subscriptions
 
 
 def check_accounts(broker: Broker) -> None:
     """The sums that the broker keeps are those of what it holds."""
     total = 0
     for session in broker.sessions.values():
-        assert session.bytes == queued_bytes(session), session
+        assert session.bytes == held_bytes(session), session
         total += session.bytes
     assert broker.ledger.queued_bytes == total
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
-    assert broker.retained_bytes == sum(message.size for message in retained)
+    assert broker.retained_bytes == sum(retained_size(message) for message in retained)
 
 
 @pytest.fixture

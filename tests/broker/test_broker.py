@@ -25,7 +25,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import FakeAccess, FakeStore, Join, Peer, lasting
+from .conftest import FakeAccess, FakeStore, Join, Peer, lasting, waiting_bytes
 
 EXPIRY = Property.SESSION_EXPIRY_INTERVAL
 MESSAGE_EXPIRY = Property.MESSAGE_EXPIRY_INTERVAL
@@ -156,8 +156,9 @@ def test_clients_do_not_publish_to_topics_that_begin_with_a_dollar(join: Join):
 def test_no_subscriber_is_told_to_a_5_0_publisher(join: Join):
     """5.0 section 3.4.2.1"""
     publisher = join("publisher")
-    for qos in (1, 2):
-        assert publisher.publish("nobody", b"", qos) == ReasonCode.NO_MATCHING_SUBSCRIBERS
+    assert publisher.publish("nobody", b"", 1) == ReasonCode.NO_MATCHING_SUBSCRIBERS
+    # At PUBREC it is not known yet who will have subscribed at PUBREL; mosquitto says 0, too.
+    assert publisher.publish("nobody", b"", 2) == ReasonCode.SUCCESS
 
 
 def test_unsubscribe_ends_the_delivery_of_new_messages(join: Join, version):
@@ -196,10 +197,10 @@ def test_each_filter_of_a_subscribe_has_its_own_answer(join: Join, version, acce
     assert isinstance(answer, Suback)
     codes = list(answer.reason_codes)
     if version == 4:
-        assert codes == [1, 0x80, 0x80, 0x80, 0x80, 0x80, 1]
+        assert codes == [1, 0x80, 0x80, 0x80, 1, 0x80, 1]
     else:
-        assert codes == [1, 0x87, 0x8F, 0x8F, 0x9E, 0x8F, 1]
-    assert set(subscriber.session.subscriptions) == {"a", "b"}
+        assert codes == [1, 0x87, 0x8F, 0x8F, 1, 0x8F, 1]
+    assert set(subscriber.session.subscriptions) == {"a", "$share/g/a", "b"}
 
 
 def test_messages_of_one_topic_keep_their_order(join: Join, version):
@@ -560,7 +561,7 @@ def test_a_session_expires(join: Join, broker: Broker, store: FakeStore):
     broker.tick(broker.now + 1)
     assert "client" not in broker.sessions
     assert broker.counters.sessions_expired == 1
-    assert broker.ledger.queued_bytes == 0
+    assert waiting_bytes(broker) == 0
     assert "client" not in store.sessions
     back = Peer(broker)
     assert not back.connect(**lasting(5, 100)).session_present
@@ -1055,7 +1056,7 @@ def test_a_slow_client_gets_the_newest_of_each_topic(join: Join, broker: Broker)
     assert broker.counters.publish_dropped == 18
     publisher.publish("a", b"now")
     assert subscriber.payloads() == [b"now"]
-    assert broker.ledger.queued_bytes == 0
+    assert waiting_bytes(broker) == 0
 
 
 def test_what_a_slow_client_missed_ends_with_its_connection(join: Join, broker: Broker, version):
@@ -1065,7 +1066,7 @@ def test_what_a_slow_client_missed_ends_with_its_connection(join: Join, broker: 
     subscriber.slow()
     join("publisher").publish("a", b"missed")
     subscriber.lose()
-    assert broker.ledger.queued_bytes == 0
+    assert waiting_bytes(broker) == 0
     subscriber = join("subscriber", version=version, **lasting(version))
     subscriber.fast()
     assert subscriber.messages() == []
