@@ -264,7 +264,13 @@ async def running(
 
     config = configuration([("127.0.0.1:0", False)], 100, plugins)
     frame = ApplianceBroker(broker, files, config, listen, lambda: listeners.stop(), plugin_timeout)
-    listeners = Listeners(broker, frame.authenticate, connections=100, connect_timeout=PATIENCE)
+    listeners = Listeners(
+        broker,
+        frame.authenticate,
+        files.exchange,
+        connections=100,
+        connect_timeout=PATIENCE,
+    )
     rig = Rig(frame, broker, files)
     try:
         await frame.start()

@@ -190,7 +190,10 @@ class Broker:
                 )
             session = Session(identity.client_id, identity, self.ledger)
             self.sessions[identity.client_id] = session
-        session.identity = identity
+        if session.identity != identity:  # one that a plugin made has found its user
+            session.identity = identity
+            session.readable.clear()
+            self.epoch += 1
         session.link = link
         session.ends_at = None
         session.set_will(will)
