@@ -216,6 +216,14 @@ def user_add(
     config: ConfigOption = None,
     password_file: PasswordFileOption = None,
     generate: GenerateOption = False,
+    scram: Annotated[
+        bool,
+        typer.Option(
+            "--scram",
+            help="Keep the password for SCRAM-SHA-256, MQTT 5's login that does not send it; one "
+            "that sends it works too.",
+        ),
+    ] = False,
 ) -> None:
     """Add a user; the password is asked for unless an option says where it comes from."""
     with _users(config, new=True) as users:
@@ -223,7 +231,7 @@ def user_add(
             raise CommandError(
                 f"there is a user {name!r} already; `appliance user passwd` changes it"
             )
-        _set_password(users, name, password_file, generate)
+        _set_password(users, name, password_file, generate, scram)
     typer.echo(f"user {name} added to {_shown(users.path)}")
 
 
@@ -233,12 +241,20 @@ def user_passwd(
     config: ConfigOption = None,
     password_file: PasswordFileOption = None,
     generate: GenerateOption = False,
+    scram: Annotated[
+        bool | None,
+        typer.Option(
+            "--scram/--no-scram",
+            help="Keep the password for SCRAM-SHA-256, or as argon2id; else as it is kept now.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Change a user's password."""
     with _users(config) as users:
         if name not in users.users():
             raise CommandError(_no_user(name, users))
-        _set_password(users, name, password_file, generate)
+        _set_password(users, name, password_file, generate, scram)
     typer.echo(f"password of user {name} changed")
 
 
@@ -256,10 +272,12 @@ def user_remove(name: str, config: ConfigOption = None) -> None:
 
 @user_app.command("list")
 def user_list(config: ConfigOption = None) -> None:
-    """Print the users' names, one a line."""
+    """Print the users' names, one a line, and how each one's password is kept."""
     with _users(config) as users:
-        for name in users.users():
-            typer.echo(name)
+        names = users.users()
+        width = max(map(len, names), default=0)
+        for name in names:
+            typer.echo(f"{name:{width}}  {users.kind_of(name)}")
 
 
 @contextmanager
@@ -280,7 +298,9 @@ def _no_user(name: str, users: Passwords) -> str:
     return f"there is no user {name!r} in {_shown(users.path)}"
 
 
-def _set_password(users: Passwords, name: str, file: str | None, generate: bool) -> None:
+def _set_password(
+    users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
+) -> None:
     if generate and file:
         raise typer.BadParameter("--generate and --password-file exclude each other")
     if generate:
@@ -294,7 +314,7 @@ def _set_password(users: Passwords, name: str, file: str | None, generate: bool)
     else:
         raise CommandError("no terminal to ask on; use --generate or --password-file")
     try:
-        users.set(name, password)
+        users.set(name, password, scram)
     except ValueError as error:
         raise CommandError(str(error)) from None
     users.save()

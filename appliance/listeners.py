@@ -304,7 +304,6 @@ class ClientProtocol(asyncio.Protocol):
     async def _log_in(self, connect: Connect) -> None:
         tls = self._transport.get_extra_info("ssl_object") if self._transport else None
         who = await self._listeners.authenticate(connect, self.address, tls)
-        self._timeout.cancel()
         if isinstance(who, Refusal):
             self._client.refuse(who.code, who.reason)
         else:
@@ -316,15 +315,18 @@ class ClientProtocol(asyncio.Protocol):
         """Begin an enhanced authentication; None when the method is not offered."""
         return self._listeners.exchange(method)
 
+    def accepted(self) -> None:
+        """The client has logged in, and may be silent now."""
+        self._timeout.cancel()
+
     def later(self) -> None:
         """Let the others have their turn, then send on."""
         self._loop.call_soon(self._send_on)
 
     def _send_on(self) -> None:
-        if self._transport is not None and not self._transport.is_closing():
-            self._broker.ledger.now = self._loop.time()
-            self._client.resume_writing()
-            self._broker.flush()
+        self._broker.ledger.now = self._loop.time()
+        self._client.send_on()
+        self._broker.flush()
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined when small."""

@@ -219,7 +219,7 @@ def test_all_that_is_wrong_with_a_users_file_is_told_at_once(users_file: Path) -
         "set a password with: appliance user passwd erin",
         ":10:7: not a valid $7$ hash of mosquitto's (PBKDF2-SHA512); "
         "set a password with: appliance user passwd frank",
-        ":11:7: a kind of hash that is not read here ($argon2id$, $7$, $6$); "
+        ":11:7: a kind of hash that is not read here ($argon2id$, SCRAM-SHA-256$, $7$, $6$); "
         "set a password with: appliance user passwd grace",
         ":12:7: this hash costs more than one login may; "
         "set a password with: appliance user passwd heidi",
@@ -259,12 +259,15 @@ def test_an_empty_password_is_not_set(users_file: Path) -> None:
         Passwords(users_file).set("alice", "")
 
 
-@pytest.mark.parametrize("user", ["nobody", "modern", "old"])
-def test_every_refusal_costs_one_argon2id_hash(
-    users_file: Path, monkeypatch: pytest.MonkeyPatch, user: str
+@pytest.mark.parametrize("with_scram", [False, True])
+@pytest.mark.parametrize("user", ["nobody", "modern", "old", "scram"])
+def test_every_refusal_costs_one_hash_of_each_slow_kind_in_the_file(
+    users_file: Path, monkeypatch: pytest.MonkeyPatch, user: str, with_scram: bool
 ) -> None:
     passwords = Passwords(users_file)
     passwords.set("modern", "x")
+    if with_scram:
+        passwords.set("scram", "x", for_scram=True)
     passwords._hashes["old"] = SHA512
     checked: list[str] = []
 
@@ -276,6 +279,7 @@ def test_every_refusal_costs_one_argon2id_hash(
     assert not passwords.verify(user, b"wrong")
     argon2id = "$argon2id$v=19$m=19456,t=2,p=1$"
     assert sum(stored.startswith(argon2id) for stored in checked) == 1
+    assert sum(stored.startswith("SCRAM-SHA-256$15000:") for stored in checked) == with_scram
 
 
 # The ACL

@@ -194,7 +194,7 @@ def test_users(
     assert Passwords.load(here / "users.passwd").verify("bob", password.encode())
 
     assert run("user", "list") == 0
-    assert output.readouterr().out == "alice\nbob\n"
+    assert output.readouterr().out == "alice  argon2id\nbob    argon2id\n"
     assert run("user", "remove", "bob") == 0
     for command in ("remove", "passwd"):
         assert run("user", command, "bob") == 1

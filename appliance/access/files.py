@@ -18,6 +18,7 @@ from appliance.mqtt.reason import ReasonCode
 from .acl import Acl
 from .passwords import Passwords
 from .problems import AccessFileError, Problem
+from .scram import METHOD, ScramExchange
 
 _log = logging.getLogger(__name__)
 
@@ -84,8 +85,15 @@ class FileAccess:
         return self._passwords.users()
 
     def exchange(self, method: str) -> Exchange | None:
-        """Begins an enhanced authentication; None when the method is not offered."""
-        return None
+        """Begins an enhanced authentication; None when the method is not offered.
+
+        SCRAM-SHA-256 is, where there is a users file. The exchange knows the users as they are at
+        each of its steps, a reload between them included. amqtt's plugins are not asked: they
+        judge a user name and a password, and here is no password to show them.
+        """
+        if method != METHOD or self._users_path is None:
+            return None
+        return ScramExchange(lambda username: self._passwords.verifier(username))
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the rules in force let the client do this; see `Acl.decide`."""

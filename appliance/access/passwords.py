@@ -22,6 +22,7 @@ from typing import Final
 import argon2
 from argon2.exceptions import InvalidHashError, VerificationError
 
+from . import scram
 from .problems import AccessFileError, Problem, read_text
 
 _log = logging.getLogger(__name__)
@@ -53,6 +54,13 @@ _ARGON2ID: Final = re.compile(
     r"\$[A-Za-z0-9+/]{11,}\$[A-Za-z0-9+/]{16,}"
 )
 _SHA512_SIZE: Final = 64
+_SCRAM: Final = f"{scram.METHOD}$"
+_KINDS: Final = {
+    "$argon2id$": "argon2id",
+    _SCRAM: scram.METHOD,
+    "$7$": "PBKDF2-SHA512",
+    "$6$": "SHA-512",
+}
 
 
 def check_username(username: str) -> None:
@@ -78,6 +86,8 @@ def check_password(stored: str, password: bytes) -> bool:
             return _HASHER.verify(stored, password)
         except (VerificationError, InvalidHashError):
             return False
+    if stored.startswith(_SCRAM):
+        return scram.Verifier.decode(stored).check(password)
     if stored.startswith("$7$"):
         _, _, iterations, salt, digest = stored.split("$")
         made = hashlib.pbkdf2_hmac("sha512", password, base64.b64decode(salt), int(iterations))
@@ -99,6 +109,9 @@ class Passwords:
         self.path = path
         self._hashes: dict[str, str] = {}
         self._changes: dict[str, str | None] = {}
+        self._verifiers: dict[str, scram.Verifier] = {}
+        # Their iterations and salt sizes: what a decoy has to look like.
+        self._shapes: set[tuple[int, int]] = set()
         self._rehashing = threading.Lock()
 
     @classmethod
@@ -107,6 +120,7 @@ class Passwords:
         self = cls(path)
         text = read_text(path, "add a first user with: appliance user add NAME")
         self._hashes = _parse(path, text)
+        self._read_verifiers()
         with suppress(OSError):
             if path.stat().st_mode & 0o007:
                 _log.warning(
@@ -124,6 +138,27 @@ class Passwords:
         """The hash of a user's password; None when there is no such user."""
         return self._hashes.get(username)
 
+    def kind_of(self, username: str) -> str:
+        """How a user's password is kept, in a word; KeyError when there is none of this name."""
+        stored = self._hashes[username]
+        return next(kind for start, kind in _KINDS.items() if stored.startswith(start))
+
+    def verifier(self, username: str) -> scram.Verifier:
+        """What SCRAM-SHA-256 proves the user's password against.
+
+        For an unknown user, and for one whose password is kept otherwise, it is a decoy that
+        nobody can tell from a real one, and that no proof fits.
+        """
+        reason = f"unknown user {username!r}"
+        if username in self._hashes:
+            reason = (
+                f"the password of user {username!r} is not kept for {scram.METHOD}; set it with: "
+                f"appliance user passwd {username} --scram"
+            )
+        # It is made for everyone: not even the time tells who is a user.
+        decoy = scram.decoy(username, self._shapes, reason)
+        return self._verifiers.get(username, decoy)
+
     def verify(self, username: str, password: bytes) -> bool:
         """Whether this is a user and its password; see `verified_hash`."""
         return self.verified_hash(username, password) is not None
@@ -136,29 +171,40 @@ class Passwords:
         cannot be written is logged, and the login is good all the same.
         """
         stored = self._hashes.get(username)
-        if stored is None:
-            check_password(_DECOY, password)
+        is_argon2id = stored is not None and stored.startswith("$argon2id$")
+        is_scram = username in self._verifiers
+        if stored is None or not check_password(stored, password):
+            # A wrong password must not tell by its time whether the user exists: each costs one
+            # hash of either slow kind that the file has, mosquitto's being quick.
+            if not is_argon2id:
+                check_password(_DECOY, password)
+            if self._shapes and not is_scram:
+                check_password(self.verifier(username).encode(), password)
             return None
-        known = check_password(stored, password)
-        if stored.startswith("$argon2id$"):
-            return stored if known else None
-        if not known:
-            # mosquitto's hashes are quick: a wrong password would tell that the user exists.
-            check_password(_DECOY, password)
-            return None
+        if is_argon2id or is_scram:
+            return stored
         return self._rehash(username, stored, password)
 
-    def set(self, username: str, password: str | bytes) -> None:
-        """Adds a user or changes its password; ValueError says what is wrong with either."""
+    def set(self, username: str, password: str | bytes, for_scram: bool | None = None) -> None:
+        """Adds a user or changes its password; ValueError says what is wrong with either.
+
+        `for_scram` has the password kept for SCRAM-SHA-256, and otherwise as argon2id; None means
+        as it is kept now, and argon2id for a new user.
+        """
         check_username(username)
         if not password:
             raise ValueError("a password must not be empty")
-        self._changes[username] = self._hashes[username] = _HASHER.hash(password)
+        if for_scram is None:
+            for_scram = username in self._verifiers
+        stored = _scram_hash(username, password) if for_scram else _HASHER.hash(password)
+        self._changes[username] = self._hashes[username] = stored
+        self._read_verifiers()
 
     def remove(self, username: str) -> None:
         """Removes a user; KeyError when there is none of this name."""
         del self._hashes[username]
         self._changes[username] = None
+        self._read_verifiers()
 
     def save(self) -> None:
         """Brings what was set and removed into the file: all or nothing, and safe on disk.
@@ -176,6 +222,14 @@ class Passwords:
             raise AccessFileError([Problem(self.path, 0, 0, message)]) from error
         self._changes.clear()
 
+    def _read_verifiers(self) -> None:
+        self._verifiers = {
+            username: scram.Verifier.decode(stored)
+            for username, stored in self._hashes.items()
+            if stored.startswith(_SCRAM)
+        }
+        self._shapes = {(each.iterations, len(each.salt)) for each in self._verifiers.values()}
+
     def _rehash(self, username: str, old: str, password: bytes) -> str:
         new = _HASHER.hash(password)
         with self._rehashing:
@@ -190,6 +244,15 @@ class Passwords:
             else:
                 _log.info("the password of user %r is kept as argon2id from now on", username)
         return new
+
+
+def _scram_hash(username: str, password: str | bytes) -> str:
+    prepared = scram.prepared_name(username)
+    if prepared != username:
+        raise ValueError(
+            f"a user of {scram.METHOD} has to be named as clients send it, {prepared!r}"
+        )
+    return scram.Verifier.of(password).encode()
 
 
 def _parse(path: Path, text: str) -> dict[str, str]:
@@ -252,10 +315,17 @@ def _check_hash(stored: str, username: str) -> None:
         match = re.fullmatch(r"\$6\$([^$]+)\$([^$]+)", stored)
         if not match or not _is_digest(match[1], match[2]):
             raise ValueError(f"not a valid $6$ hash of mosquitto's (salted SHA-512); {advice}")
+    elif stored.startswith(_SCRAM):
+        try:
+            scram.Verifier.decode(stored)
+        except ValueError as error:
+            raise ValueError(f"{error}; {advice} --scram") from None
     elif stored.startswith("$argon2id$"):
         raise ValueError(f"not a valid argon2id hash; {advice}")
-    elif stored.startswith("$"):
-        raise ValueError(f"a kind of hash that is not read here ($argon2id$, $7$, $6$); {advice}")
+    elif stored.startswith(("$", "SCRAM-")):
+        raise ValueError(
+            f"a kind of hash that is not read here ($argon2id$, {_SCRAM}, $7$, $6$); {advice}"
+        )
     elif stored:
         raise ValueError(f"a plain password is not accepted; {advice}")
     else:

@@ -277,7 +277,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         session = self.broker.sessions.get(identity.client_id)
         if session is not None and isinstance(session.identity, Unclaimed):
             log.info("the session that a plugin made is taken over by %s", identity)
-            session.identity = identity
+            self.broker.claim(session, identity)
             self.broker.rules_changed()
 
     async def _ask_plugins(self, login: AmqttSession) -> Identity | Refusal:

@@ -190,16 +190,18 @@ class Broker:
                 )
             session = Session(identity.client_id, identity, self.ledger)
             self.sessions[identity.client_id] = session
-        if session.identity != identity:  # one that a plugin made has found its user
-            session.identity = identity
-            session.readable.clear()
-            self.epoch += 1
         session.link = link
         session.ends_at = None
         session.set_will(will)
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
         self._set_expiry(session, expiry)
         return session, present
+
+    def claim(self, session: Session, identity: Identity) -> None:
+        """A session that was made for a client that had not logged in yet has found its user."""
+        session.identity = identity
+        session.readable.clear()
+        self.epoch += 1
 
     def _set_expiry(self, session: Session, expiry: int) -> None:
         was_kept = session.persistent
