@@ -1,66 +1,78 @@
-"""The network: TCP and TLS on the event loop, one `asyncio.Protocol` object a client."""
+"""Listening: TCP, TLS, WebSocket and Unix sockets, and how many may come, and how fast."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
+import math
+import os
+import resource
 import socket
 import ssl
-from collections.abc import Awaitable, Callable, Coroutine
+import stat
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from pathlib import Path
+from typing import Literal, cast
 
 from appliance.broker.broker import Broker
-from appliance.broker.client import Client
-from appliance.broker.ports import Exchange, Identity, Refusal
-from appliance.mqtt.connection import State
-from appliance.mqtt.packets import Connect
+from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
+from appliance.wire import FAREWELLS, Authenticate, ClientProtocol, Network
 
 log = logging.getLogger(__name__)
 
-#: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
-Authenticate: TypeAlias = Callable[
-    [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
-]
-
-#: Bytes that wait in a connection's output before its client counts as slow: what a healthy one
-#: takes in one round of the event loop, with room to spare.
-OUTPUT_HIGH_WATER = 1024 * 1024
-
-#: A chunk this large means that more is waiting. The loop would read on without writing out, up to
-#: 32 chunks in one go; reading is paused for the rest of the round, so that the receivers get
-#: theirs before they count as slow.
-LARGE_CHUNK = 128 * 1024
-
-#: Connections that wait to be accepted, and that are accepted in one go.
-BACKLOG = 1024
+#: Connections that wait to be accepted, as far as the system allows, and that are accepted in one
+#: go: a TLS handshake takes a millisecond, and other clients want their turn.
+BACKLOG = 4096
+ACCEPTED_A_TURN = 16
 
 #: Seconds until connections are accepted again after the system refused one.
 ACCEPT_PAUSE = 0.5
 
-#: Seconds that a client gets to read the last bytes before its connection is cut.
-CLOSE_TIMEOUT = 10.0
+#: TLS handshakes at a time; who comes meanwhile waits in the system's backlog, where waiting costs
+#: nothing and no time limit of ours runs.
+HANDSHAKES = 64
+
+#: Seconds without one handshake ending after which those under way no longer keep others waiting:
+#: it is the network that they wait for, or they are not meant to end.
+HANDSHAKE_STALL = 0.25
+
+#: Seconds that one address may open connections ahead of `limits.connection_rate`.
+CONNECTION_BURST = 5.0
+
+#: Addresses that are remembered before those are looked for that can be forgotten.
+ADDRESSES = 1024
 
 #: Seconds that clients get at the stop to read what was written to them.
 STOP_TIMEOUT = 1.0
 
-#: Seconds between two log lines about connections over the limit.
-REFUSAL_LOG_INTERVAL = 10.0
+#: Files that the process opens beside its connections.
+OTHER_FILES = FAREWELLS + 256
 
 
 @dataclass(frozen=True, slots=True)
 class ListenerSettings:
-    """Where a listener listens; `context` is None for plain TCP."""
+    """Where a listener listens: an address, or with `path` a Unix socket of that mode.
+
+    `context` is None for a connection without TLS.
+    """
 
     host: str
     port: int
     context: ssl.SSLContext | None
+    protocol: Literal["mqtt", "websocket"] = "mqtt"
+    path: Path | None = None
+    mode: int = 0o660
 
 
 class Listeners:
-    """All listening sockets, and the connections made to them."""
+    """All listening sockets; `network` has the connections made to them.
+
+    The limits are those of `broker.limits` in appliance.yaml, infinity for none.
+    """
 
     def __init__(
         self,
@@ -70,18 +82,24 @@ class Listeners:
         *,
         connections: int,
         connect_timeout: float,
+        connections_per_address: float = math.inf,
+        connection_rate: float = math.inf,
+        publish_rate: float = math.inf,
     ) -> None:
         self.broker = broker
-        self.authenticate = authenticate
-        self.exchange = exchange
         self.connections = connections
-        self.connect_timeout = connect_timeout
-        self.open: set[ClientProtocol] = set()
-        #: What runs in the background for a connection: TLS handshakes and logins.
-        self.tasks: set[asyncio.Task[None]] = set()
-        self._sockets: list[socket.socket] = []
-        self._told_full_at = float("-inf")
-        self._all_closed: asyncio.Event | None = None
+        self.network = Network(
+            broker,
+            authenticate,
+            exchange,
+            self._ended,
+            connect_timeout=connect_timeout,
+            publish_rate=publish_rate,
+        )
+        self._addresses = _Addresses(connections_per_address, connection_rate)
+        self._doors: list[_Door] = []
+        self._handshakes: set[ClientProtocol] = set()
+        self._stall: asyncio.TimerHandle | None = None
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Listen; returns the addresses, with the port that the system chose where it was 0.
@@ -90,257 +108,206 @@ class Listeners:
             OSError: an address cannot be listened on; nothing is left listening.
         """
         addresses: list[tuple[str, int]] = []
+        _allow_files(self.connections + OTHER_FILES)
         try:
             for listener in settings:
-                sock = _listen(listener.host, listener.port)
-                self._sockets.append(sock)
-                addresses.append((listener.host, sock.getsockname()[1]))
-                self._accept_from(sock, listener.context)
+                door = _Door(self, listener)
+                self._doors.append(door)
+                addresses.append(door.address)
+                door.open()
         except BaseException:
             await self.stop()
             raise
         return addresses
 
-    def _accept_from(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
-        """Accept what comes to the socket, until it is closed."""
-        loop = asyncio.get_running_loop()
-
-        def accept() -> None:
-            for _ in range(BACKLOG):
-                try:
-                    connection, peer = sock.accept()
-                except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-                    return
-                except OSError as error:
-                    # Out of file descriptors, most likely: it passes, and asking on would spin.
-                    log.error("no connection can be accepted: %s", error)
-                    loop.remove_reader(sock)
-                    loop.call_later(ACCEPT_PAUSE, resume)
-                    return
-                self._admit(connection, peer, context)
-
-        def resume() -> None:
-            if sock in self._sockets:
-                loop.add_reader(sock, accept)
-
-        resume()
-
-    def _admit(
-        self, connection: socket.socket, peer: tuple[str, int], context: ssl.SSLContext | None
-    ) -> None:
-        """Begin a new connection, or refuse it when there are as many as allowed."""
-        self.broker.counters.sockets += 1
-        address = f"[{peer[0]}]:{peer[1]}" if ":" in peer[0] else f"{peer[0]}:{peer[1]}"
-        if len(self.open) < self.connections:
-            protocol = ClientProtocol(self, address)
-            self.open.add(protocol)
-            self.in_background(protocol.begin(connection, context))
-            return
-        connection.close()
+    def admit(self, connection: socket.socket, peer: object, listener: ListenerSettings) -> None:
+        """Begin a new connection, or close it when there are as many as allowed."""
+        counters = self.broker.counters
+        counters.sockets += 1
         now = asyncio.get_running_loop().time()
-        if now - self._told_full_at >= REFUSAL_LOG_INTERVAL:
-            self._told_full_at = now
-            log.warning(
-                "%s refused: %d connections are open, as many as allowed "
-                "(broker.limits.connections)",
-                address,
-                self.connections,
+        refusal = host = ""
+        if listener.path is not None:
+            address = f"unix:{listener.path}"
+        else:
+            host, port = cast("tuple[str, int]", peer)[:2]
+            address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        if len(self.network.open) >= self.connections:
+            refusal = (
+                f"{self.connections} connections, as many as allowed (broker.limits.connections)"
             )
+        elif listener.path is None:
+            refusal = self._addresses.admit(host, now)
+        if refusal:
+            connection.close()
+            counters.connections_refused += 1
+            self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            return
+        protocol = ClientProtocol(self.network, address, host)
+        self.network.open.add(protocol)
+        if listener.context is not None:
+            self._handshakes.add(protocol)
+        self.network.in_background(self._begin(protocol, connection, listener))
 
-    def in_background(self, work: Coroutine[object, object, None]) -> None:
-        """Run a connection's handshake or login beside everything else."""
-        task = asyncio.get_running_loop().create_task(work)
-        self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
+    async def _begin(
+        self, protocol: ClientProtocol, connection: socket.socket, listener: ListenerSettings
+    ) -> None:
+        try:
+            is_websocket = listener.protocol == "websocket"
+            await protocol.begin(connection, listener.context, websocket=is_websocket)
+        finally:
+            self._handshakes.discard(protocol)
+            if self._stall is not None:
+                self._open_doors()
+
+    def _ended(self, protocol: ClientProtocol) -> None:
+        if protocol.host:
+            self._addresses.leave(protocol.host)
+
+    @property
+    def crowded(self) -> bool:
+        """Whether there are as many TLS handshakes as there may be at a time."""
+        return len(self._handshakes) >= HANDSHAKES
+
+    def wait_for_handshakes(self) -> None:
+        """Open the doors again when a handshake has ended, or when none does for a while."""
+        if self._stall is None:
+            loop = asyncio.get_running_loop()
+            self._stall = loop.call_later(HANDSHAKE_STALL, self._pass_stalled)
+
+    def _pass_stalled(self) -> None:
+        self._handshakes.clear()  # they go on, and are not counted any more
+        self._open_doors()
+
+    def _open_doors(self) -> None:
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+        for door in self._doors:
+            door.open()
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""
-        loop = asyncio.get_running_loop()
-        sockets, self._sockets = self._sockets, []
-        for sock in sockets:
-            loop.remove_reader(sock)
-            sock.close()
+        doors, self._doors = self._doors, []
+        for door in doors:
+            door.close()
+        if self._stall is not None:
+            self._stall.cancel()
         self.broker.close(
             lambda session: session.close_link(ReasonCode.SERVER_SHUTTING_DOWN, "shutting down")
         )
-        for protocol in list(self.open):
-            protocol.close()
-        for task in list(self.tasks):
-            task.cancel()
-        if self.open:
-            # Who reads gets the last bytes; who does not is not waited for longer than this.
-            self._all_closed = asyncio.Event()
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._all_closed.wait(), STOP_TIMEOUT)
-        for protocol in list(self.open):
-            protocol.abort()
-
-    def closed(self, protocol: ClientProtocol) -> None:
-        """A connection ended."""
-        self.open.discard(protocol)
-        if not self.open and self._all_closed is not None:
-            self._all_closed.set()
+        await self.network.close(STOP_TIMEOUT)
 
 
-class ClientProtocol(asyncio.Protocol):
-    """One connection: bytes to the `Client`, and as its `Wire` bytes from it."""
+class _Door:
+    """One listening socket."""
 
-    def __init__(self, listeners: Listeners, address: str) -> None:
-        self.address = address
+    def __init__(self, listeners: Listeners, settings: ListenerSettings) -> None:
         self._listeners = listeners
-        self._broker = listeners.broker
-        self._transport: asyncio.Transport | None = None
+        self._settings = settings
         self._loop = asyncio.get_running_loop()
-        self._client = Client(self._broker, self)
-        #: Bytes in the output from which on the client is not listened to.
-        self._output_limit = 0
-        self._choked = False
-        # Slow strangers: the whole way to the end of CONNECT has one time limit.
-        self._timeout = self._loop.call_later(listeners.connect_timeout, self._too_late)
-
-    # --- the connection ------------------------------------------------------------------------
-
-    async def begin(self, connection: socket.socket, context: ssl.SSLContext | None) -> None:
-        """Take over an accepted connection, with TLS through its handshake."""
-        # Not left to asyncio's own server for one reason: when a handshake fails, that would
-        # say nothing, and who it was and why is what the log is asked for.
-        timeout = self._listeners.connect_timeout if context else None
-        try:
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # A client without keep alive whose computer is gone is found out by the system.
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            await self._loop.connect_accepted_socket(
-                lambda: self, connection, ssl=context, ssl_handshake_timeout=timeout
-            )
-        except (OSError, asyncio.TimeoutError) as error:
-            log.warning("%s: no TLS connection: %s", self.address, _tls_reason(error))
-            connection.close()
-            self._forget()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The connection is there, its TLS handshake done."""
-        self._transport = cast(asyncio.Transport, transport)
-        self._transport.set_write_buffer_limits(high=OUTPUT_HIGH_WATER)
-        if self not in self._listeners.open:  # the handshake ended just after its time
-            self._transport.abort()
-
-    def _too_late(self) -> None:
-        log.warning(
-            "%s: no complete CONNECT within %g s (broker.limits.connect_timeout)",
-            self.address,
-            self._listeners.connect_timeout,
-        )
-        self.abort()
-
-    def data_received(self, data: bytes) -> None:
-        """Hand the chunk to the client; then everyone is written to, once, what it caused."""
-        broker = self._broker
-        broker.ledger.now = self._loop.time()
-        self._client.receive(data)
-        if broker.unflushed:
-            broker.flush()
-        if len(data) >= LARGE_CHUNK:
-            self._pause_reading()
-            self._loop.call_soon(self._read_on)
-        if not self._client.writable and self._output_size() > self._output_limit:
-            # It asks on, and does not read the answers.
-            self._choked = True
-            self._pause_reading()
-
-    def _output_size(self) -> int:
-        transport = self._transport
-        return 0 if transport is None else transport.get_write_buffer_size()
-
-    def _pause_reading(self) -> None:
-        if self._transport is not None and not self._transport.is_closing():
-            self._transport.pause_reading()
-
-    def _read_on(self) -> None:
-        if self._choked or self._client.connection.state is State.AUTHENTICATING:
-            return
-        if self._transport is not None and not self._transport.is_closing():
-            self._transport.resume_reading()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """The connection ended, whoever ended it."""
-        self._forget()
-        self._broker.ledger.now = self._loop.time()
-        self._client.lost()
-        self._broker.flush()
-
-    def pause_writing(self) -> None:
-        """The client reads slower than it is written to."""
-        self._client.writable = False
-        # From here on its output grows by what it is answered only, and by no more than this.
-        self._output_limit = self._output_size() + OUTPUT_HIGH_WATER
-
-    def resume_writing(self) -> None:
-        """It has caught up."""
-        if self._transport is not None and not self._transport.is_closing():
-            self._choked = False
-            self._client.resume_writing()
-            self._broker.flush()
-            self._read_on()
-
-    def _forget(self) -> None:
-        self._listeners.closed(self)
-        self._timeout.cancel()
-
-    def abort(self) -> None:
-        """Close at once."""
-        # asyncio's own TLS transport, up to Python 3.11.2, cannot be aborted twice.
-        if self._transport is not None:
-            with contextlib.suppress(AttributeError):
-                self._transport.abort()
-        self._forget()
-
-    # --- the client's Wire ---------------------------------------------------------------------
-
-    def authenticate(self, connect: Connect) -> None:
-        """Find out in the background who sent the CONNECT; read nothing more until then."""
-        self._pause_reading()
-        self._listeners.in_background(self._log_in(connect))
-
-    async def _log_in(self, connect: Connect) -> None:
-        tls = self._transport.get_extra_info("ssl_object") if self._transport else None
-        who = await self._listeners.authenticate(connect, self.address, tls)
-        if isinstance(who, Refusal):
-            self._client.refuse(who.code, who.reason)
+        self._is_open = False
+        if settings.path is not None:
+            self._socket = _listen_on_path(settings.path, settings.mode)
+            self._inode = settings.path.stat().st_ino
+            self.address = (f"unix:{settings.path}", 0)
         else:
-            self._client.accept(who.username)
-        self._broker.flush()
-        self._read_on()
+            self._socket = _listen(settings.host, settings.port)
+            self.address = (settings.host, self._socket.getsockname()[1])
 
-    def exchange(self, method: str) -> Exchange | None:
-        """Begin an enhanced authentication; None when the method is not offered."""
-        return self._listeners.exchange(method)
+    def open(self) -> None:
+        """Accept what comes; does nothing when it is open, or closed for good."""
+        if not self._is_open and self._socket.fileno() >= 0:
+            self._is_open = True
+            self._loop.add_reader(self._socket, self._accept)
 
-    def accepted(self) -> None:
-        """The client has logged in, and may be silent now."""
-        self._timeout.cancel()
+    def _shut(self) -> None:
+        if self._is_open:
+            self._is_open = False
+            self._loop.remove_reader(self._socket)
 
-    def later(self) -> None:
-        """Let the others have their turn, then send on."""
-        self._loop.call_soon(self._send_on)
-
-    def _send_on(self) -> None:
-        self._broker.ledger.now = self._loop.time()
-        self._client.send_on()
-        self._broker.flush()
-
-    def write(self, chunks: list[bytes]) -> None:
-        """Write the chunks, joined when small."""
-        data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
-        self._broker.counters.bytes_sent += len(data)
-        if self._transport is not None:
-            self._transport.write(data)
+    def _accept(self) -> None:
+        for _ in range(ACCEPTED_A_TURN):
+            if self._settings.context is not None and self._listeners.crowded:
+                self._shut()
+                self._listeners.wait_for_handshakes()
+                return
+            try:
+                connection, peer = self._socket.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return
+            except OSError as error:
+                # Out of file descriptors, most likely: it passes, and asking on would spin.
+                log.error("no connection can be accepted: %s", error)
+                self._shut()
+                self._loop.call_later(ACCEPT_PAUSE, self.open)
+                return
+            self._listeners.admit(connection, peer, self._settings)
 
     def close(self) -> None:
-        """Write out what waits, then close."""
-        if self._transport is not None:
-            self._transport.close()
-            self._timeout.cancel()
-            self._timeout = self._loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
+        """Listen no more."""
+        self._shut()
+        self._socket.close()
+        path = self._settings.path
+        if path is not None:
+            with contextlib.suppress(OSError):  # it may be gone, or another's by now
+                if path.stat().st_ino == self._inode:
+                    path.unlink()
+
+
+@dataclass(slots=True)
+class _Neighbour:
+    """What is known of one address."""
+
+    connections: int = 0
+    #: When the connections that it opened are paid for at the rate allowed.
+    paid_at: float = 0.0
+
+
+class _Addresses:
+    """How many connections each address has, and how fast it opens new ones."""
+
+    def __init__(self, limit: float, rate: float) -> None:
+        self._limit = limit
+        self._rate = rate
+        self._known: dict[bytes, _Neighbour] = {}
+        self._many = ADDRESSES
+
+    def admit(self, host: str, now: float) -> str:
+        """Count a new connection; or, uncounted, why it is not allowed."""
+        known = self._known
+        network = _network(host)
+        neighbour = known.get(network)
+        if neighbour is None:
+            if len(known) >= self._many:
+                self._forget_idle(now)
+            neighbour = known[network] = _Neighbour()
+        if neighbour.connections >= self._limit:
+            return (
+                f"its address has {neighbour.connections} connections "
+                "(broker.limits.connections_per_address)"
+            )
+        paid_at = max(neighbour.paid_at, now) + 1 / self._rate
+        if paid_at > now + CONNECTION_BURST:
+            return (
+                f"its address opens more than {self._rate:g} connections a second "
+                "(broker.limits.connection_rate)"
+            )
+        neighbour.paid_at = paid_at
+        neighbour.connections += 1
+        return ""
+
+    def leave(self, host: str) -> None:
+        """A connection from there ended."""
+        self._known[_network(host)].connections -= 1
+
+    def _forget_idle(self, now: float) -> None:
+        self._known = {
+            network: neighbour
+            for network, neighbour in self._known.items()
+            if neighbour.connections or neighbour.paid_at > now
+        }
+        # Each is looked at once for every two that come: the work stays in proportion.
+        self._many = max(ADDRESSES, 2 * len(self._known))
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -353,22 +320,71 @@ def _listen(host: str, port: int) -> socket.socket:
             (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
         )
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise OSError(
-            error.errno, f"cannot listen on {host or '*'}:{port} (broker.listeners): {reason}"
-        ) from None
+        raise _cannot_listen(f"{host or '*'}:{port}", error) from None
     sock.setblocking(False)
     return sock
 
 
-def _tls_reason(error: BaseException) -> str:
-    """What went wrong in a handshake, in words for the person who reads the log."""
-    reason = getattr(error, "reason", None) or str(error) or type(error).__name__
-    text = str(reason).replace("_", " ").lower()
-    if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
-        return f"the client does not trust our certificate; does it have ca.crt? ({text})"
-    if "http request" in text or "wrong version number" in text:
-        return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
-    if "peer did not return a certificate" in text:
-        return f"it has no client certificate, and one is required ({text})"
-    return text
+def _listen_on_path(path: Path, mode: int) -> socket.socket:
+    """A listening Unix socket, in place of one that nobody listens on any more."""
+    sock = socket.socket(socket.AF_UNIX)
+    try:
+        sock.setblocking(False)
+        _clear(path)
+        os.fchmod(sock.fileno(), mode)  # before it has a name: it is at no time open to more
+        sock.bind(str(path))
+        path.chmod(mode)  # what the process's umask has taken away
+        sock.listen(BACKLOG)
+    except OSError as error:
+        sock.close()
+        raise _cannot_listen(f"unix:{path}", error) from None
+    return sock
+
+
+def _clear(path: Path) -> None:
+    """Remove what an appliance that did not end well has left. OSError: it is something else."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise FileExistsError(errno.EEXIST, "there is a file that is no socket")
+        with socket.socket(socket.AF_UNIX) as trial:
+            trial.setblocking(False)
+            trial.connect(str(path))
+    except FileNotFoundError:
+        return
+    except ConnectionRefusedError:
+        path.unlink(missing_ok=True)
+        return
+    except BlockingIOError:  # so many wait there that one more does not fit
+        pass
+    raise OSError(errno.EADDRINUSE, "another process listens there")
+
+
+def _cannot_listen(where: str, error: OSError) -> OSError:
+    reason = error.strerror or str(error)
+    return OSError(error.errno, f"cannot listen on {where} (broker.listeners): {reason}")
+
+
+def _network(host: str) -> bytes:
+    """What counts as one address: one of IPv4; of IPv6 a network of 64 bits, as one site has."""
+    if ":" not in host:
+        return socket.inet_aton(host)
+    packed = socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
+    if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
+        return packed[12:]
+    return packed[:8]
+
+
+def _allow_files(needed: int) -> None:
+    """Let the process open so many files, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    most = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    if most < needed:
+        log.warning(
+            "broker.limits.connections needs %d open files, and the system allows %d: raise its "
+            "limit (ulimit -Hn, or LimitNOFILE= of the systemd unit) or lower the number",
+            needed,
+            most,
+        )

@@ -113,6 +113,7 @@ def publish(client: RawClient, topic: str, payload: bytes, retain: bool = False)
 # --- CONNECT
 
 
+@pytest.mark.statement("3.1.1", "MQTT-3.2.2-4", "MQTT-3.2.2-5")
 @both_versions
 @both_ways
 @pytest.mark.parametrize(
@@ -201,6 +202,7 @@ def test_what_is_not_meant_for_this_port(robot: ApplianceProcess) -> None:
 # --- PUBLISH and SUBSCRIBE
 
 
+@pytest.mark.statement("3.1.1", "MQTT-3.3.5-2")
 @both_versions
 @both_ways
 @pytest.mark.parametrize("qos", QOS)
@@ -464,6 +466,7 @@ def test_a_client_id_belongs_to_nobody_when_its_session_has_ended(
 # --- What comes behind a refused CONNECT
 
 
+@pytest.mark.statement("3.1.1", "MQTT-3.1.4-5")
 @both_versions
 @both_ways
 @pytest.mark.parametrize("size", [10, 200_000])
@@ -521,6 +524,7 @@ def test_what_comes_behind_an_accepted_connect_is_done(
     assert alice.drain() == []
 
 
+@pytest.mark.statement("3.1.1", "MQTT-3.1.0-1")
 @both_versions
 @both_ways
 def test_nothing_comes_before_connect(

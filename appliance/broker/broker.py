@@ -345,7 +345,7 @@ class Broker:
         try:
             check_topic(topic)
         except ValueError as error:
-            raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision, refusal = self._may_publish(session, topic)
         targets, shares = self._targets(session, topic) if decision else ([], [])
         return Route(topic, decision.allowed, decision.reason, refusal, targets, shares)

@@ -6,11 +6,17 @@ Pure like the rest of the broker: bytes come in at `receive`, and go out at `flu
 from __future__ import annotations
 
 import logging
-import secrets
+import uuid
 from typing import Protocol
 
 from appliance.broker.broker import Broker, Route
-from appliance.broker.handshake import agree, connack_properties, is_text, pending_will
+from appliance.broker.handshake import (
+    agree,
+    connack_properties,
+    is_text,
+    maximum_packet_size,
+    pending_will,
+)
 from appliance.broker.message import Message
 from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.broker.session import Held, Session
@@ -42,6 +48,7 @@ from appliance.mqtt.packets import (
     Unsubscribe,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +84,18 @@ class Wire(Protocol):
 
     def close(self) -> None:
         """Write what was written so far, then close."""
+
+
+def _check_filter(topic_filter: str) -> None:
+    """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+    try:
+        check_filter(topic_filter)
+    except ValueError as error:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+    try:
+        parse_shared(topic_filter)
+    except ValueError as error:
+        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
 
 
 class Client:
@@ -249,17 +268,17 @@ class Client:
                 log.debug("%s: PUBACK %d for nothing in flight", self, packet_id)
         elif kind == PUBREC:
             known = session.pubrec(packet_id, code)
-            if code < 0x80 or not known:
-                # An unknown id is answered too, or a client that missed our end would wait forever.
-                reason = ReasonCode.SUCCESS if known else ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
-                self._acknowledge(0x62, packet_id, reason)
+            if not known:
+                log.debug("%s: PUBREC %d for nothing in flight", self, packet_id)
+            if code < 0x80:
+                # An unknown id is answered too, or a client that missed our end would wait forever;
+                # without 0x92, which says nothing that it needs (and as mosquitto does).
+                self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
             held = session.unhold(packet_id)
-            reason = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
             if held is not None:
-                reason = ReasonCode.SUCCESS
                 self.broker.release(held, session)
-            self._acknowledge(0x70, packet_id, reason)
+            self._acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
 
@@ -289,6 +308,8 @@ class Client:
         assert session is not None
         identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
         identifier = identifiers[0] if isinstance(identifiers, list) else 0
+        for subscription in packet.subscriptions:
+            _check_filter(subscription.filter)
         codes: list[int] = []
         granted: list[tuple[Subscription, bool]] = []
         for subscription in packet.subscriptions:
@@ -308,6 +329,8 @@ class Client:
     def _on_unsubscribe(self, packet: Unsubscribe) -> None:
         session = self.session
         assert session is not None
+        for name in packet.filters:
+            _check_filter(name)
         codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
         self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
 
@@ -332,6 +355,7 @@ class Client:
     def _on_connect(self, packet: Connect) -> None:
         self._version = packet.version
         self._connect = packet
+        self._maximum_packet_size = maximum_packet_size(packet)
         properties = packet.properties or {}
         properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
         if not packet.client_id and not packet.clean_start and packet.version != 5:
@@ -430,7 +454,7 @@ class Client:
         packet, self._connect = self._connect, None
         if self._closed or packet is None:
             return
-        assigned = None if packet.client_id else f"auto-{secrets.token_hex(12)}"
+        assigned = None if packet.client_id else "auto-" + str(uuid.uuid4()).upper()
         identity = Identity(username, assigned or packet.client_id)
         try:
             agreement = agree(packet, self.broker.limits)
@@ -450,10 +474,9 @@ class Client:
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         self.session = session
-        self._maximum_packet_size = agreement.maximum_packet_size
         self._alias_maximum = agreement.aliases
         self._aliases = {} if agreement.aliases else None
-        self._mirrors = not (agreement.maximum_packet_size or agreement.aliases)
+        self._mirrors = not (self._maximum_packet_size or agreement.aliases)
         self._explain = agreement.explain and self.broker.features.reason_strings
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
         self._heard_at = self._ledger.now
@@ -607,9 +630,10 @@ class Client:
         if isinstance(packet, Puback | Pubrec | Suback | Disconnect) and packet.properties:
             packet.properties = None  # [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.14.2-3]
             self._send(packet)
-        elif isinstance(packet, Connack):
-            log.warning("%s: its Maximum Packet Size is too small for a CONNACK", self)
-            self.lost()
+        elif self.session is None or isinstance(packet, Connack):
+            # There is nothing to refuse it with [MQTT-3.14.0-1].
+            self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
+            self._leave(publish_will=True)
         elif not isinstance(packet, Disconnect):
             reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
             self.close(ReasonCode.PACKET_TOO_LARGE, reason)
@@ -656,13 +680,17 @@ class Client:
         """The client broke the protocol: tell it why, where it can be told, and close."""
         self._complain("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
-            # Before CONNECT there is nothing to answer; a CONNECT of an unknown version gets the
-            # refusal in the form that every version can read [MQTT-3.1.2-2].
-            if error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION:
+            # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
+            # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
+            unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
+            if error.told and (unknown or self.connection.version == 5):
+                self._version = self.connection.version
                 self._send(Connack(False, error.code))
             self._shut()
-        else:
+        elif error.told:
             self._end(error.code, str(error))
+        else:
+            self._leave(publish_will=True)
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""

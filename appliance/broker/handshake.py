@@ -14,13 +14,12 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What holds for one connection; times in seconds, sizes in bytes, 0 for none."""
+    """What holds for one connection; times in seconds, 0 for none."""
 
     keep_alive: int
     expiry: int
     #: QoS 1 and 2 messages that may be on their way to the client.
     window: int
-    maximum_packet_size: int
     #: Topic names that may be shortened to a number on the way to the client.
     aliases: int
     #: Whether it may be told more than a reason code (Request Problem Information).
@@ -40,10 +39,14 @@ def agree(connect: Connect, limits: Limits) -> Agreement:
         keep_alive=_keep_alive(connect, limits.keep_alive),
         expiry=min(expiry, limits.session_expiry),
         window=min(_number(connect, Property.RECEIVE_MAXIMUM, 65535), limits.inflight),
-        maximum_packet_size=_number(connect, Property.MAXIMUM_PACKET_SIZE, 0),
         aliases=min(_number(connect, Property.TOPIC_ALIAS_MAXIMUM, 0), limits.topic_alias),
         explain=bool(_number(connect, Property.REQUEST_PROBLEM_INFORMATION, 1)),
     )
+
+
+def maximum_packet_size(connect: Connect) -> int:
+    """The largest packet that the client takes, in bytes, from the first answer on; 0 for any."""
+    return _number(connect, Property.MAXIMUM_PACKET_SIZE, 0)
 
 
 def _keep_alive(connect: Connect, limit: int) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Limits, Link, Store
 from appliance.mqtt.packets import Subscription
-from appliance.mqtt.reason import ReasonCode
+from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 if TYPE_CHECKING:
     from appliance.broker.broker import Route
@@ -51,6 +51,7 @@ class Counters:
     publish_bytes_sent: int = 0
     connects: int = 0
     connects_refused: int = 0
+    connections_refused: int = 0
     sockets: int = 0
     sessions_expired: int = 0
     clients_maximum: int = 0
@@ -104,6 +105,11 @@ class PendingWill(NamedTuple):
 
     message: Message
     delay: int
+
+
+def _wrong(kind: str, packet_id: int) -> ProtocolError:
+    problem = f"{kind} for message {packet_id}, which waits for something else"
+    return ProtocolError(ReasonCode.PROTOCOL_ERROR, problem)
 
 
 class Session:
@@ -428,9 +434,15 @@ class Session:
     # --- acknowledgements of the client --------------------------------------------------------
 
     def puback(self, packet_id: int) -> bool:
-        """The client has a QoS 1 message; False when none of that id is in flight."""
+        """The client has a QoS 1 message; False when none of that id is in flight.
+
+        Raises:
+            ProtocolError: what is in flight under that id is not acknowledged like this.
+        """
         delivery = self.inflight.get(packet_id)
         if delivery is None or delivery[1] != 1:
+            if packet_id in self.inflight:
+                raise _wrong("PUBACK", packet_id)
             return False
         del self.inflight[packet_id]
         message = delivery[0]
@@ -444,12 +456,16 @@ class Session:
         return True
 
     def pubrec(self, packet_id: int, code: int) -> bool:
-        """The client has a QoS 2 message, or refused it; False when none of that id is there."""
+        """The client has a QoS 2 message, or refused it; False when none of that id is there.
+
+        Raises:
+            ProtocolError: what is in flight under that id is of QoS 1.
+        """
         if packet_id not in self.inflight:
             return False
         delivery = self.inflight[packet_id]
         if delivery is not None and delivery[1] != 2:
-            return False
+            raise _wrong("PUBREC", packet_id)
         if code >= 0x80:
             self.give_up(packet_id)
             self.pump()
@@ -462,9 +478,15 @@ class Session:
         return True
 
     def pubcomp(self, packet_id: int) -> bool:
-        """The QoS 2 exchange is over; False when none of that id waited for it."""
-        if packet_id not in self.inflight or self.inflight[packet_id] is not None:
+        """The QoS 2 exchange is over; False when none of that id is there.
+
+        Raises:
+            ProtocolError: what is in flight under that id does not wait for it.
+        """
+        if packet_id not in self.inflight:
             return False
+        if self.inflight[packet_id] is not None:
+            raise _wrong("PUBCOMP", packet_id)
         del self.inflight[packet_id]
         if self.queue or self.replays or self.resends:
             self.pump()

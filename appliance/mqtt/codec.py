@@ -334,6 +334,7 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
     if not length:
         return None, pos
     properties: Properties = {}
+    buf = buf[:stop]  # a value that is cut off is not completed by what comes behind
     while pos < stop:
         # An identifier is a Variable Byte Integer; no known one needs a second byte.
         known = _KNOWN.get(buf[pos])
@@ -345,8 +346,6 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
         if identifier in properties and owner not in rule.repeatable:
             raise ProtocolError(ReasonCode.PROTOCOL_ERROR, f"{identifier.name} is there twice")
         pos = _decode_property(buf, pos + 1, identifier, rule, properties)
-    if pos > stop:
-        raise malformed("a property is longer than the properties' length")
     return properties, pos
 
 

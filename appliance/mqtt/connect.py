@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
@@ -32,7 +34,7 @@ from appliance.mqtt.codec import (
     reason_name,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode, connack_v5, connack_v311
-from appliance.mqtt.topics import check_topic
+from appliance.mqtt.topics import check_topic, holds_control
 
 _PROTOCOL_NAME: Final = encode_string("MQTT")
 _FLAG_CLEAN_START: Final = 0x02
@@ -130,24 +132,29 @@ class Connect:
             raise ProtocolError(
                 ReasonCode.UNSUPPORTED_PROTOCOL_VERSION,
                 f"protocol {quote(name)} level {level} is not MQTT 3.1.1 or 5.0",
+                told=name in ("MQTT", "MQIsdp"),
             )
         v5 = level == V5
-        connect_flags, pos = decode_byte(body, pos)
-        _check_connect_flags(connect_flags, v5)
-        keep_alive, pos = decode_uint16(body, pos)
+        # In 5.0 wrong properties are answered; other wrong bytes only end the connection.
+        with _untold():
+            connect_flags, pos = decode_byte(body, pos)
+            _check_connect_flags(connect_flags, v5)
+            keep_alive, pos = decode_uint16(body, pos)
         properties = None
         if v5:
             properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
             _check_authentication(cls.TYPE, properties)
-        client_id, pos = decode_string(body, pos)
-        will = None
+        client_id, pos = _decode_client_id(body, pos)
+        will = username = password = None
         if connect_flags & _FLAG_WILL:
             will, pos = _decode_will(connect_flags, body, pos, v5)
-        username = password = None
-        if connect_flags & _FLAG_USERNAME:
-            username, pos = decode_string(body, pos)
-        if connect_flags & _FLAG_PASSWORD:
-            password, pos = decode_binary(body, pos)
+        with _untold():
+            if connect_flags & _FLAG_USERNAME:
+                username, pos = decode_string(body, pos)
+                if holds_control(username):
+                    raise malformed("the user name holds control characters")
+            if connect_flags & _FLAG_PASSWORD:
+                password, pos = decode_binary(body, pos)
         check_end(cls.TYPE, body, pos)
         clean_start = bool(connect_flags & _FLAG_CLEAN_START)
         return cls(client_id, clean_start, keep_alive, level, username, password, will, properties)
@@ -160,6 +167,27 @@ class Connect:
         if self.will is not None:
             parts.append(f"will={quote(self.will.topic)}")
         return " ".join(parts)
+
+
+@contextmanager
+def _untold() -> Iterator[None]:
+    """What is wrong in here ends the connection without an answer."""
+    try:
+        yield
+    except ProtocolError as error:
+        error.told = False
+        raise
+
+
+def _decode_client_id(body: bytes, pos: int) -> tuple[str, int]:
+    try:
+        client_id, pos = decode_string(body, pos)
+    except ProtocolError as error:
+        raise ProtocolError(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, f"client id: {error}") from None
+    if holds_control(client_id):
+        problem = "the client id holds control characters"
+        raise ProtocolError(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, problem)
+    return client_id, pos
 
 
 def _check_connect_flags(flags: int, v5: bool) -> None:
@@ -181,12 +209,13 @@ def _decode_will(flags: int, body: bytes, pos: int, v5: bool) -> tuple[Will, int
     properties = None
     if v5:
         properties, pos = decode_properties(body, pos, len(body), WILL)
-    topic, pos = decode_string(body, pos)
-    try:
-        check_topic(topic)
-    except ValueError as error:
-        raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, f"will topic: {error}") from error
-    payload, pos = decode_binary(body, pos)
+    with _untold():
+        topic, pos = decode_string(body, pos)
+        try:
+            check_topic(topic)
+        except ValueError as error:
+            raise malformed(f"will topic: {error}") from error
+        payload, pos = decode_binary(body, pos)
     return Will(topic, payload, flags >> 3 & 3, bool(flags & _FLAG_WILL_RETAIN), properties), pos
 
 

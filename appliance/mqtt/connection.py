@@ -41,6 +41,10 @@ PUBCOMP = PacketType.PUBCOMP << 16
 _ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
 
 
+#: How the variable header of a CONNECT of MQTT 5 begins.
+_MQTT_5 = b"\0\4MQTT\5"
+
+
 class State(Enum):
     """Where a connection is in its life."""
 
@@ -74,6 +78,9 @@ _LEGAL: dict[State, frozenset[PacketType]] = {
 }
 
 
+_FLAGLESS = frozenset({PacketType.SUBACK, PacketType.UNSUBACK, PacketType.PINGRESP})
+
+
 class Connection:
     """The server's end of one MQTT connection, as bytes.
 
@@ -88,6 +95,8 @@ class Connection:
         self.version = 0
         #: False while nothing may be yielded: paused, or closed.
         self._reading = True
+        #: Whether its CONNECT named an authentication method, so that AUTH may come.
+        self.authenticates = False
         #: What was received and not yet taken apart; joined once `_need` bytes are there.
         self._chunks: list[bytes] = []
         self._have = 0
@@ -177,6 +186,7 @@ class Connection:
                 length = buf[pos + 1]
                 body = pos + 2
                 if length > 0x7F:
+                    _check_type(first)
                     try:
                         length, body = _remaining_length(buf, pos)
                     except IndexError:
@@ -225,6 +235,8 @@ class Connection:
                     self._check(first, stop - pos)
                     yield self._decode(first, buf[body:stop])
                 pos = stop
+            if pos < end and self._reading:
+                _check_type(buf[pos])
         except ProtocolError:
             self.close()
             raise
@@ -258,16 +270,19 @@ class Connection:
 
     def _check(self, first: int, size: int) -> None:
         """Whether a packet of this kind may come now, and be of this size."""
-        try:
-            kind = PacketType(first >> 4)
-        except ValueError:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, "packet type 0 is reserved") from None
+        _check_type(first)
+        kind = PacketType(first >> 4)
         if self.state is State.NEW and first == 0x16:
             raise ProtocolError(
                 ReasonCode.MALFORMED_PACKET,
                 "what it sends is TLS; is it meant for the listener with tls: true?",
             )
-        if kind not in _LEGAL[self.state]:
+        if kind in _FLAGLESS and first & 0x0F:
+            # Said of these before that they may not come at all, as mosquitto does.
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a {kind.name} with reserved flags")
+        if kind not in _LEGAL[self.state] or (
+            kind is PacketType.AUTH and not self.authenticates  # [MQTT-4.12.0-7]
+        ):
             raise ProtocolError(
                 ReasonCode.PROTOCOL_ERROR, f"a {kind.name} may not come {self.state.value}"
             )
@@ -286,10 +301,13 @@ class Connection:
     def _decode(self, first: int, body: bytes) -> Packet:
         if first >> 4 == PacketType.PUBLISH:
             return self._publish(first, body)
+        if first >> 4 == PacketType.CONNECT and body[:7] == _MQTT_5:
+            self.version = 5  # so that what is wrong behind it can be answered
         packet = decode_packet(first, body, self.version)
         if isinstance(packet, Connect):
             self.version = packet.version
             self.state = State.AUTHENTICATING
+            self.authenticates = Property.AUTHENTICATION_METHOD in (packet.properties or {})
         return packet
 
     def _publish(self, first: int, body: bytes) -> Publish:
@@ -319,8 +337,13 @@ class Connection:
         try:
             check_topic(packet.topic)  # [MQTT-3.3.2-2], [MQTT-4.7.3-1]
         except ValueError as error:
-            raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from None
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         return packet
+
+
+def _check_type(first: int) -> None:
+    if first < 0x10:  # section 2.2.1; 5.0 section 2.1.2
+        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "packet type 0 is reserved")
 
 
 def _remaining_length(buf: bytes, pos: int) -> tuple[int, int]:
@@ -328,4 +351,8 @@ def _remaining_length(buf: bytes, pos: int) -> tuple[int, int]:
     # [MQTT-1.5.5-1]: at most four bytes. Those that are there are checked before more come.
     if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
         raise IndexError
-    return decode_varint(buf, pos + 1)
+    try:
+        return decode_varint(buf, pos + 1)
+    except ProtocolError as error:
+        error.told = False
+        raise

@@ -39,7 +39,7 @@ from appliance.mqtt.codec import (
     reason_name,
 )
 from appliance.mqtt.connect import Auth, Connack, Connect, Will
-from appliance.mqtt.reason import ReasonCode
+from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import parse_shared
 
 __all__ = [
@@ -479,7 +479,9 @@ class _Ping:
     def decode(cls: type[_P], flags: int, body: bytes, version: int) -> _P:
         """The packet."""
         check_flags(cls.TYPE, flags)
-        check_end(cls.TYPE, body, 0)
+        if body:
+            problem = f"{cls.TYPE.name} with {len(body)} bytes after its end"
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, problem, told=False)
         return cls()
 
     def __str__(self) -> str:
@@ -524,7 +526,11 @@ class Disconnect:
             check_end(cls.TYPE, body, 0)
         if not body:
             return cls()
-        reason_code = decode_reason(cls.TYPE, body[0], _DISCONNECT_REASONS)
+        try:
+            reason_code = decode_reason(cls.TYPE, body[0], _DISCONNECT_REASONS)
+        except ProtocolError as error:
+            error.told = False  # it is leaving anyway
+            raise
         properties = None
         if len(body) > 1:
             properties, pos = decode_properties(body, 1, len(body), cls.TYPE)
@@ -581,5 +587,5 @@ def decode_packet(first_byte: int, body: bytes, version: int) -> Packet:
     """
     decode = _DECODERS.get(first_byte >> 4)
     if decode is None:  # Packet type 0 is reserved, section 2.2.1.
-        raise malformed("packet type 0 is reserved")
+        raise protocol_error("packet type 0 is reserved")
     return decode(first_byte & 0x0F, body, version)

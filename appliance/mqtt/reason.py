@@ -61,12 +61,14 @@ class ReasonCode(IntEnum):
 class ProtocolError(Exception):
     """The other side broke the protocol: `code` goes into CONNACK or DISCONNECT, then it closes.
 
-    The message says what was wrong, for the log; it holds no payload and no secret.
+    The message says what was wrong, for the log; it holds no payload and no secret. With `told`
+    False the other side is not told: where the standard leaves that open, mosquitto does not.
     """
 
-    def __init__(self, code: ReasonCode, message: str) -> None:
+    def __init__(self, code: ReasonCode, message: str, *, told: bool = True) -> None:
         super().__init__(message)
         self.code = code
+        self.told = told
 
 
 # 3.1.1 has five refusals (table 3.1). 3, "server unavailable", invites the client to try again;

@@ -6,6 +6,7 @@ stands for one level and a final `#` for the level above it and everything below
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Iterator
 from typing import Final, Generic, TypeVar
 
@@ -15,6 +16,16 @@ MAX_TOPIC: Final = 65_535
 """The greatest length, in bytes, of a topic or a filter: what a string of MQTT can hold."""
 
 _SHARE: Final = "$share/"
+
+
+# Control characters and non-characters: the standard leaves them to the receiver (section 1.5.3;
+# 5.0 section 1.5.4). A name that cannot be printed is of no use, and a trap for who reads a log.
+_CONTROL: Final = re.compile("[\x01-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff]")
+
+
+def holds_control(text: str) -> bool:
+    """Whether the text holds characters that no name may have here."""
+    return _CONTROL.search(text) is not None
 
 
 def check_topic(topic: str) -> None:
@@ -46,6 +57,8 @@ def _check_string(text: str, what: str) -> None:
         raise ValueError(f"a {what} must not be empty")
     if "\0" in text:  # [MQTT-4.7.3-2]
         raise ValueError(f"a {what} must not hold U+0000")
+    if holds_control(text):
+        raise ValueError(f"a {what} must not hold control characters")
     # No character takes more than four bytes, so a short text need not be encoded to be measured.
     if len(text) > MAX_TOPIC // 4 and len(text.encode()) > MAX_TOPIC:  # [MQTT-4.7.3-3]
         raise ValueError(f"a {what} must not be longer than {MAX_TOPIC} bytes")

@@ -280,8 +280,6 @@ def test_qos_2_is_delivered_once_and_only_when_it_is_released(join: Join, versio
     peer.send(Pubrel(9))  # again, because PUBCOMP was lost
     (answer,) = peer.received()
     assert isinstance(answer, Pubcomp)
-    if version == 5:
-        assert answer.reason_code == ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
     assert watcher.drain() == []
     peer.send(Publish("a", b"2", 2, packet_id=9))  # the id is free: a new message [MQTT-4.3.3-12]
     peer.send(Pubrel(9))
@@ -460,24 +458,28 @@ def test_packet_ids_in_use_are_passed_over(join: Join):
 
 
 def test_acknowledgements_of_nothing_do_no_harm(join: Join, version):
-    """v5 sections 3.5.2.1, 3.6.2.1: 0x92 where it can be said; the connection goes on"""
+    """The exchange is ended for the client, as mosquitto does: without 0x92, in 5.0, too"""
     peer = join(version=version)
     peer.subscribe("a", 2)
     peer.send(Puback(7), Pubrec(7), Pubcomp(7), Pubrel(7))
-    code = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND if version == 5 else ReasonCode.SUCCESS
-    assert peer.received() == [Pubrel(7, code), Pubcomp(7, code)]
-    publisher = join("publisher")
-    publisher.publish("a", b"one", 1)
-    publisher.publish("a", b"two", 2)
-    one, two = peer.messages()
-    assert one.packet_id and two.packet_id
-    # The wrong kind for the message in flight leaves it there.
-    peer.send(Pubrec(one.packet_id), Puback(two.packet_id), Pubcomp(two.packet_id))
-    peer.send(Pubcomp(one.packet_id))
-    peer.received()
-    assert set(peer.session.inflight) == {one.packet_id, two.packet_id}
-    peer.acknowledge(one, two)
-    assert not peer.session.inflight and not peer.wire.closed
+    assert peer.received() == [Pubrel(7), Pubcomp(7)]
+    assert not peer.wire.closed
+
+
+@pytest.mark.parametrize(("qos", "answer"), [(1, Pubrec), (1, Pubcomp), (2, Puback), (2, Pubcomp)])
+def test_the_wrong_acknowledgement_ends_the_connection(join: Join, version, qos, answer):
+    """v5 section 4.13; the message stays, for the next connection"""
+    peer = join(version=version, **lasting(version))
+    peer.subscribe("a", 2)
+    join("publisher").publish("a", b"one", qos)
+    (message,) = peer.messages()
+    assert message.packet_id
+    peer.send(answer(message.packet_id))
+    assert peer.wire.closed
+    if version == 5:
+        assert peer.farewell() == ReasonCode.PROTOCOL_ERROR
+    again = join(version=version, **lasting(version))
+    assert [m.payload for m in again.drain()] == [b"one"]
 
 
 def test_a_pubrec_with_an_error_ends_the_exchange(join: Join):
@@ -655,12 +657,12 @@ def test_a_larger_packet_than_allowed_ends_the_connection(join: Join):
 @pytest.mark.parametrize(
     ("data", "code"),
     [
-        ("00 00", 0x81),
+        ("00 00", 0x82),
         ("10 0c 0004 4d515454 05 02 0000 0000", 0x82),
         ("20 03 00 00 00", 0x82),
         ("36 07 0001 61 0001 00 00", 0x81),
-        ("30 06 0002 2b 61 00 00", 0x90),
-        ("30 05 0001 23 00 00", 0x90),
+        ("30 06 0002 2b 61 00 00", 0x81),
+        ("30 05 0001 23 00 00", 0x81),
         ("32 06 0001 61 0000 00", 0x82),
         ("30 07 0001 61 09 23 0001", 0x81),
         ("30 07 0001 61 03 23 0063", 0x94),
@@ -678,7 +680,6 @@ def test_a_larger_packet_than_allowed_ends_the_connection(join: Join):
         ("a2 03 0001 00", 0x82),  # UNSUBSCRIBE without a filter [MQTT-3.10.3-2]
         ("60 02 0001", 0x81),  # PUBREL with flags 0 [MQTT-3.6.1-1]
         ("40 03 0001 55", 0x82),
-        ("c0 01 00", 0x81),
         ("e0 02 00 05", 0x81),
     ],
 )
@@ -687,6 +688,38 @@ def test_errors_have_the_standards_codes(join: Join, data, code):
     peer = join()
     peer.send(bytes.fromhex(data))
     assert peer.farewell() == code
+
+
+@pytest.mark.parametrize("data", ["c0 01 00", "e0 02 05 00", "30 80 80 80 80 01"])
+def test_errors_that_mosquitto_does_not_answer(join: Join, data):
+    """A PINGREQ with a body, DISCONNECT with a reason of the server's, a length of five bytes"""
+    peer = join()
+    peer.send(bytes.fromhex(data))
+    assert peer.wire.closed and peer.received() == []
+
+
+@pytest.mark.parametrize(
+    ("body", "answer"),
+    [
+        ("05 02 0000 02 2400 0001 61", "20 03 00 81 00"),  # a property that is not CONNECT's
+        ("05 02 0000 02 7f00 0001 61", "20 03 00 81 00"),  # one that nobody knows
+        ("05 02 0000 06 210001210002 0001 61", "20 03 00 82 00"),  # one that is there twice
+        ("05 02 0000 02 2100 0001 61", "20 03 00 81 00"),  # one that is cut off
+        ("05 02 0000 00 0001 61 ff", "20 03 00 81 00"),  # a byte too many
+        ("05 02 0000 00 0002 eda0", "20 03 00 85 00"),  # a client id that is not UTF-8
+        ("05 02 0000 00 0001 07", "20 03 00 85 00"),  # or cannot be printed
+        ("05 82 0000 00 0001 61", ""),  # a user name that is not there
+        ("05 03 0000 00 0001 61", ""),  # the reserved flag
+        ("06 02 0000 00 0001 61", "20 02 00 01"),
+        ("04 02 0000 0001 61 ff", ""),
+    ],
+)
+def test_wrong_connects(broker: Broker, body, answer):
+    """v5 section 4.13: what of a CONNECT is answered, as mosquitto does"""
+    rest = bytes.fromhex("0004 4d515454" + body)
+    peer = Peer(broker)
+    peer.send(bytes((0x10, len(rest))) + rest)
+    assert peer.wire.closed and bytes(peer.wire.written).hex() == answer.replace(" ", "")
 
 
 def test_errors_of_3_1_1_just_close(join: Join, broker: Broker):

@@ -45,7 +45,9 @@ ACKNOWLEDGEMENTS = {cls.TYPE: cls for cls in (Puback, Pubrec, Pubrel, Pubcomp)}
 def connected(version: int, size: int = SIZE) -> Connection:
     """A connection whose client has logged in."""
     connection = Connection(size, ALIASES)
-    (connect,) = connection.receive_data(Connect("client", version=version).encode())
+    properties = {Property.AUTHENTICATION_METHOD: "m"} if version == 5 else None
+    packet = Connect("client", version=version, properties=properties)  # type: ignore[arg-type]
+    (connect,) = connection.receive_data(packet.encode())
     assert isinstance(connect, Connect)
     assert connection.state is State.AUTHENTICATING
     connection.accept()
@@ -64,7 +66,7 @@ def as_packet(event: Event, version: int) -> Packet:
     try:
         check_topic(topic)
     except ValueError as error:
-        raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from error
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from error
     packet = Publish(
         topic, payload, first >> 1 & 3, bool(first & 1), first >= 0x38, packet_id or None
     )
@@ -92,7 +94,11 @@ def said_slowly(data: bytes, version: int) -> list[Packet | ReasonCode]:
     found: list[Packet | ReasonCode] = []
     aliases: dict[int, str] = {}
     try:
-        while len(data) >= 2:
+        while data:
+            if data[0] < 0x10:
+                raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "reserved")
+            if len(data) < 2:
+                break
             digits = []
             for byte in data[1:5]:
                 digits.append(byte)
@@ -106,7 +112,7 @@ def said_slowly(data: bytes, version: int) -> list[Packet | ReasonCode]:
                 raise ProtocolError(ReasonCode.MALFORMED_PACKET, "a digit too many")
             length = sum((digit & 0x7F) << 7 * place for place, digit in enumerate(digits))
             if length > 125 or len(data) >= 1 + len(digits) + length:
-                check_order(data[0] >> 4, version)
+                check_order(data[0], version)
                 if 1 + len(digits) + length > SIZE:
                     raise ProtocolError(ReasonCode.PACKET_TOO_LARGE, "too large")
             first, data = data[0], data[1 + len(digits) :]
@@ -122,11 +128,12 @@ def said_slowly(data: bytes, version: int) -> list[Packet | ReasonCode]:
     return found
 
 
-def check_order(kind: int, version: int) -> None:
+def check_order(first: int, version: int) -> None:
     """What a client may say once it is connected."""
-    if kind == 0:
-        raise ProtocolError(ReasonCode.MALFORMED_PACKET, "reserved")
-    if kind in (1, 2, 9, 11, 13):
+    kind = first >> 4
+    if kind in (9, 11, 13) and first & 15:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, "flags")
+    if kind in (1, 2, 9, 11, 13) or (kind == 15 and version == 4):
         raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "not now")
 
 
@@ -145,7 +152,7 @@ def resolve(packet: Publish, aliases: dict[int, str]) -> None:
     try:
         check_topic(packet.topic)
     except ValueError as error:
-        raise ProtocolError(ReasonCode.TOPIC_NAME_INVALID, str(error)) from error
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from error
 
 
 def split_at(data: bytes, cuts: Iterable[int]) -> list[bytes]:
@@ -367,11 +374,11 @@ def test_what_a_client_may_say(packet):
         assert found == [packet]
 
 
-def test_packet_type_0_and_auth_in_3_1_1_are_malformed():
+def test_packet_type_0_and_auth_in_3_1_1_are_errors():
     """Section 2.2.1 of 3.1.1: reserved, forbidden"""
-    assert said(connected(4), [b"\x00\x00"]) == [ReasonCode.MALFORMED_PACKET]
-    assert said(connected(5), [b"\x00\x00"]) == [ReasonCode.MALFORMED_PACKET]
-    assert said(connected(4), [b"\xf0\x00"]) == [ReasonCode.MALFORMED_PACKET]
+    assert said(connected(4), [b"\x00\x00"]) == [ReasonCode.PROTOCOL_ERROR]
+    assert said(connected(5), [b"\x00\x00"]) == [ReasonCode.PROTOCOL_ERROR]
+    assert said(connected(4), [b"\xf0\x00"]) == [ReasonCode.PROTOCOL_ERROR]
 
 
 def test_a_protocol_that_is_not_ours():
@@ -431,8 +438,8 @@ def test_a_plain_publish_is_not_wrapped(version, qos):
         ("3e 07 0001 61 0001 00 00", ReasonCode.MALFORMED_PACKET),
         ("38 05 0001 61 00 00", ReasonCode.MALFORMED_PACKET),  # DUP, QoS 0 [MQTT-3.3.1-2]
         ("32 07 0001 61 0000 00 00", ReasonCode.PROTOCOL_ERROR),  # id 0 [MQTT-2.2.1-3]
-        ("30 05 0001 2b 00 00", ReasonCode.TOPIC_NAME_INVALID),  # + [MQTT-3.3.2-2]
-        ("30 05 0001 23 00 00", ReasonCode.TOPIC_NAME_INVALID),  # #
+        ("30 05 0001 2b 00 00", ReasonCode.MALFORMED_PACKET),  # + [MQTT-3.3.2-2]
+        ("30 05 0001 23 00 00", ReasonCode.MALFORMED_PACKET),  # #
         ("30 05 0001 00 00 00", ReasonCode.MALFORMED_PACKET),  # U+0000 [MQTT-1.5.4-2]
         ("30 05 0001 ff 00 00", ReasonCode.MALFORMED_PACKET),  # no UTF-8 [MQTT-1.5.4-1]
         ("30 07 0003 eda080 00 00", ReasonCode.MALFORMED_PACKET),  # a surrogate
@@ -478,7 +485,7 @@ def test_topic_aliases():
         (with_alias(11, "a"), ReasonCode.TOPIC_ALIAS_INVALID),  # [MQTT-3.3.2-9]
         (with_alias(0, "a"), ReasonCode.TOPIC_ALIAS_INVALID),  # [MQTT-3.3.2-8]
         (with_alias(2), ReasonCode.PROTOCOL_ERROR),
-        (with_alias(1, "a/#"), ReasonCode.TOPIC_NAME_INVALID),
+        (with_alias(1, "a/#"), ReasonCode.MALFORMED_PACKET),
     ],
 )
 def test_topic_aliases_that_are_wrong(wire, code):
@@ -504,4 +511,4 @@ def test_zeros_are_no_packet_in_any_state(data):
     """Before the first PUBLISH nothing is taken for a repetition of it."""
     for connection in (Connection(SIZE, ALIASES), connected(4), connected(5)):
         found = said(connection, [data, data])
-        assert found == [ReasonCode.MALFORMED_PACKET]
+        assert found == [ReasonCode.PROTOCOL_ERROR]

@@ -40,7 +40,7 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ProtocolError
 from appliance.mqtt.topics import SubscriptionTree, TopicTree, matches, parse_shared
 
-texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
+texts = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cn"]), max_size=12)
 topics = texts.map(lambda text: text.replace("+", "").replace("#", "")).filter(bool)
 binaries = st.binary(max_size=20)
 packet_ids = st.integers(1, 0xFFFF)

@@ -1,0 +1,333 @@
+"""SCRAM-SHA-256 (RFC 5802 and 7677): what is kept of a password, and the server's exchange."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import hmac
+import re
+import secrets
+import stringprep
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from unicodedata import ucd_3_2_0
+
+from appliance.broker.ports import Accepted, Refusal
+from appliance.mqtt.reason import ReasonCode
+
+METHOD: Final = "SCRAM-SHA-256"
+
+# The rule of thumb of RFC 7677, section 4. It is the client that has to do this work, and must have
+# done it within broker.limits.connect_timeout: a microcontroller takes seconds for what costs a
+# guesser nothing. Against guessing there are long passwords, and a file that others cannot read.
+_ITERATIONS: Final = 15_000
+# RFC 7677 asks for at least these; clients refuse to answer to fewer.
+_MIN_ITERATIONS: Final = 4096
+# A slip of the pen in the file may not make logins take seconds.
+_MAX_ITERATIONS: Final = 1_000_000
+_SALT_SIZE: Final = 16
+_MAX_SALT_SIZE: Final = 128
+
+# A user name of 256 bytes, every one escaped, twice, and nonces of 256 characters.
+_MAX_MESSAGE: Final = 2048
+
+# Characters, of which SASLprep looks at each one, and strangers' names are prepared on the event
+# loop. A text in ASCII may be longer.
+_MAX_PREPARED: Final = 256
+
+_STORED: Final = re.compile(
+    r"SCRAM-SHA-256\$([0-9]{1,9}):([A-Za-z0-9+/]+={0,2})"
+    r"\$([A-Za-z0-9+/]{43}=):([A-Za-z0-9+/]{43}=)"
+)
+
+# RFC 5802, section 7. What a client adds behind these ("extensions") is ignored, and proven.
+_NAME: Final = r"(?:[^\0,=]|=2C|=3D)+"
+_NONCE: Final = r"[!-+\--~]+"
+_EXTENSIONS: Final = r"(?:,[A-Za-z]=[^\0,]+)*"
+_CLIENT_FIRST: Final = re.compile(
+    rf"(?P<header>(?:n|y|(?P<bound>p=[A-Za-z0-9.-]+)),(?:a=(?P<authzid>{_NAME}))?,)"
+    rf"(?P<bare>n=(?P<name>{_NAME}),r=(?P<nonce>{_NONCE}){_EXTENSIONS})"
+)
+_CLIENT_FINAL: Final = re.compile(
+    rf"(?P<unproven>c=(?P<header>[A-Za-z0-9+/=]+),r=(?P<nonce>{_NONCE}){_EXTENSIONS})"
+    r",p=(?P<proof>[A-Za-z0-9+/]{43}=)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verifier:
+    """What a password is proven against; it is not enough to log in as the user.
+
+    `decoy` is the reason, for the log, why no proof is ever right; it is empty in a real one.
+    """
+
+    iterations: int
+    salt: bytes
+    stored_key: bytes = field(repr=False)
+    server_key: bytes = field(repr=False)
+    decoy: str = ""
+
+    @classmethod
+    def of(cls, password: str | bytes) -> Verifier:
+        """A new one, with a salt of its own.
+
+        ValueError says what is wrong with a password that not every client would send the same.
+        """
+        try:
+            text = password if isinstance(password, str) else password.decode()
+            prepared = saslprep(text).encode()
+        except UnicodeDecodeError:
+            raise ValueError(f"a password for {METHOD} must be text in UTF-8") from None
+        except ValueError as error:
+            raise ValueError(f"a password for {METHOD} {error}") from None
+        return cls._derive(prepared, secrets.token_bytes(_SALT_SIZE), _ITERATIONS)
+
+    @classmethod
+    def _derive(cls, prepared: bytes, salt: bytes, iterations: int) -> Verifier:
+        salted = hashlib.pbkdf2_hmac("sha256", prepared, salt, iterations)
+        client_key = hmac.digest(salted, b"Client Key", "sha256")
+        server_key = hmac.digest(salted, b"Server Key", "sha256")
+        return cls(iterations, salt, hashlib.sha256(client_key).digest(), server_key)
+
+    def encode(self) -> str:
+        """As it stands in the users file, which is as PostgreSQL stores it."""
+        salt, stored_key, server_key = map(_base64, (self.salt, self.stored_key, self.server_key))
+        return f"{METHOD}${self.iterations}:{salt}${stored_key}:{server_key}"
+
+    @classmethod
+    def decode(cls, stored: str) -> Verifier:
+        """The reverse of `encode`; ValueError says what is wrong, without showing it."""
+        match = _STORED.fullmatch(stored)
+        try:
+            if match is None:
+                raise ValueError
+            salt, stored_key, server_key = map(base64.b64decode, match.groups()[1:])
+        except ValueError:
+            raise ValueError(f"not a valid {METHOD} hash") from None
+        iterations = int(match[1])
+        if iterations > _MAX_ITERATIONS:
+            raise ValueError("this hash costs more than one login may")
+        if iterations < _MIN_ITERATIONS:
+            raise ValueError(
+                f"{METHOD} needs {_MIN_ITERATIONS} iterations at least, and here are {iterations}"
+            )
+        if len(salt) > _MAX_SALT_SIZE:
+            raise ValueError(f"a salt of more than {_MAX_SALT_SIZE} bytes")
+        return cls(iterations, salt, stored_key, server_key)
+
+    def check(self, password: bytes) -> bool:
+        """Whether this is the password. Takes milliseconds, and as long when it is not."""
+        try:
+            prepared = saslprep(password.decode()).encode()
+        except ValueError:
+            prepared = password  # as PostgreSQL does, whose hashes may come from such passwords
+        made = self._derive(prepared, self.salt, self.iterations)
+        return hmac.compare_digest(made.stored_key, self.stored_key) and not self.decoy
+
+
+def decoy(username: str, shapes: Collection[tuple[int, int]], reason: str) -> Verifier:
+    """What is shown of a user that has no verifier; `reason` is for the log.
+
+    It looks like one of the real ones: `shapes` are their iterations and salt sizes. Who asks for
+    it again sees the same, as long as there are other users of its shape.
+    """
+
+    def made(what: str, size: int) -> bytes:
+        text = f"{what}:{username}".encode()
+        return hashlib.shake_256(_secret() + text).digest(size)
+
+    # Each shape bids for the name: when others come or go, most names stay with theirs.
+    shape = max(shapes or [(_ITERATIONS, _SALT_SIZE)], key=lambda shape: made(f"{shape}", 8))
+    iterations, size = shape
+    keys = made("keys", 64)
+    return Verifier(iterations, made(f"salt {shape}", size), keys[:32], keys[32:], reason)
+
+
+@functools.cache
+def _secret() -> bytes:
+    """What makes the decoys of this computer.
+
+    It outlives a restart where it can: a salt that is another one after it would be known for a
+    decoy's. machine-id(5) is made for this: never told to a network, and hashed before use.
+    """
+    try:
+        machine = Path("/etc/machine-id").read_bytes().strip()
+    except OSError:
+        machine = b""
+    if len(machine) != 32:  # a container's may be empty
+        return secrets.token_bytes(32)
+    return hashlib.sha256(b"SCRAM decoys of the appliance on " + machine).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class _Challenge:
+    """What the server has answered to a client-first-message, and what that was."""
+
+    username: str
+    verifier: Verifier
+    header: str
+    nonce: str
+    #: Both messages, as the proof is about them.
+    messages: str
+
+
+class ScramExchange:
+    """The server's side of one exchange: an `Exchange` of the broker.
+
+    Every failure is the same refusal to the client, and comes with the proof when only the user or
+    its password is wrong: who is a user cannot be found out. There is no channel binding: that the
+    client talks to us, and not to one who passes its messages on, is for certificates to show.
+    """
+
+    def __init__(self, verifier_of: Callable[[str], Verifier], nonce: str | None = None) -> None:
+        """`verifier_of` is asked at both messages; one that has changed between them fails.
+
+        `nonce` is the server's part of it, a random one unless a test brings its own.
+        """
+        self._verifier_of = verifier_of
+        self._nonce = nonce or _base64(secrets.token_bytes(18))
+        self._next: Callable[[str], bytes | Accepted | Refusal] = self._begin
+
+    def step(self, data: bytes) -> bytes | Accepted | Refusal:
+        """Take the client's next message; hashes a few short texts, and no password."""
+        take, self._next = self._next, self._over
+        try:
+            if len(data) > _MAX_MESSAGE:
+                raise ValueError(f"a message of {len(data)} bytes, and not of {_MAX_MESSAGE}")
+            return take(data.decode())
+        except ValueError as error:
+            return _refusal(f"{METHOD}: {error}")
+
+    def _begin(self, message: str) -> bytes:
+        if message:
+            return self._first(message)
+        # A CONNECT without data: the client is asked for its first message, as MQTT 5.0, section
+        # 4.12, has it in an example.
+        self._next = self._first
+        return b""
+
+    def _first(self, message: str) -> bytes:
+        _check_extensions(message)
+        match = _CLIENT_FIRST.fullmatch(message)
+        if match is None:
+            raise ValueError("not a client-first-message")
+        if match["bound"]:
+            raise ValueError("the client asks for channel binding, which is not offered")
+        name = prepared_name(_unescaped(match["name"]))
+        if match["authzid"] and prepared_name(_unescaped(match["authzid"])) != name:
+            raise ValueError(f"user {name!r} may not act for another one")
+        verifier = self._verifier_of(name)
+        nonce = match["nonce"] + self._nonce
+        answer = f"r={nonce},s={_base64(verifier.salt)},i={verifier.iterations}"
+        messages = f"{match['bare']},{answer}"
+        challenge = _Challenge(name, verifier, match["header"], nonce, messages)
+        self._next = functools.partial(self._final, challenge)
+        return answer.encode()
+
+    def _final(self, challenge: _Challenge, message: str) -> Accepted | Refusal:
+        _check_extensions(message)
+        match = _CLIENT_FINAL.fullmatch(message)
+        if match is None:
+            raise ValueError("not a client-final-message")
+        if match["header"] != _base64(challenge.header.encode()):
+            raise ValueError("the client-final-message has another gs2-header (c=)")
+        if match["nonce"] != challenge.nonce:
+            raise ValueError("the client-final-message has another nonce")
+        verifier = challenge.verifier
+        messages = f"{challenge.messages},{match['unproven']}".encode()
+        signature = hmac.digest(verifier.stored_key, messages, "sha256")
+        proof = base64.b64decode(match["proof"])
+        client_key = bytes(a ^ b for a, b in zip(proof, signature, strict=True))
+        proven = hmac.compare_digest(hashlib.sha256(client_key).digest(), verifier.stored_key)
+        changed = self._verifier_of(challenge.username) != verifier
+        if verifier.decoy:
+            return _refusal(verifier.decoy)
+        if changed:
+            return _refusal(f"user {challenge.username!r} was changed during the exchange")
+        if not proven:
+            return _refusal(f"wrong {METHOD} proof of user {challenge.username!r}")
+        server_signature = hmac.digest(verifier.server_key, messages, "sha256")
+        return Accepted(challenge.username, b"v=" + base64.b64encode(server_signature))
+
+    def _over(self, message: str) -> Refusal:
+        raise ValueError("the exchange is over")
+
+
+def saslprep(text: str) -> str:
+    """`text` as RFC 4013 has it stored and sent, so that what looks the same is the same.
+
+    ValueError says what is wrong with it, to be put behind what it is.
+    """
+    if not text.isascii():
+        _check_length(text)
+        mapped = (
+            " " if stringprep.in_table_c12(c) else c for c in text if not stringprep.in_table_b1(c)
+        )
+        text = ucd_3_2_0.normalize("NFKC", "".join(mapped))
+    if not text:
+        raise ValueError("must not be empty")
+    if text.isascii():
+        if not text.isprintable():
+            raise ValueError(_PROHIBITED)
+        return text
+    _check_length(text)  # One character can have become eighteen.
+    if any(is_in(c) for c in text for is_in in _PROHIBITED_TABLES):
+        raise ValueError(_PROHIBITED)
+    # RFC 3454, section 6: right to left is not mixed with left to right, and is at both ends.
+    if any(map(stringprep.in_table_d1, text)) and (
+        any(map(stringprep.in_table_d2, text))
+        or not (stringprep.in_table_d1(text[0]) and stringprep.in_table_d1(text[-1]))
+    ):
+        raise ValueError("must not mix writing directions as SASLprep (RFC 4013) prohibits")
+    return text
+
+
+def _check_length(text: str) -> None:
+    if len(text) > _MAX_PREPARED:
+        raise ValueError(f"must not be longer than {_MAX_PREPARED} characters")
+
+
+_PROHIBITED: Final = (
+    "must not hold control characters, emoji and others that SASLprep (RFC 4013) prohibits"
+)
+_PROHIBITED_TABLES: Final = (
+    stringprep.in_table_a1,  # unassigned in Unicode 3.2
+    stringprep.in_table_c12,
+    stringprep.in_table_c21_c22,
+    stringprep.in_table_c3,
+    stringprep.in_table_c4,
+    stringprep.in_table_c5,
+    stringprep.in_table_c6,
+    stringprep.in_table_c7,
+    stringprep.in_table_c8,
+    stringprep.in_table_c9,
+)
+
+
+def prepared_name(username: str) -> str:
+    """The user name as clients send it; ValueError says why it cannot be one."""
+    try:
+        return saslprep(username)
+    except ValueError as error:
+        raise ValueError(f"a user name {error}") from None
+
+
+def _unescaped(name: str) -> str:
+    return name.replace("=2C", ",").replace("=3D", "=")
+
+
+def _check_extensions(message: str) -> None:
+    """The attribute m= says that who does not know it must not go on."""
+    if ",m=" in message:  # no value holds a comma
+        raise ValueError("the client asks for an extension that is not known here")
+
+
+def _refusal(reason: str) -> Refusal:
+    return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()

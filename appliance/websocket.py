@@ -1,0 +1,276 @@
+"""MQTT over WebSocket (section 6 of both versions): RFC 6455 between a transport and a protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+from websockets.exceptions import NegotiationError, PayloadTooBig
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request, Response
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+from websockets.typing import Subprotocol
+
+#: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
+PATH = "/mqtt"
+SUBPROTOCOLS = ("mqtt", "mqttv3.1")
+
+#: The largest head of an HTTP request, in bytes: a browser's, with all the cookies it may have.
+HEAD_LIMIT = 16 * 1024
+
+#: Bytes of frames that are taken apart in one go, some milliseconds at worst (frames may be empty);
+#: then it is the turn of other clients.
+TURN = 32 * 1024
+
+# The library tells of every connection; what is of interest is told here, with the address.
+_library_log = logging.getLogger(f"{__name__}.frames")
+_library_log.setLevel(logging.ERROR)
+
+
+class WebSocket(asyncio.Transport, asyncio.Protocol):
+    """A protocol to the transport below, and a transport to the `protocol` above.
+
+    What is above reads and writes bytes, and its flow control is that of the transport below. It
+    receives a message in the fragments that it comes in, and none while it has paused reading.
+
+    `frame_limit` says how large a frame may be that is received now, in bytes; `complain` is told
+    what was refused or ended, and why. Whether a page of another origin opened the connection makes
+    no difference: no browser adds a password to it.
+    """
+
+    def __init__(
+        self,
+        protocol: asyncio.Protocol,
+        frame_limit: Callable[[], int],
+        complain: Callable[[str, str], None],
+    ) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self._frame_limit = frame_limit
+        self._complain = complain
+        self._loop = asyncio.get_running_loop()
+        self._frames = _Frames(logger=_library_log)
+        #: The HTTP request, until it is complete.
+        self._head = bytearray()
+        #: Received, and not yet taken apart.
+        self._held = b""
+        self._reading = True
+        self._writing = True
+        #: The answer to the last ping, while it cannot be written.
+        self._pong = b""
+
+    # --- towards the transport -----------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The connection is there; what is above may close it, and read when it is upgraded."""
+        self._transport = cast(asyncio.Transport, transport)
+        self._protocol.connection_made(self)
+
+    def data_received(self, data: bytes) -> None:
+        """Hand on what the frames hold, whole or in part."""
+        self._held += data
+        self._take()
+
+    def _take(self) -> None:
+        data, self._held = self._held[:TURN], self._held[TURN:]
+        if self._held:
+            self._transport.pause_reading()
+            self._loop.call_soon(self._take_on)
+        if self._frames.state is State.CONNECTING:
+            data = self._receive_head(data)
+        if data:
+            self._receive_frames(data)
+
+    def _take_on(self) -> None:
+        if self._transport.is_closing() or not self._reading:
+            return
+        if self._held:
+            self._take()
+        if not self._held and self._reading and not self._transport.is_closing():
+            self._transport.resume_reading()
+
+    def _receive_head(self, data: bytes) -> bytes:
+        """Answer the HTTP request once it is complete; returns what came behind it."""
+        head = self._head
+        head += data
+        end = head.find(b"\r\n\r\n") + 4
+        if not head[:1].isupper():
+            self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
+        elif end > 3:
+            # The library would read frames before the answer to the request, so it gets the two
+            # one after the other.
+            self._frames.receive_data(bytes(head[:end]))
+            behind = bytes(head[end:])
+            head.clear()
+            if self._upgrade():
+                return behind
+        elif len(head) > HEAD_LIMIT:
+            self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
+        return b""
+
+    def _upgrade(self) -> bool:
+        frames = self._frames
+        events = frames.events_received()
+        if not events:
+            error = frames.handshake_exc and frames.handshake_exc.__cause__
+            self._refuse(400, f"not a WebSocket request: {error}")
+            return False
+        request = cast(Request, events[0])
+        if request.path.partition("?")[0] != PATH:
+            self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
+            return False
+        response = frames.accept(request)
+        if response.status_code != 101:
+            self._send_refusal(response, str(frames.handshake_exc))
+            return False
+        frames.send_response(response)
+        self._send(frames.data_to_send())
+        return True
+
+    def _refuse(self, status: int | None, reason: str, path: str | None = None) -> None:
+        response = None if status is None else self._frames.reject(status, f"{reason}\n")
+        self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
+
+    def _send_refusal(self, response: Response | None, reason: str) -> None:
+        self._complain("no WebSocket connection", reason)
+        if response is not None:
+            self._transport.write(response.serialize())
+        self._transport.close()
+
+    def _receive_frames(self, data: bytes) -> None:
+        frames = self._frames
+        frames.max_size = self._frame_limit()
+        frames.receive_data(data)
+        payload: list[bytes] = []
+        is_text = False
+        for frame in frames.events_received():
+            assert not isinstance(frame, Request | Response)
+            if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]
+                is_text = True
+                break
+            if frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
+                payload.append(cast(bytes, frame.data))
+        if payload:  # [MQTT-6.0.0-2]
+            self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
+        self._answer(frames.data_to_send())
+        error = frames.parser_exc
+        if is_text:
+            self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
+        elif isinstance(error, PayloadTooBig):
+            self._fail(CloseCode.MESSAGE_TOO_BIG, f"a frame that is too large ({error})")
+        elif error is not None:
+            self._fail(CloseCode.PROTOCOL_ERROR, str(error))
+        elif frames.close_rcvd is not None:
+            self._transport.close()
+
+    def _answer(self, writes: list[bytes]) -> None:
+        """Send the pongs and the close frame that the library has ready."""
+        if self._writing or self._frames.state is not State.OPEN:
+            self._send(writes)
+        elif writes:
+            # Who pings on and does not read is owed the last answer only (RFC 6455, 5.5.3).
+            self._pong = writes[-1]
+
+    def _fail(self, code: CloseCode, reason: str) -> None:
+        self._complain("not the WebSocket protocol", reason)
+        if self._frames.state is State.OPEN:
+            self._frames.send_close(code, reason)
+            self._send(self._frames.data_to_send())
+        self._transport.close()
+
+    def _send(self, writes: list[bytes]) -> None:
+        if any(writes):
+            self._transport.write(writes[0] if len(writes) == 1 else b"".join(writes))
+
+    def pause_writing(self) -> None:
+        """The other side reads slower than it is written to."""
+        self._writing = False
+        self._protocol.pause_writing()
+
+    def resume_writing(self) -> None:
+        """It has caught up."""
+        self._writing = True
+        pong, self._pong = self._pong, b""
+        if pong and self._frames.state is State.OPEN:
+            self._transport.write(pong)
+        self._protocol.resume_writing()
+
+    def eof_received(self) -> bool | None:
+        """The other side will send no more."""
+        return self._protocol.eof_received()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection ended, whoever ended it."""
+        self._protocol.connection_lost(exc)
+
+    # --- towards the protocol ------------------------------------------------------------------
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Send a binary frame; what comes after the other side's close frame is dropped."""
+        if self._frames.state is State.OPEN:
+            self._frames.send_binary(data)  # type: ignore[arg-type]
+            self._send(self._frames.data_to_send())
+
+    def close(self) -> None:
+        """Send a close frame behind what was written, and close."""
+        if self._frames.state is State.OPEN and not self._transport.is_closing():
+            self._frames.send_close(CloseCode.NORMAL_CLOSURE)
+            self._send(self._frames.data_to_send())
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._transport.abort()
+
+    def is_closing(self) -> bool:
+        """Whether it is closed, or about to be."""
+        return self._transport.is_closing()
+
+    def pause_reading(self) -> None:
+        """Take nothing apart until `resume_reading`."""
+        self._reading = False
+        self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Go on with what was received meanwhile."""
+        self._reading = True
+        if self._held:
+            self._loop.call_soon(self._take_on)
+        else:
+            self._transport.resume_reading()
+
+    def is_reading(self) -> bool:
+        """Whether reading is not paused."""
+        return self._reading
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """Those of the transport below."""
+        self._transport.set_write_buffer_limits(high, low)
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes that wait in the transport below."""
+        return self._transport.get_write_buffer_size()
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """What the transport below knows."""
+        return self._transport.get_extra_info(name, default)
+
+
+class _Frames(ServerProtocol):
+    """The library's side of a connection, without I/O."""
+
+    def select_subprotocol(self, subprotocols: Sequence[Subprotocol]) -> Subprotocol:
+        """The first one known of what the client offers, in its order [MQTT-6.0.0-3]."""
+        for subprotocol in subprotocols:
+            if subprotocol in SUBPROTOCOLS:
+                return subprotocol
+        raise NegotiationError(f"offer the subprotocol {' or '.join(SUBPROTOCOLS)}")
+
+    def recv_frame(self, frame: Frame) -> None:
+        """Take a frame in; the limit of sizes is for a frame, as no message is put together."""
+        super().recv_frame(frame)
+        if self.cur_size:
+            self.cur_size = 0
