@@ -44,6 +44,7 @@ async def receive(client: MQTTClient) -> tuple[str, str, int | None, bool]:
     return message.topic, message.data.decode(), message.qos, message.retain
 
 
+@pytest.mark.statement("3.1.1", "MQTT-7.0.0-2")
 @pytest.mark.parametrize("qos", QOS)
 async def test_publish_and_subscribe(appliance: ApplianceProcess, topic: str, qos: int) -> None:
     async with connected(appliance) as sender, connected(appliance) as receiver:

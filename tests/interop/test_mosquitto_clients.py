@@ -111,6 +111,7 @@ def brief(message: dict[str, Any]) -> tuple[str, str, int, int]:
     return message["topic"], payload, message["qos"], message["retain"]
 
 
+@pytest.mark.statement("3.1.1", "MQTT-7.0.0-2")
 @pytest.mark.parametrize("qos", QOS)
 def test_publish_and_subscribe(broker: BrokerProcess, version: str, topic: str, qos: int) -> None:
     clients = Mosquitto(broker, version)

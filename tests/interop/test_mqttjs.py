@@ -72,6 +72,7 @@ def brief(message: dict[str, Any]) -> tuple[str, str, int, bool]:
     return message["topic"], message["payload"], message["qos"], message["retain"]
 
 
+@pytest.mark.statement("3.1.1", "MQTT-7.0.0-2")
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("qos", QOS)
 def test_publish_and_subscribe(

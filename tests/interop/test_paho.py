@@ -17,6 +17,7 @@ QOS = [0, 1, 2]
 both_versions = pytest.mark.parametrize("version", [V311, V5], ids=["v311", "v5"])
 
 
+@pytest.mark.statement("3.1.1", "MQTT-7.0.0-2")
 @both_versions
 @pytest.mark.parametrize("qos", QOS)
 def test_publish_and_subscribe(

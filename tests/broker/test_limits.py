@@ -1,0 +1,307 @@
+"""What happens when a limit is reached: policies for full queues, memory, turns and complaints."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from appliance.broker.broker import Broker
+from appliance.broker.complaints import BURST, INTERVAL
+from appliance.broker.message import Message
+from appliance.broker.ports import Action, Features, Limits
+from appliance.broker.session import REPLAYED_A_TURN, subscription_size
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Connect, Publish, Suback, Subscribe, Subscription, Will
+from appliance.mqtt.reason import ReasonCode
+
+from .conftest import FakeAccess, Join, Peer, lasting, waiting_bytes
+
+SMALL = {"queue_messages": 3, "inflight": 1}
+
+
+def fill(publisher: Peer, count: int, qos: int = 1) -> list[int]:
+    return [publisher.publish("a", b"%d" % number, qos) for number in range(count)]
+
+
+# --- full queues of QoS 1 and 2
+
+
+@pytest.mark.parametrize("limits", [Limits(**SMALL)])
+@pytest.mark.parametrize("qos", [1, 2])
+def test_refuse_tells_the_publisher_and_keeps_what_was_taken(join: Join, qos):
+    subscriber = join("subscriber")
+    subscriber.subscribe("a", qos)
+    assert fill(join("publisher"), 6, qos) == [0, 0, 0, 0, 0x97, 0x97]
+    assert [m.payload for m in subscriber.drain()] == [b"0", b"1", b"2", b"3"]
+
+
+@pytest.mark.parametrize("limits", [Limits(**SMALL)])
+def test_one_full_queue_does_not_keep_a_message_from_the_others(join: Join):
+    """QoS 1: they get it, and the publisher is told; QoS 2: it is taken, for those with room."""
+    full, free = join("full"), join("free")
+    for subscriber in (full, free):
+        subscriber.subscribe("a", 2)
+    publisher = join("publisher")
+    for number in range(4):
+        publisher.publish("a", b"%d" % number, 1)
+        free.drain()
+    assert publisher.publish("a", b"alarm", 1) == 0x97
+    assert publisher.publish("a", b"once", 2) == 0
+    assert [m.payload for m in free.drain()] == [b"alarm", b"once"]
+    assert [m.payload for m in full.drain()] == [b"0", b"1", b"2", b"3"]
+
+
+@pytest.mark.parametrize("limits", [Limits(**SMALL)])
+def test_what_pubrec_took_is_kept_though_the_queue_filled_meanwhile(join: Join):
+    subscriber = join("subscriber")
+    subscriber.subscribe("a", 2)
+    promised = join("promised")
+    promised.send(Publish("a", b"promised", 2, packet_id=1))
+    assert promised.received()[0].reason_code == 0  # type: ignore[union-attr]
+    assert fill(join("publisher"), 5)[-1] == 0x97
+    promised.send(bytes.fromhex("62 02 0001"))
+    assert b"promised" in [m.payload for m in subscriber.drain()]
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_full="drop-oldest", **SMALL)])
+@pytest.mark.parametrize("qos", [1, 2])
+def test_drop_oldest_keeps_the_newest(join: Join, broker: Broker, store, qos):
+    subscriber = join("subscriber", **lasting(5))
+    subscriber.subscribe("a", qos)
+    assert fill(join("publisher"), 8, qos) == [0] * 8
+    assert sum(store.owed.values()) == 4
+    assert [m.payload for m in subscriber.drain()] == [b"0", b"5", b"6", b"7"]
+    assert broker.counters.publish_dropped == 4
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_full="disconnect", **SMALL)])
+@pytest.mark.parametrize("qos", [1, 2])
+def test_disconnect_ends_the_connection_and_keeps_the_session(join: Join, qos):
+    subscriber = join("subscriber", **lasting(5))
+    subscriber.subscribe("a", qos)
+    publisher = join("publisher")
+    fill(publisher, 4, qos)
+    assert not subscriber.wire.closed
+    fill(publisher, 1, qos)
+    assert subscriber.farewell() == ReasonCode.QUOTA_EXCEEDED
+    back = join("subscriber", **lasting(5))
+    assert [m.payload for m in back.drain()] == [b"0", b"1", b"2", b"3"]
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_full="disconnect", **SMALL)])
+def test_a_chain_of_wills_behind_full_queues_comes_to_an_end(join: Join):
+    """Each one's will is what overflows the next one's queue."""
+    peers = [join(f"p{n}", will=Will(f"t/{n + 1}", b"will", 1), keep_alive=0) for n in range(200)]
+    for number, peer in enumerate(peers):
+        peer.subscribe(f"t/{number}", 1)
+    publisher = join("publisher")
+    for number in range(200):
+        for _ in range(4):
+            publisher.publish(f"t/{number}", b"x", 1)
+    publisher.publish("t/0", b"x", 1)
+    assert all(peer.wire.closed for peer in peers)
+
+
+# --- QoS 0 for slow clients
+
+
+@pytest.mark.parametrize("limits", [Limits(keep=3)])
+def test_a_queue_of_n_keeps_the_newest_n_in_order(join: Join, broker: Broker):
+    subscriber = join("subscriber")
+    subscriber.subscribe("a")
+    subscriber.slow()
+    fill(join("publisher"), 8, 0)
+    subscriber.fast()
+    assert subscriber.payloads() == [b"5", b"6", b"7"]
+    assert broker.counters.publish_dropped == 5 and waiting_bytes(broker) == 0
+
+
+# --- memory
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_bytes=100_000, subscriptions=10_000)])
+def test_subscriptions_take_memory(join: Join):
+    peer = join()
+    deep = "/".join("x" * 1 for _ in range(100))
+    codes = [peer.subscribe(f"{number}/{deep}") for number in range(5)]
+    assert subscription_size(f"0/{deep}") > 30_000
+    assert codes == [0, 0, 0x97, 0x97, 0x97]
+    peer.unsubscribe(f"0/{deep}")
+    assert peer.subscribe(f"9/{deep}") == 0
+
+
+@pytest.mark.parametrize("limits", [Limits(memory=100_000)])
+def test_wills_take_memory(broker: Broker):
+    codes = []
+    for number in range(4):
+        peer = Peer(broker)
+        answer = peer.connect(f"c{number}", will=Will("w", bytes(40_000)))
+        codes.append(answer.reason_code)
+    assert codes == [0, 0, 0x97, 0x97]
+
+
+@pytest.mark.parametrize("limits", [Limits(retained_bytes=200_000)])
+def test_levels_of_retained_topics_take_memory(join: Join):
+    peer = join()
+    deep = "/".join("x" for _ in range(150))
+    codes = [peer.publish(f"{n}/{deep}", b"x", 1, retain=True) for n in range(6)]
+    assert codes[:3] == [0x10] * 3 and codes[-1] == 0x97
+
+
+@pytest.mark.parametrize("size", [10, 5000])
+def test_a_message_that_waits_is_held_once(join: Join, size):
+    subscriber = join("subscriber", version=4)
+    subscriber.subscribe("a")
+    subscriber.slow()
+    join("publisher", version=4).publish("a", bytes(size))
+    ((message, *_),) = subscriber.session.latest.values()
+    assert (size < 1024) == bool(message.wire_head)
+    assert message.head(5, 0x30) == Publish("a", bytes(size)).encode(5)
+    message.settle()
+    subscriber.fast()
+    assert subscriber.payloads() == [bytes(size)]
+
+
+@pytest.mark.parametrize("limits", [Limits(topic_length=10)])
+def test_long_topics(join: Join):
+    peer = join()
+    assert peer.publish("a" * 11, b"", 1) == ReasonCode.TOPIC_NAME_INVALID
+    assert peer.publish("a" * 10, b"", 1) == ReasonCode.NO_MATCHING_SUBSCRIBERS
+    assert peer.subscribe("ä" * 6) == ReasonCode.TOPIC_FILTER_INVALID
+    assert peer.subscribe("ä" * 5) == 0
+
+
+# --- turns
+
+
+def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
+    publisher = join("publisher")
+    count = 3 * REPLAYED_A_TURN + 5
+    for number in range(count):
+        publisher.publish(f"r/{number}", b"%d" % number, retain=True)
+    subscriber = join("subscriber")
+    subscriber.subscribe("r/#")
+    heard = subscriber.payloads()
+    assert len(heard) == REPLAYED_A_TURN
+    while subscriber.wire.laters:
+        subscriber.wire.laters -= 1
+        subscriber.client.send_on()
+        broker.flush()
+    assert len(heard + subscriber.payloads()) == count
+
+
+def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access: FakeAccess):
+    access.deny("user", Action.RECEIVE, "r/+")
+    publisher = join("publisher")
+    for number in range(REPLAYED_A_TURN + 5):
+        publisher.publish(f"r/{number}", b"", 0)
+        broker.retained.set(f"r/{number}", Message(f"r/{number}", b"x", retain=True))
+    subscriber = join("subscriber")
+    subscriber.subscribe("r/#")
+    assert subscriber.payloads() == [] and subscriber.wire.laters == 1
+    for number in range(REPLAYED_A_TURN + 5):
+        broker.retained.delete(f"r/{number}")
+
+
+# --- complaints
+
+
+def test_a_flood_is_told_as_a_number(join: Join, broker: Broker, access: FakeAccess, caplog):
+    access.deny("user", Action.PUBLISH, "secret/#")
+    peer = join()
+    with caplog.at_level(logging.WARNING):
+        for number in range(1000):
+            peer.publish(f"secret/{number}", b"", 0)
+        assert len(caplog.records) == BURST
+        broker.tick(broker.now + INTERVAL)
+    *_, last = (record.getMessage() for record in caplog.records)
+    assert f"{1000 - BURST} more" in last and "'secret/999'" in last
+    assert broker.counters.publish_refused == 1000
+
+
+def test_different_clients_are_told_apart(join: Join, access: FakeAccess, caplog):
+    access.deny("user", Action.PUBLISH, "secret/#")
+    with caplog.at_level(logging.WARNING):
+        for number in range(2 * BURST):
+            join(f"c{number}").publish("secret", b"", 0)
+    assert len([r for r in caplog.records if "may not publish" in r.getMessage()]) == 2 * BURST
+
+
+def test_a_long_client_id_does_not_fill_the_log(broker: Broker, caplog):
+    peer = Peer(broker)
+    with caplog.at_level(logging.WARNING):
+        peer.say_connect("x" * 60_000)
+        peer.client.refuse(ReasonCode.NOT_AUTHORIZED, "wrong password")
+    (record,) = caplog.records
+    assert len(record.getMessage()) < 300
+
+
+# --- what the operator switches on
+
+
+def test_reasons_are_told_in_words_to_those_who_want_them(join: Join, broker, access: FakeAccess):
+    broker.features = Features(reason_strings=True)
+    access.deny("user", Action.PUBLISH, "secret")
+    for wanted in (1, 0):
+        peer = join(f"c{wanted}", properties={Property.REQUEST_PROBLEM_INFORMATION: wanted})
+        peer.send(Publish("secret", b"", 1, packet_id=1))
+        (answer,) = peer.received()
+        assert answer.reason_code == 0x87
+        assert bool(answer.properties) == bool(wanted)
+    small = join("small", properties={Property.MAXIMUM_PACKET_SIZE: 30})
+    small.send(Publish("secret", b"", 1, packet_id=1))
+    (answer,) = small.received()
+    assert answer.reason_code == 0x87 and not answer.properties
+
+
+def test_a_suback_that_does_not_fit_ends_the_connection(join: Join):
+    """[MQTT-3.1.2-24]"""
+    peer = join(properties={Property.MAXIMUM_PACKET_SIZE: 20})
+    peer.send(Subscribe(1, [Subscription(f"t/{n}", 0) for n in range(5)]))
+    assert isinstance(peer.received()[0], Suback)
+    peer.send(Subscribe(2, [Subscription(f"t/{n}", 0) for n in range(30)]))
+    assert peer.farewell() == ReasonCode.PACKET_TOO_LARGE
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_text_that_is_none_is_refused_when_checked(join: Join, broker: Broker, qos):
+    broker.features = Features(check_payload_format=True)
+    subscriber = join("subscriber")
+    subscriber.subscribe("a")
+    peer = join("peer")
+    text = {Property.PAYLOAD_FORMAT_INDICATOR: 1}
+    code = peer.publish("a", b"\xff", qos, properties=text)
+    assert code == (0x99 if qos else 0)
+    peer.publish("a", "ä".encode(), qos, properties=text)
+    peer.publish("a", b"\xfe", qos, properties={Property.PAYLOAD_FORMAT_INDICATOR: 0})
+    assert [m.payload for m in subscriber.messages()] == ["ä".encode(), b"\xfe"]
+    late = Peer(broker)
+    late.send(Connect("late", will=Will("w", b"\xff", properties=text)))
+    assert late.received()[0].reason_code == 0x99  # type: ignore[union-attr]
+
+
+def test_where_answers_may_go(join: Join, broker: Broker):
+    """[MQTT-3.1.2-28]"""
+    broker.features = Features(response_information="r/%u/%c")
+    peer = Peer(broker)
+    answer = peer.connect("id", properties={Property.REQUEST_RESPONSE_INFORMATION: 1})
+    assert answer.properties is not None
+    assert answer.properties[Property.RESPONSE_INFORMATION] == "r/user/id"
+    unasked = Peer(broker).connect("other")
+    assert Property.RESPONSE_INFORMATION not in (unasked.properties or {})
+
+
+@pytest.mark.parametrize("limits", [Limits(keep_alive=60)])
+@pytest.mark.parametrize("asked", [0, 61])
+def test_a_keep_alive_over_the_limit(broker: Broker, version, asked):
+    """5.0 is told another one; 3.1.1, which cannot be told, is refused, as by mosquitto."""
+    peer = Peer(broker, version)
+    answer = peer.connect("id", keep_alive=asked) if version == 5 else None
+    if answer is not None:
+        assert answer.properties is not None
+        assert answer.properties[Property.SERVER_KEEP_ALIVE] == 60
+        return
+    peer.say_connect("id", keep_alive=asked)
+    peer.let_in()
+    assert bytes(peer.wire.written) == b"\x20\x02\x00\x02"

@@ -1,0 +1,154 @@
+"""Shared subscriptions (5.0 section 4.8.2): members that are there, slow, absent and leaving."""
+
+from __future__ import annotations
+
+import pytest
+
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Action, Limits
+from appliance.mqtt.codec import Property
+
+from .conftest import FakeAccess, Join, lasting
+
+
+def publish(publisher, count: int, qos: int = 1) -> None:
+    for number in range(count):
+        publisher.publish("a", b"%d" % number, qos)
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_members_take_turns(join: Join, version, qos):
+    members = [join(f"m{n}", version=version) for n in range(3)]
+    for member in members:
+        assert member.subscribe("$share/g/a", qos) == qos
+    publish(join("publisher"), 9, qos)
+    heard = [[message.payload for message in member.drain()] for member in members]
+    assert [len(payloads) for payloads in heard] == [3, 3, 3]
+    assert sorted(payload for payloads in heard for payload in payloads) == [
+        b"%d" % n for n in range(9)
+    ]
+
+
+def test_groups_and_plain_subscriptions_each_get_their_own(join: Join, broker: Broker):
+    one, other, plain = join("one"), join("other"), join("plain")
+    one.subscribe("$share/g/a/+")
+    other.subscribe("$share/h/a/+")
+    plain.subscribe("a/#")
+    plain.subscribe("$share/g/a/+")
+    assert broker.shared_subscription_count == 2
+    publisher = join("publisher")
+    for number in range(4):
+        publisher.publish("a/b", b"%d" % number)
+    assert len(other.payloads()) == 4
+    # The plain subscription gets all, and half as a member of the group on top.
+    assert len(one.payloads()) == 2 and len(plain.payloads()) == 6
+    for member in (one, plain):
+        member.unsubscribe("$share/g/a/+")
+    assert broker.shared_subscription_count == 1
+
+
+def test_a_member_that_is_slow_is_passed_over(join: Join):
+    slow, fast = join("slow"), join("fast")
+    for member in (slow, fast):
+        member.subscribe("$share/g/a", 1)
+    slow.slow()
+    publish(join("publisher"), 6)
+    assert len(fast.drain()) == 6
+    slow.fast()
+    assert slow.messages() == []
+
+
+def test_a_member_that_does_not_acknowledge_is_passed_over(join: Join):
+    silent = join("silent", properties={Property.RECEIVE_MAXIMUM: 1})
+    busy = join("busy")
+    for member in (silent, busy):
+        member.subscribe("$share/g/a", 1)
+    publisher = join("publisher")
+    for number in range(6):
+        publisher.publish("a", b"%d" % number, 1)
+        busy.drain()
+    assert len(silent.messages()) == 1
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+def test_what_a_member_leaves_goes_to_the_others(join: Join, version, qos):
+    """v5 [MQTT-4.8.2-4]: QoS 2 in flight stays with its member, whose session is kept"""
+    leaving = join("leaving", version=version, **lasting(version))
+    leaving.subscribe("$share/g/a", qos)
+    publisher = join("publisher")
+    publish(publisher, 25, qos)  # 20 are in flight, 5 wait
+    sent = [message.payload for message in leaving.messages()]
+    staying = join("staying")
+    staying.subscribe("$share/g/a", qos)
+    leaving.lose()
+    taken = [message.payload for message in staying.drain()]
+    back = join("leaving", version=version, **lasting(version))
+    kept = [message.payload for message in back.drain()]
+    if qos == 1:
+        assert sorted(taken) == sorted(b"%d" % n for n in range(25)) and kept == []
+    else:
+        assert taken == [b"%d" % n for n in range(20, 25)] and kept == sent
+
+
+def test_a_session_that_ends_leaves_its_messages_to_an_absent_member(join: Join):
+    absent = join("absent", **lasting(5))
+    absent.subscribe("$share/g/a", 1)
+    absent.lose()
+    leaving = join("leaving")
+    leaving.subscribe("$share/g/a", 1)
+    publish(join("publisher"), 3)
+    assert len(leaving.messages()) == 3
+    leaving.disconnect()
+    assert len(join("absent", **lasting(5)).drain()) == 3
+
+
+def test_unsubscribing_finishes_what_is_in_flight_and_leaves_the_rest(join: Join):
+    """[MQTT-3.10.4-3]"""
+    leaving = join("leaving", properties={Property.RECEIVE_MAXIMUM: 1})
+    leaving.subscribe("$share/g/a", 1)
+    publish(join("publisher"), 3)
+    (first,) = leaving.messages()
+    staying = join("staying")
+    staying.subscribe("$share/g/a", 1)
+    leaving.unsubscribe("$share/g/a")
+    leaving.acknowledge(first)
+    assert leaving.messages() == []
+    assert [message.payload for message in staying.drain()] == [b"1", b"2"]
+
+
+def test_an_absent_group_keeps_qos_1_and_not_qos_0(join: Join):
+    member = join("member", **lasting(5))
+    member.subscribe("$share/g/a", 1)
+    member.lose()
+    publisher = join("publisher")
+    assert publisher.publish("a", b"kept", 1) == 0
+    publisher.publish("a", b"gone", 0)
+    assert [m.payload for m in join("member", **lasting(5)).drain()] == [b"kept"]
+
+
+def test_members_without_the_right_to_read_get_nothing(join: Join, access: FakeAccess):
+    access.deny("mallory", Action.RECEIVE, "a")
+    eve, alice = join("eve", user="mallory"), join("alice")
+    for member in (eve, alice):
+        member.subscribe("$share/g/+", 1)
+    publish(join("publisher"), 4)
+    assert eve.messages() == [] and len(alice.drain()) == 4
+
+
+def test_no_retained_messages_for_a_group(join: Join):
+    join("publisher").publish("a", b"kept", 1, retain=True)
+    member = join("member")
+    member.subscribe("$share/g/a", 1)
+    assert member.messages() == []
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_messages=2, inflight=2)])
+@pytest.mark.parametrize("qos", [1, 2])
+def test_a_group_without_room_is_told_to_the_publisher(join: Join, qos):
+    members = [join(f"m{n}") for n in range(2)]
+    for member in members:
+        member.subscribe("$share/g/a", qos)
+    publisher = join("publisher")
+    codes = [publisher.publish("a", b"%d" % number, qos) for number in range(10)]
+    assert codes == [0] * 8 + [0x97] * 2
+    assert sum(len(member.drain()) for member in members) == 8
