@@ -715,10 +715,12 @@ class Client:
                 log.info("%s: connection lost", self)
             self._leave(publish_will=True)
 
-    def tick(self, now: float) -> None:
+    def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
-        if self._silence and now - self._heard_at > self._silence:
-            self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
+        if not self._silence or now - self._heard_at <= self._silence:
+            return False
+        self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
+        return True
 
     def _leave(self, *, publish_will: bool, expiry: int | None = None) -> None:
         session = self.session

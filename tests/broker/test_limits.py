@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from appliance.broker.broker import Broker
+from appliance.broker.broker import ENDINGS_A_TURN, Broker
 from appliance.broker.complaints import BURST, INTERVAL
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
@@ -202,6 +202,24 @@ def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access
     assert subscriber.payloads() == [] and subscriber.wire.laters == 1
     for number in range(REPLAYED_A_TURN + 5):
         broker.retained.delete(f"r/{number}")
+
+
+def test_thousands_that_fall_silent_end_in_turns(join: Join, broker: Broker):
+    peers = [join(f"p{n}", keep_alive=10) for n in range(2 * ENDINGS_A_TURN + 1)]
+    for turn in (1, 2):
+        assert broker.tick(1020.0) == 1020.0
+        assert sum(peer.wire.closed for peer in peers) == turn * ENDINGS_A_TURN
+    assert broker.tick(1020.0) > 1020.0
+    assert all(peer.wire.closed for peer in peers)
+
+
+def test_thousands_of_sessions_expire_in_turns(join: Join, broker: Broker):
+    for number in range(2 * ENDINGS_A_TURN + 1):
+        join(f"p{number}", **lasting(5, 60)).lose()
+    turns = 1
+    while broker.tick(1061.0) <= 1061.0:
+        turns += 1
+    assert turns == 3 and not broker.sessions
 
 
 # --- complaints
