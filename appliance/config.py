@@ -100,17 +100,25 @@ def _in_units(value: int, units: Mapping[str, int]) -> str:
 
 
 class Bind(NamedTuple):
-    """An address to listen on. An empty host is every address of this computer; port 0 any port."""
+    """An address to listen on. An empty host is every address of this computer; port 0 any port.
+
+    With a `path` it is a Unix socket there, which has neither.
+    """
 
     host: str
     port: int
+    path: Path | None = None
 
     def __str__(self) -> str:
+        if self.path is not None:
+            return f"unix:{self.path}"
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
     @property
     def loopback(self) -> bool:
         """Whether only this computer can reach it."""
+        if self.path is not None:
+            return True
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -118,17 +126,34 @@ class Bind(NamedTuple):
 
 
 def parse_bind(value: object) -> Bind:
-    """`host:port`, `[::1]:port` or `:port`. Raises ValueError."""
+    """`host:port`, `[::1]:port`, `:port` or `unix:path`. Raises ValueError."""
     if isinstance(value, Bind):
         return value
     text = value if isinstance(value, str) else ""
+    if text.startswith("unix:") and text != "unix:":
+        return Bind("", 0, Path(text.removeprefix("unix:")))
     match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^\s:\[\]]*)):(\d{1,5})", text)
     if match is None:
-        raise ValueError('must be "host:port", "[::1]:port" or ":port"')
+        raise ValueError('must be "host:port", "[::1]:port", ":port" or "unix:path"')
     port = int(match[3])
     if port > 65535:
         raise ValueError(f"there is no port {port}")
     return Bind(match[1] or match[2], port)
+
+
+def _parse_address(value: object, info: ValidationInfo) -> Bind:
+    bind = parse_bind(value)
+    return bind if bind.path is None else bind._replace(path=_parse_path(bind.path, info))
+
+
+def _parse_mode(value: object) -> int:
+    """A file's mode; YAML reads 0660 as a number in base 8, and in quotes it is text."""
+    modes = {"0600": 0o600, "0660": 0o660, "0666": 0o666}
+    mode = modes.get(value) if isinstance(value, str) else value
+    if mode not in modes.values() or isinstance(mode, bool):
+        raise ValueError(f"must be {_either(list(modes))}")
+    assert isinstance(mode, int)
+    return mode
 
 
 def _parse_seconds(value: object, info: ValidationInfo) -> float:
@@ -259,7 +284,12 @@ Size = Annotated[int, BeforeValidator(parse_size), PlainSerializer(format_size, 
 Duration = Annotated[
     float, BeforeValidator(_parse_seconds), PlainSerializer(format_duration, when_used="json")
 ]
-Address = Annotated[Bind, PlainValidator(parse_bind), PlainSerializer(str, when_used="json")]
+Address = Annotated[Bind, PlainValidator(_parse_address), PlainSerializer(str, when_used="json")]
+Mode = Annotated[
+    int,
+    PlainValidator(_parse_mode),
+    PlainSerializer(lambda mode: f"{mode:04o}", when_used="json", return_type=str),
+]
 # Defaults of paths are validated as well: that is what makes them relative to the file.
 FilePath = Annotated[Path, PlainValidator(_parse_path), Field(validate_default=True)]
 Qos = Annotated[int | None, PlainValidator(_parse_qos), PlainSerializer(_or_auto, when_used="json")]
@@ -287,10 +317,20 @@ def _section() -> Any:
 
 
 class Listener(_Section):
-    """One address that clients connect to, with or without TLS."""
+    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket."""
 
     bind: Address
     tls: bool = False
+    protocol: Literal["mqtt", "websocket"] = "mqtt"
+    mode: Mode = 0o660
+
+    @field_validator("tls")
+    @classmethod
+    def _check_tls(cls, tls: bool, info: ValidationInfo) -> bool:
+        bind = info.data.get("bind")  # None when it is wrong itself
+        if tls and bind is not None and bind.path is not None:
+            raise ValueError("must be false for a Unix socket: nobody can listen in on it")
+        return tls
 
 
 class Tls(_Section):
@@ -319,7 +359,7 @@ class Limits(_Section):
     sessions: Count = 10_000
     subscriptions: Count = 1000
     topic_length: Annotated[Size, Field(ge=1, le=65535)] = 65535
-    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 200
+    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 201
     retained_messages: Annotated[int, Field(ge=0)] = 100_000
     retained_bytes: Annotated[Size, Field(ge=0)] = 64 << 20
     connect_timeout: Annotated[Duration, Field(gt=0)] = 10.0
@@ -478,7 +518,7 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     seen: dict[Bind, int] = {}
     for number, listener in enumerate(settings.broker.listeners):
         first = seen.setdefault(listener.bind, number)
-        if first != number and listener.bind.port:
+        if first != number and (listener.bind.port or listener.bind.path):
             path = ("broker", "listeners", number, "bind")
             yield path, f"broker.listeners[{first}] listens there already"
     routes: dict[tuple[str, str], int] = {}

@@ -84,11 +84,11 @@ class Route:
     allowed: bool
     #: The rule that decided.
     reason: str
-    #: What the client is told when it is not allowed.
-    refusal: ReasonCode
     targets: list[Target]
     #: Shared subscriptions, and those of their members that may receive the topic.
     shares: list[tuple[Share, list[Target]]]
+    #: Whether there is any subscription to the topic, be it of a client that gets nothing.
+    subscribed: bool
 
 
 #: Who a message may be owed to: a session, or one of a group.
@@ -349,33 +349,33 @@ class Broker:
             check_topic(topic)
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        decision, refusal = self._may_publish(session, topic)
-        targets, shares = self._targets(session, topic) if decision else ([], [])
-        return Route(topic, decision.allowed, decision.reason, refusal, targets, shares)
+        decision = self._may_publish(session, topic)
+        matches = self._subscriptions.match(topic) if decision else []
+        targets, shares = self._targets(session, topic, matches)
+        return Route(topic, decision.allowed, decision.reason, targets, shares, bool(matches))
 
-    def _may_publish(self, session: Session, topic: str) -> tuple[Decision, ReasonCode]:
+    def _may_publish(self, session: Session, topic: str) -> Decision:
         if session.identity is None:
-            return _ALLOWED, ReasonCode.SUCCESS
-        excess = self._excess(topic)
-        if excess:
-            return Decision(False, excess), ReasonCode.TOPIC_NAME_INVALID
+            return _ALLOWED
+        excess = self.excess(topic)
+        if excess:  # [MQTT-4.13.1-1]; as mosquitto does
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic with {excess}")
         if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
             reason = "topics that begin with $ are the broker's own"
-            return Decision(False, reason), ReasonCode.NOT_AUTHORIZED
-        decision = self.access.decide(session.identity, Action.PUBLISH, topic)
-        return decision, ReasonCode.NOT_AUTHORIZED
+            return Decision(False, reason)
+        return self.access.decide(session.identity, Action.PUBLISH, topic)
 
-    def _excess(self, topic: str) -> str:
-        """Which limit the topic or filter is over, if any."""
+    def excess(self, topic: str) -> str:
+        """What the topic or filter has too much of, if anything."""
         limits = self.limits
         if topic.count("/") >= limits.topic_levels:
             return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
         if len(topic) > limits.topic_length // 4 and len(topic.encode()) > limits.topic_length:
-            return f"longer than {limits.topic_length} bytes (broker.limits.topic_length)"
+            return f"more than {limits.topic_length} bytes (broker.limits.topic_length)"
         return ""
 
     def _targets(
-        self, origin: Session, topic: str
+        self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
     ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
         """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1].
 
@@ -384,7 +384,7 @@ class Broker:
         """
         merged: dict[str, Target] = {}
         shares: list[tuple[Share, list[Target]]] = []
-        for match in self._subscriptions.match(topic):
+        for match in matches:
             if isinstance(match, Share):
                 shares.append((match, self._members(match, topic)))
                 continue
@@ -435,8 +435,8 @@ class Broker:
     def publish(self, message: Message, origin: Session) -> ReasonCode:
         """Deliver the message to every session that subscribed to its topic.
 
-        Returns 0x00, 0x10 when nobody did, 0x87 or 0x90 when `origin` may not publish it (told in
-        the log), 0x97 when somebody who subscribed, or the retained messages, had no room for it.
+        Returns 0x00, 0x10 when nobody did, 0x87 when `origin` may not publish it (told in the
+        log), 0x97 when somebody who subscribed, or the retained messages, had no room for it.
 
         Raises:
             ProtocolError: the topic is not valid.
@@ -450,36 +450,35 @@ class Broker:
         """`publish`, for who has the message's route already: to these of its targets."""
         if not route.allowed:
             self.refuse_publish(origin, route, message)
-            return route.refusal
+            return ReasonCode.NOT_AUTHORIZED
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
         kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
-        matched = False
         published_qos = message.qos
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
-            if session.deliver(message, qos, retain and as_published, subscription_ids):
-                matched = True
-            elif qos:
+            if not session.deliver(message, qos, retain and as_published, subscription_ids) and qos:
                 self._tell_full(session)
                 kept = False
         for share, members in route.shares:
             chosen = share.choose(members, message)
             if chosen is not None:
-                matched = self._deliver_shared(chosen, message, share) or matched
+                self._deliver_shared(chosen, message, share)
             elif published_qos and members:
                 self._tell_full(members[0][0])
                 kept = False
         if kept:
-            return ReasonCode.SUCCESS if matched else ReasonCode.NO_MATCHING_SUBSCRIBERS
+            # 0x10 is for a topic without a subscription. That its client is absent, or may not
+            # read it, is nothing to tell the publisher.
+            return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
         return ReasonCode.QUOTA_EXCEEDED
 
-    def _deliver_shared(self, target: Target, message: Message, share: Share) -> bool:
+    def _deliver_shared(self, target: Target, message: Message, share: Share) -> None:
         session, qos, as_published, subscription_ids = target
         retain = message.retain and as_published
-        return session.deliver(message, min(qos, message.qos), retain, subscription_ids, share)
+        session.deliver(message, min(qos, message.qos), retain, subscription_ids, share)
 
     def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
@@ -616,9 +615,6 @@ class Broker:
             parse_shared(topic_filter)
         except ValueError as error:
             return ReasonCode.TOPIC_FILTER_INVALID, str(error)
-        excess = self._excess(topic_filter)
-        if excess:
-            return ReasonCode.TOPIC_FILTER_INVALID, excess
         if session.identity is None:
             return None
         if topic_filter not in session.subscriptions:

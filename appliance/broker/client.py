@@ -86,18 +86,6 @@ class Wire(Protocol):
         """Write what was written so far, then close."""
 
 
-def _check_filter(topic_filter: str) -> None:
-    """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
-    try:
-        check_filter(topic_filter)
-    except ValueError as error:
-        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-    try:
-        parse_shared(topic_filter)
-    except ValueError as error:
-        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
-
-
 class Client:
     """One network connection; its `Link` to a session once it has logged in."""
 
@@ -211,6 +199,7 @@ class Client:
             packet.retain,
             packet.properties,
             self._expires_at(packet.properties),
+            passed_on=packet.passed_on,
         )
         route = broker.route(session, message.topic_wire)
         packet_id = packet.packet_id or 0
@@ -241,7 +230,7 @@ class Client:
         elif not route.allowed:
             self.broker.refuse_publish(session, route, message)
             # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
-            code = route.refusal
+            code = ReasonCode.NOT_AUTHORIZED
         elif self._version == 5 and len(session.received) >= self._unfinished_maximum:
             raise ProtocolError(  # [MQTT-3.3.4-7]
                 ReasonCode.RECEIVE_MAXIMUM_EXCEEDED,
@@ -309,7 +298,7 @@ class Client:
         identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
         identifier = identifiers[0] if isinstance(identifiers, list) else 0
         for subscription in packet.subscriptions:
-            _check_filter(subscription.filter)
+            self._check_filter(subscription.filter)
         codes: list[int] = []
         granted: list[tuple[Subscription, bool]] = []
         for subscription in packet.subscriptions:
@@ -326,11 +315,25 @@ class Client:
         for subscription, is_new in granted:
             self.broker.send_retained(session, subscription, is_new)
 
+    def _check_filter(self, topic_filter: str) -> None:
+        """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+        try:
+            check_filter(topic_filter)
+        except ValueError as error:
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+        try:
+            shared = parse_shared(topic_filter)
+        except ValueError as error:
+            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
+        excess = self.broker.excess(shared[1] if shared else topic_filter)
+        if excess:
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic filter with {excess}")
+
     def _on_unsubscribe(self, packet: Unsubscribe) -> None:
         session = self.session
         assert session is not None
         for name in packet.filters:
-            _check_filter(name)
+            self._check_filter(name)
         codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
         self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
 
@@ -363,6 +366,10 @@ class Client:
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
         will = packet.will
+        excess = self.broker.excess(will.topic) if will is not None else ""
+        if excess:
+            self.refuse(ReasonCode.TOPIC_NAME_INVALID, f"its will's topic has {excess}")
+            return
         checked = self.broker.features.check_payload_format
         if will is not None and checked and not is_text(will.payload, will.properties):
             reason = "its will is marked as text and is not"

@@ -78,22 +78,22 @@ def connack_properties(
     if connect.version != 5:
         return None
     properties: Properties = {}
+    if connect.keep_alive != agreement.keep_alive:  # [MQTT-3.1.2-21], [MQTT-3.2.2-22]
+        properties[Property.SERVER_KEEP_ALIVE] = agreement.keep_alive
     if limits.topic_alias:
         properties[Property.TOPIC_ALIAS_MAXIMUM] = limits.topic_alias
     if not connect.client_id:  # [MQTT-3.2.2-16]
         properties[Property.ASSIGNED_CLIENT_IDENTIFIER] = identity.client_id
-    if connect.keep_alive != agreement.keep_alive:  # [MQTT-3.1.2-21], [MQTT-3.2.2-22]
-        properties[Property.SERVER_KEEP_ALIVE] = agreement.keep_alive
     if _number(connect, Property.SESSION_EXPIRY_INTERVAL, 0) != agreement.expiry:
         properties[Property.SESSION_EXPIRY_INTERVAL] = agreement.expiry
-    if limits.packet_size < USUAL_PACKET_SIZE:
-        properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size
     asked = _number(connect, Property.REQUEST_RESPONSE_INFORMATION, 0)
     if asked and features.response_information:  # [MQTT-3.1.2-28]
         information = features.response_information.replace("%c", identity.client_id)
         information = information.replace("%u", identity.username or "")
         properties[Property.RESPONSE_INFORMATION] = information
     properties |= authentication
+    if limits.packet_size < USUAL_PACKET_SIZE:
+        properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size
     if limits.inflight != 0xFFFF:
         properties[Property.RECEIVE_MAXIMUM] = limits.inflight
     return properties
@@ -107,7 +107,14 @@ def pending_will(connect: Connect) -> PendingWill | None:
     properties = dict(will.properties or {})
     delay = properties.pop(Property.WILL_DELAY_INTERVAL, 0)
     assert isinstance(delay, int)
-    message = Message(will.topic, will.payload, will.qos, will.retain, properties or None)
+    message = Message(
+        will.topic,
+        will.payload,
+        will.qos,
+        will.retain,
+        properties or None,
+        passed_on=will.passed_on,
+    )
     return PendingWill(message, delay)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from appliance.mqtt.codec import (
     Properties,
     Property,
-    encode_properties,
+    encode_property_list,
     encode_string,
     encode_varint,
 )
@@ -30,6 +30,7 @@ class Message:
 
     __slots__ = (
         "_heads",
+        "_passed_on",
         "_properties_wire",
         "expires_at",
         "payload",
@@ -52,6 +53,7 @@ class Message:
         properties: Properties | None = None,
         expires_at: float | None = None,
         topic_wire: bytes | None = None,
+        passed_on: bytes | None = None,
     ) -> None:
         self.topic = topic
         self.payload = payload
@@ -65,12 +67,14 @@ class Message:
         self.wire_key = 0
         self.wire_head = b""
         self._heads: dict[int, bytes] | None = None
+        #: The properties that all receivers get, as they stand in a packet, without their length.
+        self._passed_on = passed_on
         self._properties_wire: bytes | None = None
         #: Bytes that a queue counts for this message.
         self.size = len(payload) + len(self.topic_wire) + OVERHEAD
         if properties:
             pairs = properties.get(Property.USER_PROPERTY)
-            self.size += len(encode_properties(properties))
+            self.size += len(encode_property_list(properties))
             self.size += PAIR_OVERHEAD * len(pairs) if isinstance(pairs, list) else 0
 
     def head(self, version: int, first: int) -> bytes:
@@ -97,8 +101,16 @@ class Message:
     def properties_wire(self) -> bytes:
         """The properties as they stand in an MQTT 5 packet, between packet id and payload."""
         if self._properties_wire is None:
-            self._properties_wire = encode_properties(self.properties) if self.properties else b"\0"
+            passed_on = self._properties_of_all()
+            self._properties_wire = encode_varint(len(passed_on)) + passed_on
         return self._properties_wire
+
+    def _properties_of_all(self) -> bytes:
+        if self._passed_on is None:
+            properties = dict(self.properties or {})
+            properties.pop(Property.MESSAGE_EXPIRY_INTERVAL, None)
+            self._passed_on = encode_property_list(properties) if properties else b""
+        return self._passed_on
 
     def settle(self) -> None:
         """The message is going to wait: what can be encoded again is not kept, if it is large."""
@@ -124,18 +136,17 @@ class Message:
         stands for the name when not `named`, and the time that is left of the expiry interval
         [MQTT-3.3.2-6]. The properties are in mosquitto's order.
         """
-        properties: Properties = {}
+        before: Properties = {}
         if alias:
-            properties[Property.TOPIC_ALIAS] = alias
+            before[Property.TOPIC_ALIAS] = alias
         if subscription_ids:
-            properties[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
-        properties |= self.properties or {}
+            before[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
+        properties = encode_property_list(before) + self._properties_of_all()
         if self.expires_at is not None:
-            del properties[Property.MESSAGE_EXPIRY_INTERVAL]
             left = max(0, round(self.expires_at - now))
-            properties[Property.MESSAGE_EXPIRY_INTERVAL] = left
+            properties += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: left})
         body = self.topic_wire if named else b"\0\0"
         if first & 0x06:
             body += packet_id.to_bytes(2, "big")
-        body += encode_properties(properties) + self.payload
+        body += encode_varint(len(properties)) + properties + self.payload
         return bytes((first,)) + encode_varint(len(body)) + body

@@ -203,7 +203,7 @@ class Limits:
     inflight: int = 20
     subscriptions: int = 1000
     topic_length: int = 65535
-    topic_levels: int = 200
+    topic_levels: int = 201
     retained_messages: int = 100_000
     retained_bytes: int = 64 * 1024 * 1024
     session_expiry: int = 7 * 24 * 3600

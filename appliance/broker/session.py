@@ -343,6 +343,8 @@ class Session:
             self._uncount(message)
             if self._has_expired(message):
                 self._settled(message, delivery[1])
+                # Its number is used up, as by mosquitto, which gives them out on queueing.
+                self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
                 self._send(link, delivery)
 

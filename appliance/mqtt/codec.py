@@ -297,6 +297,12 @@ def encode_properties(properties: Properties | None) -> bytes:
     """Properties with their length in front (5.0 section 2.2.2); None and {} give a single 0."""
     if not properties:
         return b"\0"  # v5 [MQTT-2.2.2-1]
+    out = encode_property_list(properties)
+    return encode_varint(len(out)) + out
+
+
+def encode_property_list(properties: Properties) -> bytes:
+    """Properties, one behind the other, without their length."""
     out = bytearray()
     for identifier, value in properties.items():
         kind = PROPERTY_RULES[identifier].kind
@@ -317,7 +323,7 @@ def encode_properties(properties: Properties | None) -> bytes:
                 out += encode_binary(cast(bytes, value))
             else:
                 out += _encode_uint(cast(int, value), kind.value)
-    return encode_varint(len(out)) + out
+    return bytes(out)
 
 
 def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Properties | None, int]:
@@ -347,6 +353,23 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
             raise ProtocolError(ReasonCode.PROTOCOL_ERROR, f"{identifier.name} is there twice")
         pos = _decode_property(buf, pos + 1, identifier, rule, properties)
     return properties, pos
+
+
+def without_properties(buf: bytes, pos: int, left_out: frozenset[Property]) -> bytes:
+    """The properties at `pos`, which `decode_properties` has accepted, but for some of them.
+
+    In their own order, which a `Properties` does not keep: there all User Properties are one.
+    """
+    length, pos = decode_varint(buf, pos)
+    stop = pos + length
+    kept: list[bytes] = []
+    while pos < stop:
+        start = pos
+        identifier, rule = _KNOWN[buf[pos]]
+        pos = _decode_property(buf, pos + 1, identifier, rule, {})
+        if identifier not in left_out:
+            kept.append(buf[start:pos])
+    return b"".join(kept)
 
 
 def _decode_property(

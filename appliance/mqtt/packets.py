@@ -38,7 +38,7 @@ from appliance.mqtt.codec import (
     quote,
     reason_name,
 )
-from appliance.mqtt.connect import Auth, Connack, Connect, Will
+from appliance.mqtt.connect import Auth, Connack, Connect, Will, properties_to_pass_on
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import parse_shared
 
@@ -120,6 +120,8 @@ class Publish:
     dup: bool = False
     packet_id: int | None = None
     properties: Properties | None = None
+    #: Its properties as they came, for those it goes to, when `properties` has lost their order.
+    passed_on: bytes | None = field(default=None, repr=False, compare=False)
 
     def encode(self, version: int) -> bytes:
         """The whole packet."""
@@ -148,13 +150,16 @@ class Publish:
         packet_id = None
         if qos:
             packet_id, pos = decode_packet_id(cls.TYPE, body, pos)
-        properties = None
+        properties = passed_on = None
         if version == V5:
+            start = pos
             properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            passed_on = properties_to_pass_on(body, start, properties)
             # A Protocol Error in 5.0 section 3.3.2.1.
             if not topic and (properties is None or Property.TOPIC_ALIAS not in properties):
                 raise protocol_error("PUBLISH without a topic and without a topic alias")
-        return cls(topic, body[pos:], qos, bool(flags & 1), dup, packet_id, properties)
+        payload = body[pos:]
+        return cls(topic, payload, qos, bool(flags & 1), dup, packet_id, properties, passed_on)
 
     def __str__(self) -> str:
         number = "" if self.packet_id is None else f" id={self.packet_id}"

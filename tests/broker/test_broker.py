@@ -983,13 +983,18 @@ def test_the_number_of_subscriptions_is_bounded(join: Join, version):
 
 
 @pytest.mark.parametrize("limits", [Limits(topic_levels=4)])
-def test_the_levels_of_topics_and_filters_are_bounded(join: Join):
-    peer = join()
-    assert peer.subscribe("a/b/c/d") == 0
-    assert peer.subscribe("a/b/c/d/e") == ReasonCode.TOPIC_FILTER_INVALID
+@pytest.mark.parametrize("shared", ["", "$share/g/"])
+def test_the_levels_of_topics_and_filters_are_bounded(join: Join, shared):
+    """More is malformed, as for mosquitto; the group of a shared subscription does not count"""
+    peer = join("peer")
+    assert peer.subscribe(f"{shared}a/b/c/d") == 0
     assert peer.publish("a/b/c/d", b"", 1) == 0
     peer.received()
-    assert peer.publish("a/b/c/d/e", b"", 1) == ReasonCode.TOPIC_NAME_INVALID
+    peer.send(Publish("a/b/c/d/e", b"", 1, packet_id=9))
+    assert peer.farewell() == ReasonCode.MALFORMED_PACKET
+    other = join("other")
+    other.send(Subscribe(1, [Subscription(f"{shared}a/b/c/d/e")]))
+    assert other.farewell() == ReasonCode.MALFORMED_PACKET
 
 
 @pytest.mark.parametrize("limits", [Limits(queue_messages=5, inflight=2)])

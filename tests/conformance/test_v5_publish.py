@@ -414,6 +414,17 @@ def test_each_subscribers_copy_expires_by_itself(broker: Broker) -> None:
     assert message.topic == "last"
 
 
+@statement("5.0", "MQTT-3.3.2-5", "MQTT-3.3.2-6", "MQTT-4.3.3-13")
+@pytest.mark.parametrize(("waited", "left"), [(3, 7), (11, None)])
+def test_the_time_until_pubrel_counts(broker: Broker, waited: int, left: int | None) -> None:
+    client, sender = joined(broker), joined(broker, "sender")
+    client.subscribe("a", 2)
+    assert sender.say(expiring(10, 2)) == wire("50 02 0001")
+    broker.tick(broker.now + waited)
+    assert sender.say("62 02 0001") == wire("70 02 0001")
+    assert client.hear() == (b"" if left is None else expiring(left, 2))
+
+
 @statement("5.0", "MQTT-3.3.2-6")
 @QOS
 def test_a_message_that_did_not_wait_has_its_whole_interval(broker: Broker, qos: int) -> None:
