@@ -304,6 +304,8 @@ class Broker:
         """Give what one member of a group cannot get to another."""
         for message, _, _, _, share in deliveries:
             assert share is not None
+            if self.ledger.has_expired(message):
+                continue
             target = share.choose(self._members(share, message.topic), message)
             if target is None:
                 self.counters.publish_dropped += 1
@@ -509,6 +511,8 @@ class Broker:
             ProtocolError: the topic is not valid.
         """
         message, full = held
+        if self.ledger.has_expired(message):
+            return
         route = self.route(origin, message.topic_wire)
         targets: list[Target] = []
         for target in route.targets:

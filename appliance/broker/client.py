@@ -598,7 +598,12 @@ class Client:
         limit = self._maximum_packet_size
         if message.size <= limit and not subscription_ids:
             return False
-        return len(message.encode_for(first, 1, subscription_ids, self._ledger.now)) > limit
+        # A topic gets no new alias from a message that is near the limit, see `_encode`.
+        alias = self._aliases.get(message.topic, 0) if self._aliases else 0
+        packet = message.encode_for(
+            first, 1, subscription_ids, self._ledger.now, alias, named=not alias
+        )
+        return len(packet) > limit
 
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""

@@ -88,6 +88,13 @@ class Ledger:
         self.queue_bytes = self.limits.queue_bytes
         self.memory = self.limits.memory
 
+    def has_expired(self, message: Message) -> bool:
+        """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
+        if message.expires_at is None or message.expires_at > self.now:
+            return False
+        self.counters.publish_dropped += 1
+        return True
+
 
 #: Keys for messages that wait, in the order of their coming.
 _NUMBERS = itertools.count()
@@ -341,19 +348,12 @@ class Session:
             delivery = self.queue.popleft()
             message = delivery[0]
             self._uncount(message)
-            if self._has_expired(message):
+            if self.ledger.has_expired(message):
                 self._settled(message, delivery[1])
                 # Its number is used up, as by mosquitto, which gives them out on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
                 self._send(link, delivery)
-
-    def _has_expired(self, message: Message) -> bool:
-        """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
-        if message.expires_at is None or message.expires_at > self.ledger.now:
-            return False
-        self.ledger.counters.publish_dropped += 1
-        return True
 
     def resend(self) -> None:
         """Send again what was in flight when the last connection ended [MQTT-4.4.0-1]."""
@@ -384,7 +384,7 @@ class Session:
             oldest = next(iter(self.latest))
             message, _, retain, subscription_ids, _ = self.latest.pop(oldest)
             self._uncount(message)
-            if not self._has_expired(message):
+            if not self.ledger.has_expired(message):
                 link.publish(message, 0, 0, False, retain, subscription_ids)
 
     def _keep_latest(self, delivery: Delivery) -> bool:

@@ -86,6 +86,21 @@ def test_session_present(broker: Broker, clean: bool, before: str) -> None:
     assert answer == (SESSION_PRESENT if before == "kept" and not clean else ACCEPTED)
 
 
+@statement("5.0", "MQTT-3.2.2-3", "MQTT-3.1.4-3", "MQTT-4.1.0-2")
+@pytest.mark.parametrize(("seconds", "answer"), [(0, ACCEPTED), (100, SESSION_PRESENT)])
+def test_a_session_that_ends_with_its_connection_is_not_taken_over(
+    broker: Broker, seconds: int, answer: bytes
+) -> None:
+    """Section 3.1.4: with an expiry interval of 0 it ends at the take-over."""
+    before = joined(broker, "c", **lasting(5, seconds))
+    before.subscribe("a")
+    client = Client(broker)
+    assert client.log_in(connect("c", flags=0)) == answer
+    assert before.hear() == disconnect(0x8E)
+    joined(broker, "sender").publish("a", b"x")
+    assert client.hear() == (publish("a", b"x") if seconds else b"")
+
+
 # --- 3.2.2.2 reason codes
 
 

@@ -266,12 +266,13 @@ def test_a_will_is_published_once(broker: Broker) -> None:
 
 
 @statement("5.0", "MQTT-3.1.2-8")
-def test_the_will_waits_for_its_delay(broker: Broker) -> None:
+@pytest.mark.parametrize("end", ["lost", "e0 01 04", "82 02 0001"])
+def test_the_will_waits_for_its_delay(broker: Broker, end: str) -> None:
     watcher = watching(broker)
     client = Client(broker)
     payload = ("c", properties("18 0000000a"), "w", "gone")  # 10 s
     client.log_in(connect(*payload, flags=CLEAN_START | WILL, props=KEPT))
-    client.lose()
+    client.lose() if end == "lost" else client.say(end)
     broker.tick(broker.now + 9)
     assert watcher.hear() == b""
     broker.tick(broker.now + 1)
