@@ -225,7 +225,13 @@ class Client:
     ) -> None:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         code = ReasonCode.SUCCESS
-        if packet_id in session.received:
+        held = session.received.get(packet_id)
+        if held is not None and not held.message.is_like(message):
+            # A client that has lost its memory begins anew with the same ids: what it does not
+            # know of any more, it will not release. mosquitto sees it like this, too.
+            session.unhold(packet_id)
+            held = None
+        if held is not None:
             pass  # sent again: PUBREC goes out again [MQTT-4.3.3-12]
         elif not route.allowed:
             self.broker.refuse_publish(session, route, message)

@@ -112,6 +112,10 @@ class Message:
             self._passed_on = encode_property_list(properties) if properties else b""
         return self._passed_on
 
+    def is_like(self, other: Message) -> bool:
+        """Whether it may be the same message, sent again."""
+        return self.topic_wire == other.topic_wire and self.payload == other.payload
+
     def settle(self) -> None:
         """The message is going to wait: what can be encoded again is not kept, if it is large."""
         if len(self.payload) >= LARGE:

@@ -440,7 +440,11 @@ def decode_packet_id(packet_type: PacketType, body: bytes, pos: int) -> tuple[in
     """A Packet Identifier at `pos` (section 2.3.1; 5.0 section 2.2.1)."""
     packet_id, pos = decode_uint16(body, pos)
     if not packet_id:  # [MQTT-2.3.1-1] v5 [MQTT-2.2.1-3]
-        raise protocol_error(f"{packet_type.name} with the packet identifier 0")
+        problem = f"{packet_type.name} with the packet identifier 0"
+        # The standard names no reason code; these are mosquitto's.
+        if packet_type in (PacketType.SUBSCRIBE, PacketType.UNSUBSCRIBE):
+            raise malformed(problem)
+        raise protocol_error(problem)
     return packet_id, pos
 
 

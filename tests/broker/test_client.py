@@ -671,7 +671,7 @@ def test_a_larger_packet_than_allowed_ends_the_connection(join: Join):
         ("30 06 0001 61 02 0b 01", 0x82),  # a Subscription Identifier [MQTT-3.3.4-6]
         ("80 07 0001 00 0001 61 00", 0x81),  # reserved flags [MQTT-3.8.1-1]
         ("82 03 0001 00", 0x82),  # no filter [MQTT-3.8.3-2]
-        ("82 07 0000 00 0001 61 00", 0x82),  # packet id 0
+        ("82 07 0000 00 0001 61 00", 0x81),  # packet id 0
         ("82 07 0001 00 0001 61 03", 0x82),  # QoS 3
         ("82 07 0001 00 0001 61 30", 0x82),  # retain handling 3
         ("82 07 0001 00 0001 61 40", 0x81),  # reserved option bits [MQTT-3.8.3-5]
