@@ -810,7 +810,7 @@ def test_a_connect_without_data(dial: Dial) -> None:
 
 
 def test_a_large_connect(dial: Dial) -> None:
-    will = Will("r2d2/will", bytes(65535), 0, False, {Property.USER_PROPERTY: [("x", "x" * 65000)]})
+    will = Will("r2d2/will", bytes(65535), 0, False, {Property.USER_PROPERTY: [("x", "x" * 30000)]})
     client = logged_in(dial(), "large", will=will)
     assert client.drain() == []
 

@@ -131,10 +131,10 @@ class PluginAccess:
         if (decision is None or age > VERDICT_AGE) and question not in self._asked:
             own = sum(1 for asked in self._asked if asked[0] == question[0])
             if len(self._asked) >= QUESTIONS or own >= CLIENT_QUESTIONS:
-                return Decision(False, "the topic plugins have too many questions to answer")
+                return Decision(False, "the topic plugins have too many questions to answer", True)
             self._asked[question] = asyncio.ensure_future(self._ask(question))
         if decision is None or age > VERDICT_USE:
-            return Decision(False, "the topic plugins were asked; the next try is answered")
+            return Decision(False, "the topic plugins were asked; the next try is answered", True)
         self._verdicts.move_to_end(question)
         return decision
 

@@ -11,7 +11,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
@@ -56,6 +56,15 @@ CACHED_ROUTES = 1024
 
 #: And the longest of these topics, in bytes.
 CACHED_TOPIC = 512
+
+#: Entries and targets in the caches of all sessions together, some 80 bytes each.
+CACHED_IN_ALL = 500_000
+
+#: The effort to find a route, see `Counters.effort`; each match comes on top.
+ROUTE_EFFORT = 20
+
+#: Retained messages that one tick lets expire.
+EXPIRED_A_TURN = 1024
 
 #: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
@@ -115,7 +124,7 @@ class Broker:
         self.limits = limits or Limits()
         self.features = features or Features()
         self.complaints = Complaints()
-        self.ledger = Ledger(self.limits, store)
+        self.ledger = Ledger(self.limits, store, may_keep=self._may_keep)
         #: What the broker counts.
         self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
@@ -135,6 +144,10 @@ class Broker:
         self._shares: dict[str, Share] = {}
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
+        #: When retained messages expire, soonest first.
+        self._expiring: list[tuple[float, int, Message]] = []
+        #: Entries and targets that went into the sessions' caches since these were last cleared.
+        self._cached = 0
 
     @property
     def now(self) -> float:
@@ -168,7 +181,7 @@ class Broker:
             ProtocolError: 0x85, the client id belongs to another user's session, which is not
                 touched; 0x97, no more sessions are kept, or its will has no room.
         """
-        if will is not None and (self.ledger.queued_bytes + will.message.size > self.limits.memory):
+        if will is not None and (self.ledger.queued_bytes + will.message.size > self.ledger.memory):
             raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, "no room for its will")
         session = self.sessions.get(identity.client_id)
         if session is not None:
@@ -218,9 +231,7 @@ class Broker:
         """The CONNACK was sent: observers may know, and what waits may go."""
         if self.observer is not None:
             self.observer.connected(session)
-        for packet_id, delivery in list(session.inflight.items()):
-            if delivery is not None and not self.may_receive(session, delivery[0].topic):
-                session.give_up(packet_id)
+        session.unchecked = True
         session.resend()
 
     def attach(self, client_id: str, link: Link) -> Session:
@@ -275,9 +286,8 @@ class Broker:
             self._leave(session, topic_filter)
         if session.subscriptions:
             self.epoch += 1
-        orphans = session.take_shared(None, sent=True)
+        session.hand_over(None, self._giver(absent_too=True), sent=True)
         session.clear()
-        self._redeliver(orphans)
         if session.persistent:
             self.store.session_removed(session)
 
@@ -295,22 +305,31 @@ class Broker:
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
+        give = self._giver(absent_too=False)
         for topic_filter in session.subscriptions:
             share = self._shares.get(topic_filter)
             if share is not None and any(member.link is not None for member in share.members):
-                self._redeliver(session.take_shared(share, sent=True))
+                session.hand_over(share, give, sent=True)
 
-    def _redeliver(self, deliveries: list[Delivery]) -> None:
-        """Give what one member of a group cannot get to another."""
-        for message, _, _, _, share in deliveries:
+    def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
+        """A way to give other members what one of a group leaves; True when that is settled."""
+        known: dict[tuple[Share, str], list[Target]] = {}
+
+        def give(delivery: Delivery) -> bool:
+            message, _, _, _, share = delivery
             assert share is not None
             if self.ledger.has_expired(message):
-                continue
-            target = share.choose(self._members(share, message.topic), message)
-            if target is None:
-                self.counters.publish_dropped += 1
-            else:
-                self._deliver_shared(target, message, share)
+                return True
+            members = known.get((share, message.topic))
+            if members is None:
+                members = self._members(share, message.topic)
+                if not absent_too:
+                    members = [member for member in members if member[0].link is not None]
+                known[share, message.topic] = members
+            target = share.choose(members, message)
+            return target is not None and self._deliver_shared(target, message, share)
+
+        return give
 
     def _publish_will(self, session: Session) -> None:
         will = session.set_will(None)
@@ -343,7 +362,16 @@ class Broker:
             route = self._find_route(session, topic_wire)
             if len(topic_wire) <= CACHED_TOPIC:
                 session.routes[topic_wire] = route
+                self._cached += 1 + len(route.targets)
+                if self._cached > CACHED_IN_ALL:
+                    self._clear_caches()
         return route
+
+    def _clear_caches(self) -> None:
+        self._cached = 0
+        for session in self.sessions.values():
+            session.routes.clear()
+            session.readable.clear()
 
     def _find_route(self, session: Session, topic_wire: bytes) -> Route:
         topic, _ = decode_string(topic_wire, 0)
@@ -353,6 +381,7 @@ class Broker:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision = self._may_publish(session, topic)
         matches = self._subscriptions.match(topic) if decision else []
+        self.counters.effort += ROUTE_EFFORT + len(matches)
         targets, shares = self._targets(session, topic, matches)
         return Route(topic, decision.allowed, decision.reason, targets, shares, bool(matches))
 
@@ -429,16 +458,18 @@ class Broker:
             session.readable_epoch = self.access.epoch
         allowed = readable.get(topic)
         if allowed is None:
-            allowed = self.access.decide(session.identity, Action.RECEIVE, topic).allowed
-            if len(topic) <= CACHED_TOPIC:
+            decision = self.access.decide(session.identity, Action.RECEIVE, topic)
+            allowed = decision.allowed
+            if len(topic) <= CACHED_TOPIC and not decision.pending:
                 readable[topic] = allowed
+                self._cached += 1
         return allowed
 
     def publish(self, message: Message, origin: Session) -> ReasonCode:
         """Deliver the message to every session that subscribed to its topic.
 
         Returns 0x00, 0x10 when nobody did, 0x87 when `origin` may not publish it (told in the
-        log), 0x97 when somebody who subscribed, or the retained messages, had no room for it.
+        log), 0x97 when nobody who subscribed, or not the retained messages, had room for it.
 
         Raises:
             ProtocolError: the topic is not valid.
@@ -458,29 +489,38 @@ class Broker:
         retain = message.retain
         kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
         published_qos = message.qos
+        self.counters.effort += 1 + len(targets)
+        taken = full = False
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
-            if not session.deliver(message, qos, retain and as_published, subscription_ids) and qos:
+            if session.deliver(message, qos, retain and as_published, subscription_ids):
+                taken = True
+            elif qos:
                 self._tell_full(session)
-                kept = False
+                full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
-            if chosen is not None:
-                self._deliver_shared(chosen, message, share)
-            elif published_qos and members:
-                self._tell_full(members[0][0])
-                kept = False
-        if kept:
-            # 0x10 is for a topic without a subscription. That its client is absent, or may not
-            # read it, is nothing to tell the publisher.
-            return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
-        return ReasonCode.QUOTA_EXCEEDED
+            if chosen is not None and self._deliver_shared(chosen, message, share):
+                taken = True
+            elif published_qos and (asked := [member[0] for member in members if member[1]]):
+                self.counters.publish_dropped += chosen is None
+                self._tell_full(asked[0])
+                full = True
+        if not kept or (full and not taken):
+            return ReasonCode.QUOTA_EXCEEDED
+        # Who has no room misses it, which is logged: a publisher that was told would send it to
+        # all others again, for one tablet that was left switched off.
+        # 0x10 is for a topic without a subscription. That its client is absent, or may not read
+        # it, is nothing to tell the publisher.
+        return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
 
-    def _deliver_shared(self, target: Target, message: Message, share: Share) -> None:
+    def _deliver_shared(self, target: Target, message: Message, share: Share) -> bool:
+        """False when a QoS 1 or 2 message was dropped."""
         session, qos, as_published, subscription_ids = target
+        qos = min(qos, message.qos)
         retain = message.retain and as_published
-        session.deliver(message, min(qos, message.qos), retain, subscription_ids, share)
+        return session.deliver(message, qos, retain, subscription_ids, share) or not qos
 
     def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
@@ -522,7 +562,16 @@ class Broker:
                 session.deliver_promised((message, qos, message.retain and as_published, ids, None))
             else:
                 targets.append(target)
-        self.publish_to(targets, route, message, origin)
+        shares: list[tuple[Share, list[Target]]] = []
+        for share, members in route.shares:
+            asked = [member for member in members if member[1]] if route.allowed else []
+            if asked and share not in full and not any(m[0].has_room(message) for m in asked):
+                session, qos, as_published, ids = next((m for m in asked if m[0].link), asked[0])
+                retain = message.retain and as_published
+                session.deliver_promised((message, min(qos, message.qos), retain, ids, share))
+            else:
+                shares.append((share, members))
+        self.publish_to(targets, replace(route, shares=shares), message, origin)
 
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
@@ -572,10 +621,30 @@ class Broker:
                 return False
             self.retained_bytes = grown
             self.retained.set(message.topic, message)
+            if message.expires_at is not None:
+                self._schedule_expiry(message)
         self.store.retained(message)
         if self.observer is not None:
             self.observer.retained(message)
         return True
+
+    def _schedule_expiry(self, message: Message) -> None:
+        assert message.expires_at is not None
+        heapq.heappush(self._expiring, (message.expires_at, next(self._order), message))
+        # Those that were replaced are not kept until their time comes.
+        if len(self._expiring) > 2 * len(self.retained) + 64:
+            self._expiring = [
+                entry for entry in self._expiring if self.retained.get(entry[2].topic) is entry[2]
+            ]
+            heapq.heapify(self._expiring)
+
+    def _expire_retained(self) -> None:
+        left = EXPIRED_A_TURN
+        while left and self._expiring and self._expiring[0][0] <= self.now:
+            left -= 1
+            _, _, message = heapq.heappop(self._expiring)
+            if self.retained.get(message.topic) is message:
+                self._retain(Message(message.topic, b"", retain=True))
 
     # --- subscribing ---------------------------------------------------------------------------
 
@@ -635,7 +704,7 @@ class Broker:
         return None
 
     def send_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
-        """Send the retained messages that a subscription asks for, behind its SUBACK."""
+        """Let `Session.pump` send the retained messages that a subscription asks for."""
         if parse_shared(subscription.filter) is not None:
             return  # the group's members have not asked for them (5.0 section 4.8.2)
         handling = subscription.retain_handling
@@ -648,7 +717,11 @@ class Broker:
 
         None stands for what it may not see, so that passing over many of these takes turns, too.
         """
-        for topic, message in self.retained.find(topic_filter):
+        for found in self.retained.find_in_steps(topic_filter):
+            if found is None:
+                yield None
+                continue
+            topic, message = found
             if message.expires_at is not None and message.expires_at <= self.now:
                 self._retain(Message(topic, b"", retain=True))
                 yield None
@@ -667,7 +740,7 @@ class Broker:
         self._leave(session, topic_filter)
         self.epoch += 1
         if share is not None:
-            self._redeliver(session.take_shared(share, sent=False))
+            session.hand_over(share, self._giver(absent_too=True), sent=False)
         if session.persistent:
             self.store.unsubscribed(session, topic_filter)
         if self.observer is not None:
@@ -680,16 +753,16 @@ class Broker:
         """The access rules changed: nothing cached holds, and what waits is checked again."""
         self.epoch += 1
         for session in self.sessions.values():
-            if session.identity is not None:
-                self._revoke(session)
+            session.unchecked = True  # message by message, as they are sent
 
-    def _revoke(self, session: Session) -> None:
-        def allowed(topic: str) -> bool:
-            return self.may_receive(session, topic)
+    def _may_keep(self, session: Session, topic: str) -> bool:
+        """Whether a message that waits may still be sent.
 
-        dropped = session.revoke(allowed)
-        if dropped:
-            log.info("%s: %d waiting messages may no longer be read", session, dropped)
+        It was allowed when it came: while plugins make up their minds anew it stays so.
+        """
+        if session.identity is None or self.may_receive(session, topic):
+            return True
+        return self.access.decide(session.identity, Action.RECEIVE, topic).pending
 
     def _schedule(self, when: float, session: Session) -> None:
         heapq.heappush(self._deadlines, (when, next(self._order), session))
@@ -713,6 +786,7 @@ class Broker:
         """
         self.ledger.now = now
         self.complaints.tick(now)
+        self._expire_retained()
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
             left -= client.tick(now)

@@ -61,6 +61,16 @@ OUTPUT_LIMIT = 1024 * 1024
 _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
 
+#: The effort of a packet that is not of the data path.
+PACKET_EFFORT = 5
+
+#: The effort of a subscription, in and out.
+SUBSCRIBE_EFFORT = 10
+
+#: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
+EFFORT_A_TURN = 1000
+
+
 class Wire(Protocol):
     """The connection under a client, as a listener implements it."""
 
@@ -86,6 +96,11 @@ class Wire(Protocol):
         """Write what was written so far, then close."""
 
 
+def _reason(code: int, route: Route) -> str:
+    """Why a message was refused, in words."""
+    return route.reason if code == ReasonCode.NOT_AUTHORIZED else "no room to keep it"
+
+
 class Client:
     """One network connection; its `Link` to a session once it has logged in."""
 
@@ -98,6 +113,7 @@ class Client:
         self._ledger = broker.ledger
         self._counters = broker.counters
         self._connect: Connect | None = None
+        self._held = 0  # bytes of the connection that are counted in the ledger
         self._out: list[bytes] = []
         self._out_size = 0  # of the PUBLISH packets in there, from their sessions
         self._full = False  # not writable until the flush, for OUTPUT_LIMIT
@@ -115,6 +131,8 @@ class Client:
         self._unfinished_maximum = 0
         self._version = 0
         self._closed = False
+        #: Whether `send_on` will be called anyway.
+        self._later = False
 
     def __str__(self) -> str:
         name = str(self.session) if self.session else "client"
@@ -127,21 +145,47 @@ class Client:
         counters = self._counters
         counters.bytes_received += len(data)
         now = self._ledger.now
+        connection = self.connection
+        effort = counters.effort + EFFORT_A_TURN
         try:
-            for event in self.connection.receive_data(data):
+            for event in connection.receive_data(data):
                 self._heard_at = now  # complete packets count, dripping bytes do not
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
+                    counters.effort += 1
                     if event < PUBREC and self.session is not None:  # PUBACK: most of them
                         counters.control_received += 1
                         self.session.puback(event & 0xFFFF)
                     else:
                         self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
+                    counters.effort += PACKET_EFFORT
                     self._on_packet(event)  # type: ignore[arg-type]
+                if counters.effort > effort and not connection.paused:
+                    # What is left of the chunk waits until the others have had their turn.
+                    connection.pause()
+                    self.later()
         except ProtocolError as error:
             self.fail(error)
+        if connection.held != self._held:
+            self._count_held()
+
+    def _count_held(self) -> None:
+        """Count the memory of what came and is not done with: it is bounded, as all that waits."""
+        ledger = self._ledger
+        grown = self.connection.held - self._held
+        self._held += grown
+        ledger.queued_bytes += grown
+        ledger.input_bytes += grown
+        if grown > 0 and self._held > ledger.reserve and ledger.queued_bytes > ledger.memory:
+            self.fail(
+                ProtocolError(
+                    ReasonCode.QUOTA_EXCEEDED,
+                    f"no memory for {self._held} bytes of unfinished packets and topic aliases "
+                    "(broker.limits.memory)",
+                )
+            )
 
     def _on_raw_publish(self, event: RawPublish) -> None:
         """The data path: a PUBLISH without properties."""
@@ -159,6 +203,7 @@ class Client:
             route = broker.route(session, topic_wire)
         targets = route.targets
         if first == 0x30 and route.allowed and broker.observer is None:
+            counters.effort += 1 + len(targets)
             # A plain QoS 0 message to receivers of the same version leaves as it came: no message
             # object is made for it. Who cannot take it like this is left for the long way.
             targets = [
@@ -182,7 +227,7 @@ class Client:
             return
         code = broker.publish_to(targets, route, message, session)
         if qos:
-            self._acknowledge(0x40, packet_id, code, route.reason)
+            self._acknowledge(0x40, packet_id, code, _reason(code, route))
 
     def _on_publish(self, packet: Publish) -> None:
         """A PUBLISH that the full decoder has read: with properties, most likely."""
@@ -210,7 +255,7 @@ class Client:
         else:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos:
-                self._acknowledge(0x40, packet_id, code, route.reason)
+                self._acknowledge(0x40, packet_id, code, _reason(code, route))
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
@@ -252,7 +297,7 @@ class Client:
                 code = ReasonCode.QUOTA_EXCEEDED
                 if self._version != 5:
                     raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
-        self._acknowledge(0x50, packet_id, code, route.reason)
+        self._acknowledge(0x50, packet_id, code, _reason(code, route))
 
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
@@ -303,6 +348,7 @@ class Client:
         assert session is not None
         identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
         identifier = identifiers[0] if isinstance(identifiers, list) else 0
+        self._counters.effort += SUBSCRIBE_EFFORT * len(packet.subscriptions)
         for subscription in packet.subscriptions:
             self._check_filter(subscription.filter)
         codes: list[int] = []
@@ -338,6 +384,7 @@ class Client:
     def _on_unsubscribe(self, packet: Unsubscribe) -> None:
         session = self.session
         assert session is not None
+        self._counters.effort += SUBSCRIBE_EFFORT * len(packet.filters)
         for name in packet.filters:
             self._check_filter(name)
         codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
@@ -593,7 +640,8 @@ class Client:
             if alias:
                 named = False
             elif len(aliases) < self._alias_maximum and (
-                not self._maximum_packet_size or message.size < self._maximum_packet_size
+                not self._maximum_packet_size
+                or (message.size < self._maximum_packet_size and not subscription_ids)
             ):
                 alias = aliases[message.topic] = len(aliases) + 1
         return message.encode_for(
@@ -651,7 +699,7 @@ class Client:
         elif self.session is None or isinstance(packet, Connack):
             # There is nothing to refuse it with [MQTT-3.14.0-1].
             self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
-            self._leave(publish_will=True)
+            self._leave(publish_will=False)
         elif not isinstance(packet, Disconnect):
             reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
             self.close(ReasonCode.PACKET_TOO_LARGE, reason)
@@ -681,16 +729,23 @@ class Client:
     def resume_writing(self) -> None:
         """The network takes bytes again: send what waited."""
         self.writable = True
-        self.send_on()
+        if self.session is not None and self.session.link is self:
+            self.session.pump()
 
     def later(self) -> None:
         """Let the other clients have their turn."""
-        self.wire.later()
+        if not self._later:
+            self._later = True
+            self.wire.later()
 
     def send_on(self) -> None:
-        """Send what waits, as far as the client takes it."""
+        """Go on where the last turn ended: with what waits for the client, and what it sent."""
+        self._later = False
         if self.session is not None and self.session.link is self:
-            self.session.pump()
+            self.session.take_turn()
+            if self.connection.paused:
+                self.connection.resume()
+                self.receive(b"")
 
     # --- the end -------------------------------------------------------------------------------
 
@@ -751,6 +806,9 @@ class Client:
         # wait for what they acknowledge to be kept.
         self._closed = True
         self.connection.close()
+        self._ledger.queued_bytes -= self._held
+        self._ledger.input_bytes -= self._held
+        self._held = 0
         self.writable = False
         self.broker.clients.discard(self)
         if not self._out:

@@ -70,8 +70,8 @@ class Message:
         #: The properties that all receivers get, as they stand in a packet, without their length.
         self._passed_on = passed_on
         self._properties_wire: bytes | None = None
-        #: Bytes that a queue counts for this message.
-        self.size = len(payload) + len(self.topic_wire) + OVERHEAD
+        #: Bytes that a queue counts for this message; the topic is a string, and in its packets.
+        self.size = len(payload) + 3 * len(self.topic_wire) + OVERHEAD
         if properties:
             pairs = properties.get(Property.USER_PROPERTY)
             self.size += len(encode_property_list(properties))

@@ -38,10 +38,14 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Whether something is allowed; `reason` names the rule, for the log."""
+    """Whether something is allowed; `reason` names the rule, for the log.
+
+    A refusal that is `pending` holds only until those who decide have answered.
+    """
 
     allowed: bool
     reason: str
+    pending: bool = False
 
     def __bool__(self) -> bool:
         return self.allowed

@@ -31,8 +31,9 @@ LEVEL_SIZE = 350
 
 
 def subscription_size(topic_filter: str) -> int:
-    """Bytes that are counted for a subscription."""
-    return SUBSCRIPTION_SIZE + len(topic_filter) + LEVEL_SIZE * topic_filter.count("/")
+    """Bytes that are counted for a subscription: the filter is in the session, and in the tree."""
+    text = len(topic_filter) * (1 if topic_filter.isascii() else 4)
+    return SUBSCRIPTION_SIZE + 2 * text + LEVEL_SIZE * topic_filter.count("/")
 
 
 @dataclass(slots=True)
@@ -53,6 +54,9 @@ class Counters:
     connects_refused: int = 0
     connections_refused: int = 0
     sockets: int = 0
+    #: Work done, in units of about a microsecond; what takes long counts itself here, so that one
+    #: client's turn can be ended without a look at the clock.
+    effort: int = 0
     sessions_expired: int = 0
     clients_maximum: int = 0
 
@@ -78,15 +82,23 @@ class Ledger:
     now: float = 0.0
     #: Bytes that the queues, subscriptions and wills of all sessions hold, and the output buffers.
     queued_bytes: int = 0
+    #: Among these, what came from clients and is not done with: parts of packets, topic aliases.
+    input_bytes: int = 0
     #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
     overflowed: list[Session] = field(default_factory=list)
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     memory: int = field(init=False)
+    #: And what a session may hold when all the memory is taken by others, in bytes.
+    reserve: int = field(init=False)
+    #: Whether the rules in force still let a session receive what waits for it under a topic.
+    may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
 
     def __post_init__(self) -> None:
         self.queue_bytes = self.limits.queue_bytes
-        self.memory = self.limits.memory
+        # An eighth is set apart, so that those who hold much do not starve those who hold little.
+        self.memory = self.limits.memory * 7 // 8
+        self.reserve = self.limits.memory // 8 // self.limits.sessions
 
     def has_expired(self, message: Message) -> bool:
         """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
@@ -143,9 +155,11 @@ class Session:
         "readable_epoch",
         "received",
         "replays",
+        "replays_left",
         "resends",
         "routes",
         "subscriptions",
+        "unchecked",
         "will",
         "will_at",
         "window",
@@ -171,12 +185,15 @@ class Session:
         #: Retained messages of new subscriptions, by filter; they go before anything newer. They
         #: are looked up when their turn comes, so that a slow client's take no memory.
         self.replays: dict[str, Iterator[Delivery | None]] = {}
+        self.replays_left = REPLAYED_A_TURN
         #: QoS 0, waiting for a slow client, oldest first: the newest of each topic, or by number
         #: when the limit `keep` says how many.
         self.latest: dict[str | int, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
         self.received: dict[int, Held] = {}
         self.bytes = 0
+        #: Whether the access rules have changed since they let in what waits.
+        self.unchecked = False
         #: Topics that the client may receive, or not; valid while the epoch is the access rules'.
         self.readable: dict[str, bool] = {}
         self.readable_epoch = -1
@@ -227,7 +244,9 @@ class Session:
         # `_fits` and `_count`, written out here and in `_send`: two calls less a message.
         ledger = self.ledger
         size = message.size
-        if self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory:
+        if (
+            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
+        ) or self.fits(size):
             if (
                 link is not None
                 and link.writable
@@ -264,7 +283,7 @@ class Session:
         """Whether a QoS 1 or 2 message would be kept."""
         limits = self.ledger.limits
         return limits.queue_full == "drop-oldest" or (
-            len(self.queue) < limits.queue_messages and self._fits(message)
+            len(self.queue) < limits.queue_messages and self.fits(message.size)
         )
 
     def _enqueue(self, delivery: Delivery) -> None:
@@ -277,14 +296,16 @@ class Session:
     def _drop_oldest_for(self, message: Message) -> bool:
         """Make room at the old end of the queue; False when even then there is none."""
         ledger = self.ledger
+        if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
+            return False
         while self.queue and not (
-            len(self.queue) < ledger.limits.queue_messages and self._fits(message)
+            len(self.queue) < ledger.limits.queue_messages and self.fits(message.size)
         ):
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest[0], oldest[1])
             ledger.counters.publish_dropped += 1
-        return self._fits(message)
+        return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
         """Send retained messages, behind those before them; asked for again, they begin anew.
@@ -293,6 +314,11 @@ class Session:
         """
         self.replays.pop(topic_filter, None)
         self.replays[topic_filter] = deliveries
+        self.pump()
+
+    def take_turn(self) -> None:
+        """Send what waits; the others have had their turn since the last time."""
+        self.replays_left = REPLAYED_A_TURN
         self.pump()
 
     def pump(self) -> None:
@@ -308,6 +334,8 @@ class Session:
             self._pump_queue(link)
         if self.latest:
             self._pump_latest(link)
+        if self.unchecked and not (self.queue or self.latest or self.resends):
+            self.unchecked = False
 
     def _pump_resends(self, link: Link) -> None:
         # The window may be smaller than it was on the last connection [MQTT-3.3.4-9].
@@ -315,19 +343,22 @@ class Session:
         while resends and link.writable and len(self.inflight) - len(resends) < self.window:
             packet_id = resends.popleft()
             delivery = self.inflight.get(packet_id)
-            if delivery is not None:
-                message, qos, retain, subscription_ids, _ = delivery
+            if delivery is None:
+                continue
+            message, qos, retain, subscription_ids, _ = delivery
+            if self._is_forbidden(message):
+                self.give_up(packet_id)
+            else:
                 link.publish(message, qos, packet_id, True, retain, subscription_ids)
 
     def _pump_replays(self, link: Link) -> bool:
         """Send retained messages; False when there are more than one turn is for."""
-        left = REPLAYED_A_TURN
         for topic_filter, deliveries in list(self.replays.items()):
             needs_window = self.subscriptions[topic_filter].qos > 0  # QoS 0 does not [MQTT-3.3.4-8]
             while link.writable and not (needs_window and len(self.inflight) >= self.window):
-                if not left:
+                if not self.replays_left:
                     return False
-                left -= 1
+                self.replays_left -= 1
                 try:
                     delivery = next(deliveries)
                 except StopIteration:
@@ -336,6 +367,10 @@ class Session:
                 if delivery is None:
                     continue
                 message, qos, retain, subscription_ids, _ = delivery
+                if qos and self.inflight and not self.fits(message.size):
+                    # More of these when some are acknowledged.
+                    self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
+                    break
                 if qos:
                     self._owe(message, qos)
                     self._send(link, delivery)
@@ -348,7 +383,7 @@ class Session:
             delivery = self.queue.popleft()
             message = delivery[0]
             self._uncount(message)
-            if self.ledger.has_expired(message):
+            if self.ledger.has_expired(message) or self._is_forbidden(message):
                 self._settled(message, delivery[1])
                 # Its number is used up, as by mosquitto, which gives them out on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
@@ -384,8 +419,15 @@ class Session:
             oldest = next(iter(self.latest))
             message, _, retain, subscription_ids, _ = self.latest.pop(oldest)
             self._uncount(message)
-            if not self.ledger.has_expired(message):
+            if not (self.ledger.has_expired(message) or self._is_forbidden(message)):
                 link.publish(message, 0, 0, False, retain, subscription_ids)
+
+    def _is_forbidden(self, message: Message) -> bool:
+        """Whether rules that have changed meanwhile no longer let the client have it; counted."""
+        if not self.unchecked or self.ledger.may_keep(self, message.topic):
+            return False
+        self.ledger.counters.publish_dropped += 1
+        return True
 
     def _keep_latest(self, delivery: Delivery) -> bool:
         message = delivery[0]
@@ -402,20 +444,13 @@ class Session:
             self._uncount(replaced[0])
             self.ledger.counters.publish_dropped += 1
         room = limits.keep or len(self.latest) < limits.queue_messages
-        if room and self._fits(message):
+        if room and self.fits(message.size):
             message.settle()
             self._count(message)
             self.latest[key] = delivery
             return True
         self.ledger.counters.publish_dropped += 1
         return False
-
-    def _fits(self, message: Message) -> bool:
-        ledger = self.ledger
-        size = message.size
-        return (
-            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
-        )
 
     def _count(self, message: Message) -> None:
         self.bytes += message.size
@@ -447,6 +482,8 @@ class Session:
                 raise _wrong("PUBACK", packet_id)
             return False
         del self.inflight[packet_id]
+        if self.resends and packet_id in self.resends:
+            self.resends.remove(packet_id)
         message = delivery[0]
         size = message.size
         self.bytes -= size
@@ -468,6 +505,8 @@ class Session:
         delivery = self.inflight[packet_id]
         if delivery is not None and delivery[1] != 2:
             raise _wrong("PUBREC", packet_id)
+        if packet_id in self.resends:
+            self.resends.remove(packet_id)
         if code >= 0x80:
             self.give_up(packet_id)
             self.pump()
@@ -505,7 +544,7 @@ class Session:
 
     def hold(self, packet_id: int, held: Held) -> bool:
         """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
-        if not self._fits(held.message):
+        if not self.fits(held.message.size):
             return False
         held.message.settle()
         self.received[packet_id] = held
@@ -544,59 +583,41 @@ class Session:
     def fits(self, size: int) -> bool:
         """Whether the session may take so many bytes more."""
         ledger = self.ledger
-        return (
-            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
+        held = self.bytes + size
+        return held <= ledger.queue_bytes and (
+            ledger.queued_bytes + size <= ledger.memory or held <= ledger.reserve
         )
 
     def _take(self, size: int) -> None:
         self.bytes += size
         self.ledger.queued_bytes += size
 
-    def take_shared(self, share: Share | None, *, sent: bool) -> list[Delivery]:
-        """Give up what a shared subscription (None: each of them) gave this session.
+    def hand_over(
+        self, share: Share | None, give: Callable[[Delivery], bool], *, sent: bool
+    ) -> None:
+        """Offer what a shared subscription (None: each of them) gave this session to others.
 
-        With `sent` also what is in flight with QoS 1: another member may get it a second time.
-        QoS 2 stays [MQTT-4.8.2-4], [MQTT-4.8.2-5].
+        What `give` finds nobody for stays. With `sent` what is in flight with QoS 1 is offered,
+        too: another member may get it a second time. QoS 2 stays [MQTT-4.8.2-4], [MQTT-4.8.2-5].
         """
 
-        def is_meant(delivery: Delivery) -> bool:
-            return delivery[4] is not None and share in (None, delivery[4])
+        def is_given(delivery: Delivery) -> bool:
+            return delivery[4] is not None and share in (None, delivery[4]) and give(delivery)
 
-        taken: list[Delivery] = []
         if sent:
             for packet_id, delivery in list(self.inflight.items()):
-                if delivery is not None and delivery[1] == 1 and is_meant(delivery):
+                if delivery is not None and delivery[1] == 1 and is_given(delivery):
                     self.give_up(packet_id)
-                    taken.append(delivery)
-        queued = [delivery for delivery in self.queue if is_meant(delivery)]
-        if queued:
-            self.queue = deque(delivery for delivery in self.queue if not is_meant(delivery))
-            for delivery in queued:
-                self._uncount(delivery[0])
-                self._settled(delivery[0], delivery[1])
-        return taken + queued
-
-    # --- the session's end, and a change of rules ---------------------------------------------
-
-    def revoke(self, allowed: Callable[[str], bool]) -> int:
-        """Drop what waits and may no longer be received; returns how many messages."""
-        dropped = 0
         kept: deque[Delivery] = deque()
         for delivery in self.queue:
-            message, qos = delivery[:2]
-            if allowed(message.topic):
-                kept.append(delivery)
+            if is_given(delivery):
+                self._uncount(delivery[0])
+                self._settled(delivery[0], delivery[1])
             else:
-                self._uncount(message)
-                self._settled(message, qos)
-                dropped += 1
+                kept.append(delivery)
         self.queue = kept
-        for key, delivery in list(self.latest.items()):
-            if not allowed(delivery[0].topic):
-                self._uncount(self.latest.pop(key)[0])
-                dropped += 1
-        self.ledger.counters.publish_dropped += dropped
-        return dropped
+
+    # --- the session's end ---------------------------------------------------------------------
 
     def forget_transient(self) -> None:
         """Drop what does not outlive the connection: QoS 0, and what is known of its topics."""

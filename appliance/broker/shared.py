@@ -12,6 +12,10 @@ from appliance.mqtt.packets import Subscription
 Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
 
 
+#: Members that are looked at for one message.
+ASKED = 128
+
+
 class Share:
     """One `$share/{group}/{filter}` and its members, in the order in which they came."""
 
@@ -29,7 +33,7 @@ class Share:
         best_rank = 0
         best_index = 0
         count = len(members)
-        for offset in range(count):
+        for offset in range(min(count, ASKED)):
             index = (self._turn + offset) % count
             session = members[index][0]
             qos = min(message.qos, members[index][1])

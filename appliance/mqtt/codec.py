@@ -101,6 +101,11 @@ class Kind(Enum):
     STRING_PAIR = 8
 
 
+#: User Properties of one packet. Each is an object many times its size on the wire: without a bound
+#: one packet could stop the broker for seconds.
+MAXIMUM_PAIRS: Final = 10_000
+
+
 @dataclass(frozen=True, slots=True)
 class PropertyRule:
     """What the standard allows of one property.
@@ -380,6 +385,10 @@ def _decode_property(
     if kind is Kind.STRING_PAIR:
         name, pos = decode_string(buf, pos)
         text, pos = decode_string(buf, pos)
+        if len(cast("list[object]", properties.get(identifier, ()))) >= MAXIMUM_PAIRS:
+            raise ProtocolError(
+                ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_PAIRS} User Properties"
+            )
         # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
         pairs = cast("list[tuple[str, str]]", properties.setdefault(identifier, []))
         pairs.append((name, text))

@@ -27,9 +27,10 @@ from appliance.mqtt.topics import check_topic
 RawPublish: TypeAlias = tuple[int, bytes, int, bytes, bytes]
 Event: TypeAlias = "Packet | RawPublish | int"
 
-#: The largest packet that is read and is not a PUBLISH, in bytes: five strings of 65,535 bytes and
-#: some properties for a CONNECT, so that a stranger gets no more memory than this; thousands of
-#: filters for a SUBSCRIBE, and not the millions that would keep all others waiting.
+#: The largest packets that are read and are no PUBLISH, in bytes. A CONNECT comes from a stranger:
+#: room for a will and some properties, and as much as mosquitto takes. Others are long lists of
+#: filters: thousands, and not the millions that would keep all others waiting.
+MAXIMUM_CONNECT = 100_000
 MAXIMUM_CONTROL = 384 * 1024
 
 PUBACK = PacketType.PUBACK << 16
@@ -102,6 +103,8 @@ class Connection:
         self._have = 0
         self._need = 0
         self._aliases: dict[int, str] = {}
+        #: Bytes that the aliases' topics take.
+        self._aliased = 0
         #: The last PUBLISH of the data path: its bytes from the header to the topic's end, and what
         #: they say. A client that repeats itself (same topic, same size: most of them do) is
         #: recognised by these bytes, which saves taking them apart again.
@@ -111,13 +114,22 @@ class Connection:
         self._head_size = 0
 
     @property
-    def buffered(self) -> int:
-        """Bytes that were received and not yet taken apart."""
-        return self._have
+    def held(self) -> int:
+        """Bytes of memory: received and not yet taken apart, and for topic aliases."""
+        return self._have + self._aliased
+
+    @property
+    def paused(self) -> bool:
+        """Whether what comes is kept until `accept` or `resume`."""
+        return not self._reading and self.state is not State.CLOSED
 
     def pause(self) -> None:
-        """Keep what comes from here on, until `accept`."""
+        """Keep what comes from here on, until `accept` or `resume`."""
         self._reading = False
+
+    def resume(self) -> None:
+        """Go on; `receive_data(b"")` yields what came in the meantime."""
+        self._reading = True
 
     def accept(self) -> None:
         """The client has logged in; `receive_data(b"")` yields what came in the meantime."""
@@ -130,6 +142,8 @@ class Connection:
         self._reading = False
         self._chunks.clear()
         self._have = 0
+        self._aliases.clear()
+        self._aliased = 0
 
     def receive_data(self, data: bytes) -> Iterable[Event]:
         """What `data`, behind what came before it, completes.
@@ -292,10 +306,12 @@ class Connection:
                 f"a packet of {size} bytes, more than the limit of "
                 f"{self.maximum_packet_size} (broker.limits.packet_size)",
             )
-        if size > MAXIMUM_CONTROL and kind is not PacketType.PUBLISH:
+        limit = MAXIMUM_CONNECT if kind is PacketType.CONNECT else MAXIMUM_CONTROL
+        if size > limit and kind is not PacketType.PUBLISH:
             raise ProtocolError(
                 ReasonCode.QUOTA_EXCEEDED,
-                f"a {kind.name} of {size} bytes, more than the limit of {MAXIMUM_CONTROL}",
+                f"a {kind.name} of {size} bytes, more than the limit of {limit}",
+                told=kind is not PacketType.CONNECT,
             )
 
     def _decode(self, first: int, body: bytes) -> Packet:
@@ -327,6 +343,7 @@ class Connection:
                     f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
                 )
             if packet.topic:
+                self._aliased += len(packet.topic) - len(self._aliases.get(alias, ""))
                 self._aliases[alias] = packet.topic
             elif alias in self._aliases:
                 packet.topic = self._aliases[alias]

@@ -67,6 +67,9 @@ __all__ = [
     "decode_packet",
 ]
 
+#: Topic filters in one packet; each costs far more than its bytes.
+MAXIMUM_FILTERS: Final = 4096
+
 _R = ReasonCode
 _RECEIVED_REASONS = frozenset(
     {_R.SUCCESS, _R.NO_MATCHING_SUBSCRIBERS, _R.UNSPECIFIED_ERROR}
@@ -331,6 +334,7 @@ class Subscribe:
         while pos < len(body):
             subscription, pos = Subscription._decode(body, pos, version)
             subscriptions.append(subscription)
+            _check_count(subscriptions)
         if not subscriptions:  # [MQTT-3.8.3-3] v5 [MQTT-3.8.3-2]
             raise protocol_error("SUBSCRIBE without a topic filter")
         return cls(packet_id, subscriptions, properties)
@@ -423,6 +427,7 @@ class Unsubscribe:
         while pos < len(body):
             topic_filter, pos = decode_string(body, pos)  # [MQTT-3.10.3-1]
             filters.append(topic_filter)
+            _check_count(filters)
         if not filters:  # [MQTT-3.10.3-2]
             raise protocol_error("UNSUBSCRIBE without a topic filter")
         return cls(packet_id, filters, properties)
@@ -467,6 +472,12 @@ class Unsuback:
     def __str__(self) -> str:
         codes = _list([reason_name(code) for code in self.reason_codes[:_SHOWN]])
         return f"UNSUBACK id={self.packet_id} {codes}{_more(self.reason_codes)}".rstrip()
+
+
+def _check_count(filters: Sequence[object]) -> None:
+    if len(filters) > MAXIMUM_FILTERS:
+        problem = f"more than {MAXIMUM_FILTERS} topic filters in one packet"
+        raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, problem)
 
 
 _P = TypeVar("_P", bound="_Ping")

@@ -17,6 +17,9 @@ MAX_TOPIC: Final = 65_535
 
 _SHARE: Final = "$share/"
 
+STEP: Final = 16
+"""Nodes of a tree that are passed in one step of a search."""
+
 
 # Control characters and non-characters: the standard leaves them to the receiver (section 1.5.3;
 # 5.0 section 1.5.4). A name that cannot be printed is of no use, and a trap for who reads a log.
@@ -234,11 +237,12 @@ class SubscriptionTree(Generic[V]):
 
 
 class _TopicNode(Generic[V]):
-    __slots__ = ("children", "entry")
+    __slots__ = ("children", "entry", "listing")
 
     def __init__(self) -> None:
         self.children: dict[str, _TopicNode[V]] = {}
         self.entry: tuple[str, V] | None = None
+        self.listing: tuple[_TopicNode[V], ...] | None = None
 
 
 class TopicTree(Generic[V]):
@@ -262,6 +266,7 @@ class TopicTree(Generic[V]):
             child = node.children.get(level)
             if child is None:
                 child = node.children[level] = _TopicNode()
+                node.listing = None
             node = child
         self._size += node.entry is None
         node.entry = (topic, value)
@@ -293,6 +298,7 @@ class TopicTree(Generic[V]):
         while path and node.entry is None and not node.children:
             node, level = path.pop()
             del node.children[level]
+            node.listing = None
         return True
 
     def find(self, filter: str) -> Iterator[tuple[str, V]]:
@@ -301,11 +307,23 @@ class TopicTree(Generic[V]):
         The tree may change between two of them; it is then open whether what was set or deleted
         meanwhile is in the rest.
         """
+        return (found for found in self.find_in_steps(filter) if found is not None)
+
+    def find_in_steps(self, filter: str) -> Iterator[tuple[str, V] | None]:
+        """`find`, with a None now and then, so that a long search can be put off in its middle."""
         levels = filter.split("/")
-        # What is still to be looked at: a node, and how many levels of the filter lead to it.
-        stack = [(self._root, 0)]
+        # What is still to be looked at: nodes, and how many levels of the filter lead to them.
+        stack: list[tuple[Iterator[_TopicNode[V]], int]] = [(iter((self._root,)), 0)]
+        passed = 0
         while stack:
-            node, depth = stack.pop()
+            nodes, depth = stack[-1]
+            node = next(nodes, None)
+            if node is None:
+                stack.pop()
+                continue
+            passed += 1
+            if not passed % STEP:
+                yield None
             if depth == len(levels):
                 if node.entry is not None:
                     yield node.entry
@@ -314,15 +332,21 @@ class TopicTree(Generic[V]):
             if level == "#":
                 if node.entry is not None:
                     yield node.entry
-                next_depth = depth  # `#` is good for all levels below.
+                stack.append((iter(self._listing(node)), depth))  # good for all levels below
             elif level == "+":
-                next_depth = depth + 1
+                stack.append((iter(self._listing(node)), depth + 1))
             else:
                 child = node.children.get(level)
                 if child is not None:
-                    stack.append((child, depth + 1))
-                continue
-            hide_dollar = node is self._root  # [MQTT-4.7.2-1]
-            for name, child in reversed(node.children.items()):
-                if not (hide_dollar and name.startswith("$")):
-                    stack.append((child, next_depth))
+                    stack.append((iter((child,)), depth + 1))
+
+    def _listing(self, node: _TopicNode[V]) -> tuple[_TopicNode[V], ...]:
+        """What wildcards find below a node; kept, as thousands of searches may be under way."""
+        if node.listing is None:
+            hides_dollar = node is self._root  # [MQTT-4.7.2-1]
+            node.listing = tuple(
+                child
+                for name, child in node.children.items()
+                if not (hides_dollar and name.startswith("$"))
+            )
+        return node.listing

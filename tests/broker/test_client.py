@@ -210,7 +210,7 @@ def test_half_a_packet_is_no_sign_of_life(join: Join, broker: Broker):
     peer = join(keep_alive=10)
     for _ in range(4):
         broker.tick(broker.now + 4)
-        peer.client.receive(b"\x30\x7f"[:1] if not peer.client.connection.buffered else b"\x7f")
+        peer.client.receive(b"\x30\x7f"[:1] if not peer.client.connection.held else b"\x7f")
     assert peer.wire.closed
 
 

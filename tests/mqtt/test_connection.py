@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from test_properties import binaries, connects, packets, publishes, topics
 
 from appliance.mqtt.codec import Property, decode_string, encode_varint
-from appliance.mqtt.connection import MAXIMUM_CONTROL, Connection, Event, State
+from appliance.mqtt.connection import (
+    MAXIMUM_CONNECT,
+    MAXIMUM_CONTROL,
+    Connection,
+    Event,
+    State,
+)
 from appliance.mqtt.packets import (
     Auth,
     Connack,
@@ -224,7 +230,7 @@ def test_a_damaged_publish_between_two_whole_ones(version, packet, place, byte):
 def test_any_bytes_give_packets_or_one_error(data, version):
     connection = connected(version)
     assert same(said(connection, [data]), said_slowly(data, version))
-    assert connection.buffered <= len(data)
+    assert connection.held <= len(data)
 
 
 @given(versions.flatmap(connects), versions, topics, binaries, st.lists(st.integers(0), max_size=3))
@@ -246,7 +252,7 @@ def test_what_comes_behind_connect_waits_for_the_login(connect, version, topic, 
     assert found == [connect]
     connection.accept()
     assert said(connection, [b""]) == [message]
-    assert connection.buffered == 0
+    assert connection.held == 0
 
 
 # --- sizes
@@ -260,7 +266,7 @@ def test_a_packet_that_is_too_large_is_refused_by_its_header(first):
         connection = connected(5)
         assert said(connection, chunks) == [ReasonCode.PACKET_TOO_LARGE]
         assert connection.state is State.CLOSED
-        assert connection.buffered == 0
+        assert connection.held == 0
 
 
 def test_a_packet_of_the_largest_size_is_taken():
@@ -276,9 +282,9 @@ def test_a_packet_of_the_largest_size_is_taken():
 def test_a_stranger_gets_less():
     """Before the login a packet is bounded by what a CONNECT can sensibly be."""
     connection = Connection(1 << 28, ALIASES)
-    header = b"\x10" + encode_varint(MAXIMUM_CONTROL)
+    header = b"\x10" + encode_varint(MAXIMUM_CONNECT)
     assert said(connection, [header]) == [ReasonCode.QUOTA_EXCEEDED]
-    large = Connect("x" * 65535, version=4, username="y" * 65535, password=bytes(65535))
+    large = Connect("x" * 33_000, version=4, username="y" * 33_000, password=bytes(33_000))
     assert said(Connection(1 << 28, ALIASES), [large.encode()]) == [large]
 
 
@@ -325,7 +331,7 @@ def test_a_packet_in_many_chunks_is_joined_once(chunk):
         sys.setprofile(None)
     assert [as_packet(event, 5) for event in events] == [packet]
     assert joins <= 2
-    assert connection.buffered == 0
+    assert connection.held == 0
 
 
 # --- orders
@@ -400,7 +406,7 @@ def test_after_the_end_nothing_is_said_or_kept():
     connection.close()
     assert list(events) == []
     assert said(connection, [Pingreq().encode(5), b"\x30"]) == []
-    assert connection.buffered == 0
+    assert connection.held == 0
 
 
 def test_paused_nothing_is_lost():
@@ -413,7 +419,7 @@ def test_paused_nothing_is_lost():
             connection.pause()
     assert len(found) == 2
     assert said(connection, [data[-1:], b"\xc0"]) == []
-    assert connection.buffered == 3 * 4 + 1
+    assert connection.held == 3 * 4 + 1
     connection.accept()
     assert said(connection, [b""]) == [Puback(3), Puback(4), Puback(5)]
     assert said(connection, [b"\x00"]) == [Pingreq()]
