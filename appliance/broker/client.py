@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import uuid
+from collections.abc import Sequence
 from typing import Protocol
 
 from appliance.broker.broker import Broker, Route
@@ -64,7 +65,10 @@ _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 #: The effort of a packet that is not of the data path.
 PACKET_EFFORT = 5
 
-#: The effort of a subscription, in and out.
+#: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE: some ten milliseconds of work.
+MAXIMUM_LEVELS = 20_000
+
+#: The effort of a subscription, in and out; its levels come on top.
 SUBSCRIBE_EFFORT = 10
 
 #: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
@@ -348,9 +352,7 @@ class Client:
         assert session is not None
         identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
         identifier = identifiers[0] if isinstance(identifiers, list) else 0
-        self._counters.effort += SUBSCRIBE_EFFORT * len(packet.subscriptions)
-        for subscription in packet.subscriptions:
-            self._check_filter(subscription.filter)
+        self._check_filters([subscription.filter for subscription in packet.subscriptions])
         codes: list[int] = []
         granted: list[tuple[Subscription, bool]] = []
         for subscription in packet.subscriptions:
@@ -366,6 +368,17 @@ class Client:
             return
         for subscription, is_new in granted:
             self.broker.send_retained(session, subscription, is_new)
+
+    def _check_filters(self, filters: Sequence[str]) -> None:
+        """Raises a ProtocolError when one is no topic filter, or all are too much for one turn."""
+        levels = sum(name.count("/") + 1 for name in filters)
+        self._counters.effort += SUBSCRIBE_EFFORT * len(filters) + levels
+        if levels > MAXIMUM_LEVELS:
+            raise ProtocolError(
+                ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_LEVELS} levels in one packet"
+            )
+        for name in filters:
+            self._check_filter(name)
 
     def _check_filter(self, topic_filter: str) -> None:
         """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
@@ -384,9 +397,7 @@ class Client:
     def _on_unsubscribe(self, packet: Unsubscribe) -> None:
         session = self.session
         assert session is not None
-        self._counters.effort += SUBSCRIBE_EFFORT * len(packet.filters)
-        for name in packet.filters:
-            self._check_filter(name)
+        self._check_filters(packet.filters)
         codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
         self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
 

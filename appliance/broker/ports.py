@@ -197,6 +197,7 @@ USUAL_PACKET_SIZE = 16 * 1024 * 1024
 class Limits:
     """Bounds of everything that a client can make grow; see `broker.limits` in appliance.yaml."""
 
+    connections: int = 1000
     packet_size: int = USUAL_PACKET_SIZE
     memory: int = 256 * 1024 * 1024
     queue_messages: int = 1000

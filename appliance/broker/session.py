@@ -89,7 +89,7 @@ class Ledger:
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     memory: int = field(init=False)
-    #: And what a session may hold when all the memory is taken by others, in bytes.
+    #: And what a connected client may hold when all the memory is taken by others, in bytes.
     reserve: int = field(init=False)
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
@@ -98,7 +98,7 @@ class Ledger:
         self.queue_bytes = self.limits.queue_bytes
         # An eighth is set apart, so that those who hold much do not starve those who hold little.
         self.memory = self.limits.memory * 7 // 8
-        self.reserve = self.limits.memory // 8 // self.limits.sessions
+        self.reserve = self.limits.memory // 8 // self.limits.connections
 
     def has_expired(self, message: Message) -> bool:
         """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
@@ -585,7 +585,8 @@ class Session:
         ledger = self.ledger
         held = self.bytes + size
         return held <= ledger.queue_bytes and (
-            ledger.queued_bytes + size <= ledger.memory or held <= ledger.reserve
+            ledger.queued_bytes + size <= ledger.memory
+            or (self.link is not None and held <= ledger.reserve)
         )
 
     def _take(self, size: int) -> None:

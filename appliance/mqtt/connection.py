@@ -343,7 +343,7 @@ class Connection:
                     f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
                 )
             if packet.topic:
-                self._aliased += len(packet.topic) - len(self._aliases.get(alias, ""))
+                self._aliased += _size(packet.topic) - _size(self._aliases.get(alias, ""))
                 self._aliases[alias] = packet.topic
             elif alias in self._aliases:
                 packet.topic = self._aliases[alias]
@@ -356,6 +356,11 @@ class Connection:
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         return packet
+
+
+def _size(text: str) -> int:
+    """Bytes of memory, roughly."""
+    return len(text) * (1 if text.isascii() else 4)
 
 
 def _check_type(first: int) -> None:

@@ -264,6 +264,10 @@ def test_packets_of_countless_parts_are_refused(join: Join):
     second = join("second")
     second.send(Subscribe(1, [Subscription("a")] * (MAXIMUM_FILTERS + 1)))
     assert second.farewell() == ReasonCode.QUOTA_EXCEEDED
+    third = join("third")
+    deep = "/".join("x" for _ in range(200))
+    third.send(Subscribe(1, [Subscription(f"{n}/{deep}") for n in range(150)]))
+    assert third.farewell() == ReasonCode.QUOTA_EXCEEDED
 
 
 def test_retained_messages_expire_by_themselves(join: Join, broker: Broker):
@@ -284,7 +288,7 @@ def test_retained_messages_expire_by_themselves(join: Join, broker: Broker):
     publisher.publish("r/0", b"", retain=True)
 
 
-@pytest.mark.parametrize("limits", [Limits(memory=100_000, sessions=10, queue_messages=100)])
+@pytest.mark.parametrize("limits", [Limits(memory=100_000, connections=5, queue_messages=100)])
 def test_who_holds_little_is_not_starved_by_who_holds_much(join: Join):
     greedy, modest = join("greedy"), join("modest")
     greedy.subscribe("g", 1)
