@@ -80,9 +80,12 @@ class App:
         broker.tick(loop.time())
 
         async def listen() -> None:
-            self.addresses = await listeners.start(self._listener_settings())
-            for host, port in self.addresses:
-                log.info("listening on %s:%d", host or "*", port)
+            wanted = self._listener_settings()
+            self.addresses = await listeners.start(wanted)
+            for (host, port), listener in zip(self.addresses, wanted, strict=True):
+                kind = " for WebSocket" if listener.protocol == "websocket" else ""
+                where = host if listener.path else f"{host or '*'}:{port}"
+                log.info("listening%s on %s", kind, where)
 
         config = configuration(
             [(str(listener.bind), listener.tls) for listener in broker_settings.listeners],
@@ -97,9 +100,13 @@ class App:
         listeners = Listeners(
             broker,
             frame.authenticate,
-            access.exchange,
+            # It would pass by plugins that refuse clients.
+            access.exchange if not authenticating else lambda method: None,
             connections=limits.connections,
             connect_timeout=limits.connect_timeout,
+            connections_per_address=limits.connections_per_address,
+            connection_rate=limits.connection_rate,
+            publish_rate=limits.publish_rate,
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", _Deaf())
@@ -118,7 +125,12 @@ class App:
             context = server_context(tls.certificate, tls.key, tls.ca, tls.client_certificates)
         return [
             ListenerSettings(
-                listener.bind.host, listener.bind.port, context if listener.tls else None
+                listener.bind.host,
+                listener.bind.port,
+                context if listener.tls else None,
+                listener.protocol,
+                listener.bind.path,
+                listener.mode,
             )
             for listener in self.settings.broker.listeners
         ]
@@ -230,6 +242,7 @@ class _Deaf:
 def _broker_limits(settings: Settings) -> Limits:
     limits = settings.broker.limits
     return Limits(
+        connections=limits.connections,
         packet_size=limits.packet_size,
         memory=limits.memory,
         queue_messages=limits.queue_messages,

@@ -274,13 +274,12 @@ class _Addresses:
 
     def admit(self, host: str, now: float) -> str:
         """Count a new connection; or, uncounted, why it is not allowed."""
-        known = self._known
         network = _network(host)
-        neighbour = known.get(network)
+        neighbour = self._known.get(network)
         if neighbour is None:
-            if len(known) >= self._many:
+            if len(self._known) >= self._many:
                 self._forget_idle(now)
-            neighbour = known[network] = _Neighbour()
+            neighbour = self._known[network] = _Neighbour()
         if neighbour.connections >= self._limit:
             return (
                 f"its address has {neighbour.connections} connections "

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, cast
 
 from websockets.exceptions import NegotiationError, PayloadTooBig
@@ -21,13 +22,34 @@ SUBPROTOCOLS = ("mqtt", "mqttv3.1")
 #: The largest head of an HTTP request, in bytes: a browser's, with all the cookies it may have.
 HEAD_LIMIT = 16 * 1024
 
-#: Bytes of frames that are taken apart in one go, some milliseconds at worst (frames may be empty);
-#: then it is the turn of other clients.
-TURN = 32 * 1024
+#: Seconds that frames are taken apart before it is the turn of other clients, and the bytes of them
+#: that this is asked for at a time: at worst, as frames may be empty, two milliseconds.
+TURN = 0.001
+PORTION = 4096
 
 # The library tells of every connection; what is of interest is told here, with the address.
 _library_log = logging.getLogger(f"{__name__}.frames")
 _library_log.setLevel(logging.ERROR)
+
+
+class Upper(asyncio.Protocol, ABC):
+    """What can be above a WebSocket: a protocol that answers for the connection."""
+
+    @abstractmethod
+    def frame_limit(self) -> int:
+        """How large a frame may be that is received now, in bytes."""
+
+    @abstractmethod
+    def keep(self, size: int) -> None:
+        """So many bytes of a frame are kept until it is complete."""
+
+    @abstractmethod
+    def complain(self, what: str, why: str) -> None:
+        """Tell the log what was refused or ended."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection: what is below was told why."""
 
 
 class WebSocket(asyncio.Transport, asyncio.Protocol):
@@ -36,27 +58,19 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     What is above reads and writes bytes, and its flow control is that of the transport below. It
     receives a message in the fragments that it comes in, and none while it has paused reading.
 
-    `frame_limit` says how large a frame may be that is received now, in bytes; `complain` is told
-    what was refused or ended, and why. Whether a page of another origin opened the connection makes
-    no difference: no browser adds a password to it.
+    Whether a page of another origin opened the connection makes no difference: no browser adds a
+    password to it by itself.
     """
 
-    def __init__(
-        self,
-        protocol: asyncio.Protocol,
-        frame_limit: Callable[[], int],
-        complain: Callable[[str, str], None],
-    ) -> None:
+    def __init__(self, protocol: Upper) -> None:
         super().__init__()
         self._protocol = protocol
-        self._frame_limit = frame_limit
-        self._complain = complain
         self._loop = asyncio.get_running_loop()
         self._frames = _Frames(logger=_library_log)
         #: The HTTP request, until it is complete.
         self._head = bytearray()
         #: Received, and not yet taken apart.
-        self._held = b""
+        self._held = memoryview(b"")
         self._reading = True
         self._writing = True
         #: The answer to the last ping, while it cannot be written.
@@ -71,24 +85,25 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Hand on what the frames hold, whole or in part."""
-        self._held += data
+        self._held = memoryview(bytes(self._held) + data if self._held else data)
         self._take()
 
     def _take(self) -> None:
-        data, self._held = self._held[:TURN], self._held[TURN:]
-        if self._held:
-            self._transport.pause_reading()
-            self._loop.call_soon(self._take_on)
-        if self._frames.state is State.CONNECTING:
-            data = self._receive_head(data)
-        if data:
-            self._receive_frames(data)
+        """Take apart what is there, until others have their turn; reading is paused then."""
+        until = self._loop.time() + TURN
+        while self._held and self._reading and not self._transport.is_closing():
+            data, self._held = bytes(self._held[:PORTION]), self._held[PORTION:]
+            if self._frames.state is State.CONNECTING:
+                data = self._receive_head(data)
+            if data:
+                self._receive_frames(data)
+            if self._held and self._loop.time() > until:
+                self._transport.pause_reading()
+                self._loop.call_soon(self._take_on)
+                break
 
     def _take_on(self) -> None:
-        if self._transport.is_closing() or not self._reading:
-            return
-        if self._held:
-            self._take()
+        self._take()
         if not self._held and self._reading and not self._transport.is_closing():
             self._transport.resume_reading()
 
@@ -135,14 +150,14 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
 
     def _send_refusal(self, response: Response | None, reason: str) -> None:
-        self._complain("no WebSocket connection", reason)
+        self._protocol.complain("no WebSocket connection", reason)
         if response is not None:
             self._transport.write(response.serialize())
-        self._transport.close()
+        self._protocol.close()
 
     def _receive_frames(self, data: bytes) -> None:
         frames = self._frames
-        frames.max_size = self._frame_limit()
+        frames.max_size = self._protocol.frame_limit()
         frames.receive_data(data)
         payload: list[bytes] = []
         is_text = False
@@ -156,6 +171,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if payload:  # [MQTT-6.0.0-2]
             self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
         self._answer(frames.data_to_send())
+        self._protocol.keep(len(frames.reader.buffer))
         error = frames.parser_exc
         if is_text:
             self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
@@ -175,11 +191,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._pong = writes[-1]
 
     def _fail(self, code: CloseCode, reason: str) -> None:
-        self._complain("not the WebSocket protocol", reason)
+        self._protocol.complain("not the WebSocket protocol", reason)
         if self._frames.state is State.OPEN:
             self._frames.send_close(code, reason)
             self._send(self._frames.data_to_send())
-        self._transport.close()
+        self._protocol.close()
 
     def _send(self, writes: list[bytes]) -> None:
         if any(writes):

@@ -11,12 +11,14 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import TypeAlias, cast
 
+from appliance import tls
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
-from appliance.websocket import WebSocket
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.websocket import Upper, WebSocket
 
 #: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
 Authenticate: TypeAlias = Callable[
@@ -24,7 +26,7 @@ Authenticate: TypeAlias = Callable[
 ]
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
-#: read most of them: what a healthy one takes in one round of the event loop, with room to spare.
+#: read them: what a healthy one takes in one round of the event loop, with room to spare.
 OUTPUT_HIGH_WATER = 1024 * 1024
 
 #: The same while the output of all clients takes more than a quarter of `limits.memory`. Less than
@@ -34,15 +36,7 @@ OUTPUT_LOW_WATER = 16 * 1024
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
 WRITE_PORTION = 128 * 1024
 
-#: Bytes that a TLS transport has handed to the connection under it before it begins to keep any.
-TLS_BUFFER = 64 * 1024
-
-#: Seconds that one client's bytes are worked on before others have their turn, and the bytes that
-#: are never cut into smaller portions for it.
-TURN = 0.001
-SMALL_CHUNK = 4096
-
-#: And the largest portion: of small messages, so many bytes may be some hundred milliseconds.
+#: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
 LARGEST_PORTION = 256 * 1024
 
 #: A chunk this large means that more is waiting. The loop would read on without writing out, up to
@@ -50,10 +44,19 @@ LARGEST_PORTION = 256 * 1024
 #: theirs before they count as slow.
 LARGE_CHUNK = 128 * 1024
 
+#: Bytes of a chunk that are little, and messages that are few: after more than these it is checked
+#: whether who sends them has to wait.
+LITTLE = 16 * 1024
+FEW_MESSAGES = 64
+
+#: What all clients that send much may cause in one round of the event loop, see
+#: `Counters.effort`: some five milliseconds.
+EFFORT_A_ROUND = 5000
+
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
 
-#: Seconds that a publisher is not read after each chunk while memory is short.
+#: Seconds that a publisher is not read, after each check, while memory is short.
 SHORT_OF_MEMORY_PAUSE = 0.05
 
 #: Seconds that a client is slow before the log is told.
@@ -89,26 +92,89 @@ class Network:
         self.authenticate = authenticate
         self.exchange = exchange
         self.connect_timeout = connect_timeout
-        #: Seconds of a client's time that a message takes.
-        self.publish_interval = 1 / publish_rate
-        #: Bytes in which there are not more messages than may come at once; the smallest has five.
-        self.largest_portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
+        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
+        #: Messages of a client after which it is checked.
+        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
+        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
+        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
         #: `Ledger.queued_bytes` from which on publishers are slowed.
         self.short_of_memory = broker.limits.memory * 3 // 4
+        #: Bytes in the output of all clients from which on less is allowed to each of them.
+        self.much_output = broker.limits.memory // 4
         self.open: set[ClientProtocol] = set()
         #: What runs in the background for a connection: TLS handshakes and logins.
         self.tasks: set[asyncio.Task[None]] = set()
         #: Bytes in the output of all clients, as far as they are counted.
         self.output = 0
         self._ended = ended
+        #: For how many clients a large chunk waits, by its id.
+        self._shared: dict[int, int] = {}
+        #: Who has more to do than there was time for; in turn, with all others in between.
+        self._turns: deque[ClientProtocol] = deque()
+        self._effort_begun = 0
+        self._counting = False
         self._farewells: set[_Farewell] = set()
         self._all_closed: asyncio.Event | None = None
+
+    def is_busy(self) -> bool:
+        """Whether as much was done in this round of the event loop as one round is for.
+
+        Who sends much then waits. Who sends little does not, whatever the others do.
+        """
+        if not self._counting:
+            self._counting = True
+            self._effort_begun = self.broker.counters.effort
+            asyncio.get_running_loop().call_soon(self._new_round)
+        effort = self.broker.counters.effort - self._effort_begun
+        return effort > EFFORT_A_ROUND or bool(self._turns)
+
+    def _new_round(self) -> None:
+        self._counting = False
+
+    def queue_turn(self, protocol: ClientProtocol) -> None:
+        """Call `take_turn` when it is the protocol's."""
+        self._turns.append(protocol)
+        if len(self._turns) == 1:
+            asyncio.get_running_loop().call_soon(self._run_turns)
+
+    def _run_turns(self) -> None:
+        end = self.broker.counters.effort + EFFORT_A_ROUND
+        left = len(self._turns)
+        while left:
+            left -= 1
+            # Taken out after its turn, so that no entry meanwhile is the first, to be scheduled.
+            self._turns[0].take_turn()
+            self._turns.popleft()
+            if self.broker.counters.effort > end:
+                break
+        if self._turns:
+            asyncio.get_running_loop().call_soon(self._run_turns)
 
     def in_background(self, work: Coroutine[object, object, None]) -> None:
         """Run a connection's handshake or login beside everything else."""
         task = asyncio.get_running_loop().create_task(work)
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
+
+    def count_output(self, size: int) -> None:
+        """So many bytes more, or less, wait to be read by a client."""
+        self.output += size
+        self.broker.ledger.queued_bytes += size
+
+    def share(self, chunk: bytes) -> None:
+        """Count a large chunk that waits for a client: once, for however many it waits."""
+        clients = self._shared.get(id(chunk), 0)
+        if not clients:
+            self.count_output(len(chunk))
+        self._shared[id(chunk)] = clients + 1
+
+    def unshare(self, chunk: bytes) -> None:
+        """It waits for one client less."""
+        clients = self._shared.pop(id(chunk)) - 1
+        if clients:
+            self._shared[id(chunk)] = clients
+        else:
+            self.count_output(-len(chunk))
 
     def closed(self, protocol: ClientProtocol) -> None:
         """A connection ended."""
@@ -150,7 +216,7 @@ class Network:
             farewell.end()
 
 
-class ClientProtocol(asyncio.Protocol):
+class ClientProtocol(Upper):
     """One connection: bytes to the `Client`, and as its `Wire` bytes from it."""
 
     def __init__(self, network: Network, address: str, host: str) -> None:
@@ -159,24 +225,33 @@ class ClientProtocol(asyncio.Protocol):
         self.host = host
         self._network = network
         self._broker = network.broker
+        self._ledger = network.broker.ledger
+        self._counters = network.broker.counters
         self._transport: asyncio.Transport | None = None
         self._loop = asyncio.get_running_loop()
         self._client = Client(self._broker, self)
         self._closing = False
-        # Input: what was received and waits for its turn, and why it does.
+        # Input: what was received and waits, and what it waits for.
         self._held = memoryview(b"")
-        self._portion = min(4 * SMALL_CHUNK, network.largest_portion)
-        self._published_until = 0.0  # what it published is paid for, at the rate allowed
-        self._turn_comes = False
-        self._resting = False
+        self._frame = 0  # bytes of a WebSocket frame that is not complete
+        self._sends_on = False  # the client has more to do, and wants its turn
+        self._turn_over = False
+        self._in_turn = False
+        self._resting: asyncio.TimerHandle | None = None
         self._choked = False
         self._logging_in = False
-        # Output: the chunks that the transport was not given yet.
-        self._waiting: deque[bytes | memoryview] = deque()
-        self._waiting_size = 0
+        # How fast it publishes.
+        self._little = min(LITTLE, network.portion)
+        self._countdown = network.check_every  # of messages, to the next check
+        self._checked_at = self._loop.time()
+        self._allowed = PUBLISH_BURST * network.publish_rate  # messages, at the last check
+        # Output: what the transport was not given yet, and what of it is counted.
+        self._waiting: deque[bytes] = deque()
+        self._waiting_size = 0  # bytes that are left of them
+        self._begun = 0  # bytes of the first chunk that the transport was given
+        self._unshared = 0  # bytes of the chunks that wait for this client only
         self._paused = False
-        self._hidden = 0  # bytes in a transport that asks for a pause, beside those that it tells
-        self._counted = 0  # of its bytes in the ledger
+        self._counted = 0  # bytes in the ledger
         self._slow: asyncio.TimerHandle | None = None
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
@@ -193,20 +268,20 @@ class ClientProtocol(asyncio.Protocol):
         """Take over an accepted connection, with TLS through its handshake."""
         # Not left to asyncio's own server for one reason: when a handshake fails, that would
         # say nothing, and who it was and why is what the log is asked for.
-        timeout = self._network.connect_timeout if context else None
         protocol: asyncio.Protocol = self
         if websocket:
-            protocol = WebSocket(self, self._frame_limit, self._complain)
+            protocol = WebSocket(self)
         try:
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 # A client without keep alive whose computer is gone is found out by the system.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            await self._loop.connect_accepted_socket(
-                lambda: protocol, connection, ssl=context, ssl_handshake_timeout=timeout
-            )
+            if context is None:
+                await self._loop.connect_accepted_socket(lambda: protocol, connection)
+            else:
+                await tls.accept(connection, context, protocol, self._network.connect_timeout)
         except (OSError, asyncio.TimeoutError) as error:
-            self._complain(f"no {'TLS ' if context else ''}connection", _tls_reason(error))
+            self.complain(f"no {'TLS ' if context else ''}connection", _tls_reason(error))
             connection.close()
             self._forget()
 
@@ -214,45 +289,48 @@ class ClientProtocol(asyncio.Protocol):
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=OUTPUT_LOW_WATER)
-        if transport.get_extra_info("ssl_object") is not None:
-            self._hidden = TLS_BUFFER
         if self not in self._network.open:  # the handshake ended just after its time
             self._transport.abort()
 
     def _too_late(self) -> None:
         timeout = f"{self._network.connect_timeout:g} s"
-        self._complain(f"no complete CONNECT within {timeout}", "broker.limits.connect_timeout")
+        self.complain(f"no complete CONNECT within {timeout}", "broker.limits.connect_timeout")
         self.abort()
 
-    def _complain(self, what: str, why: str) -> None:
+    def complain(self, what: str, why: str) -> None:
         """Tell the log, unless it is a flood of the same from the same host."""
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
         self._broker.complaints.tell(now, (self.host, what), "%s", message)
 
-    def _frame_limit(self) -> int:
-        """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
-        if self._client.session is None:
-            return MAXIMUM_CONTROL
-        return self._broker.limits.packet_size + MAXIMUM_CONTROL
-
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection ended, whoever ended it."""
         self._forget()
-        self._waiting.clear()
-        self._waiting_size = 0
+        while self._waiting:
+            self._take_waiting(self._waiting_size)
         self._paused = False
         self._count_output()
         if self._slow is not None:
             self._slow.cancel()
-        self._broker.ledger.now = self._loop.time()
+        self._ledger.now = self._loop.time()
         if not self._closing:
             self._closing = True
-            self._client.receive(bytes(self._held))  # what it said before it left
-        self._client.lost()
-        self._broker.flush()
+            self._client.receive(bytes(self._held))
+        self._transport = None
+        self.keep(0)
+        self._leave()
         if self._connection is not None:
             self._network.part(self._connection)
+
+    def _leave(self) -> None:
+        """End the client when what it said before it left is done, in as many turns as it takes."""
+        if self._sends_on:
+            self._sends_on = False
+            self._client.send_on()
+            self._loop.call_soon(self._leave)
+        else:
+            self._client.lost()
+        self._broker.flush()
 
     def _forget(self) -> None:
         self._network.closed(self)
@@ -260,128 +338,178 @@ class ClientProtocol(asyncio.Protocol):
 
     def abort(self) -> None:
         """Close at once."""
-        # asyncio's own TLS transport, up to Python 3.11.2, cannot be aborted twice.
         if self._transport is not None:
-            with contextlib.suppress(AttributeError):
-                self._transport.abort()
+            self._transport.abort()
         self._forget()
 
     # --- bytes in ------------------------------------------------------------------------------
 
     def data_received(self, data: bytes) -> None:
         """Hand the chunk to the client; then everyone is written to, once, what it caused."""
-        if len(data) > self._portion:
-            data = self._hold(data)
-        broker = self._broker
-        counters = broker.counters
-        broker.ledger.now = now = self._loop.time()
+        if len(data) > self._little and not self._in_turn:
+            data = self._receive_much(data)
+            if not data:
+                return
+        counters = self._counters
+        self._ledger.now = self._loop.time()
         published = counters.publish_received
         self._client.receive(data)
-        published = counters.publish_received - published
-        if broker.unflushed:
-            broker.flush()
-        if published:
-            # A client has as much time as there is; each message takes some of it.
-            until = self._published_until
-            until = (until if until > now else now) + published * self._network.publish_interval
-            self._published_until = until
-            if until > now + PUBLISH_BURST:
-                self._rest(until - now - PUBLISH_BURST)
-            elif broker.ledger.queued_bytes > self._network.short_of_memory:
-                self._wait_for_memory()
-        if len(data) > SMALL_CHUNK:
-            self._size_portions(len(data), self._loop.time() - now)
-        if not self._client.writable and self._output_size() > self._output_limit:
+        published -= counters.publish_received
+        if self._broker.unflushed:
+            self._broker.flush()
+        if published:  # so many less than none
+            self._countdown += published
+            if self._countdown <= 0:
+                self._check_publisher()
+        if self._slow is not None and self._output_size() > self._output_limit:
             # It asks on, and does not read the answers.
             self._choked = True
             self._pause_reading()
 
-    def _hold(self, data: bytes) -> bytes:
-        """Keep what is more than a portion for later; returns the portion."""
-        chunk = memoryview(data)
-        self._held = chunk[self._portion :]
-        self._read_later()
-        return bytes(chunk[: self._portion])
-
-    def _size_portions(self, size: int, took: float) -> None:
-        """Let the next portions be as large as is done in one turn; the last one took so long."""
-        if took > TURN:
-            self._portion = min(self._portion, max(SMALL_CHUNK, int(size * TURN / took)))
-        elif size >= self._portion and took < TURN / 2:
-            self._portion = min(2 * self._portion, self._network.largest_portion)
-        if size >= LARGE_CHUNK:
+    def _receive_much(self, data: bytes) -> bytes:
+        """Let who sends much wait where that is due; returns what is to be taken in now."""
+        self._check_memory()
+        portion = 0 if self._network.is_busy() else self._network.portion
+        if len(data) >= LARGE_CHUNK or len(data) > portion:
             self._read_later()
+        if len(data) > portion:
+            self._held = memoryview(data)[portion:]
+        return data[:portion]
+
+    def _check_publisher(self) -> None:
+        """Let a publisher wait that is too fast, by its own limit or by everyone's."""
+        network = self._network
+        rate = network.publish_rate
+        now = self._ledger.now
+        # What it may publish grows with time, and shrinks by what it has published since the last
+        # check.
+        allowed = min(self._allowed + (now - self._checked_at) * rate, PUBLISH_BURST * rate)
+        self._allowed = allowed - (network.check_every - self._countdown)
+        self._countdown = network.check_every
+        self._checked_at = now
+        if self._allowed < 0:
+            self._rest(-self._allowed / rate)
+        else:
+            self._check_memory()
+
+    def _check_memory(self) -> None:
+        if self._ledger.queued_bytes > self._network.short_of_memory and self._resting is None:
+            # Not for longer: it may be this client that has to acknowledge what takes the memory.
+            self._rest(SHORT_OF_MEMORY_PAUSE)
+            self._broker.complaints.tell(
+                self._ledger.now,
+                "memory",
+                "%s is slowed: %d bytes are in use, of the %d allowed (broker.limits.memory)",
+                self._client,
+                self._ledger.queued_bytes,
+                self._broker.limits.memory,
+            )
 
     def _rest(self, seconds: float) -> None:
         """Read nothing for so long."""
-        self._resting = True
+        if self._resting is not None:
+            self._resting.cancel()
+        self._resting = self._loop.call_later(seconds, self._rested)
         self._pause_reading()
-        self._loop.call_later(seconds, self._rested)
 
     def _rested(self) -> None:
-        self._resting = False
+        self._resting = None
         self._read_on()
-
-    def _wait_for_memory(self) -> None:
-        # Not for longer: it may be this client that has to acknowledge what takes the memory.
-        self._rest(SHORT_OF_MEMORY_PAUSE)
-        ledger = self._broker.ledger
-        self._broker.complaints.tell(
-            ledger.now,
-            "memory",
-            "%s is slowed: %d bytes wait for clients, of the %d allowed (broker.limits.memory)",
-            self._client,
-            ledger.queued_bytes,
-            ledger.memory,
-        )
 
     def _read_later(self) -> None:
         """Let the others have their turn, then read on."""
         self._pause_reading()
-        if not self._turn_comes:
-            self._turn_comes = True
-            self._loop.call_soon(self._read_on)
+        if not self._turn_over:
+            self._turn_over = True
+            self._network.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._turn_over = False
+        self._read_on()
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.pause_reading()
 
     def _read_on(self) -> None:
-        self._turn_comes = False
-        if self._choked or self._resting or self._logging_in or self._closing:
+        """Go on with what waits, in its order, unless there is a reason to wait."""
+        if self._turn_over or self._resting or self._choked or self._logging_in or self._closing:
             return
         if self._transport is None or self._transport.is_closing():
             return
-        if self._held:
-            portion = bytes(self._held[: self._portion])
-            self._held = self._held[self._portion :]
+        if self._sends_on:
+            self._send_on()
+        elif self._held:
+            portion = bytes(self._held[: self._network.portion])
+            self._held = self._held[self._network.portion :]
+            self._in_turn = True
             self.data_received(portion)
+            self._in_turn = False
             self._read_later()
         else:
             self._transport.resume_reading()
+
+    def _send_on(self) -> None:
+        self._sends_on = False
+        self._ledger.now = self._loop.time()
+        published = self._counters.publish_received
+        self._client.send_on()
+        self._countdown -= self._counters.publish_received - published
+        self._broker.flush()
+        if self._countdown <= 0:
+            self._check_publisher()
+        self._read_on()
+
+    def frame_limit(self) -> int:
+        """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
+        if self._client.session is None:
+            return MAXIMUM_CONTROL
+        return self._broker.limits.packet_size + MAXIMUM_CONTROL
+
+    def keep(self, size: int) -> None:
+        """Count the bytes of a WebSocket frame that is not complete; without room, close."""
+        ledger = self._ledger
+        grown = size - self._frame
+        self._frame = size
+        ledger.queued_bytes += grown
+        if grown > 0 and size > ledger.reserve and ledger.queued_bytes > ledger.memory:
+            reason = f"no memory for {size} bytes of a WebSocket frame (broker.limits.memory)"
+            self._client.fail(ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason))
+            self._broker.flush()
 
     # --- bytes out -----------------------------------------------------------------------------
 
     def _write_on(self) -> None:
         """Give the transport what waits, until it asks for a pause."""
-        waiting = self._waiting
         assert self._transport is not None
-        while waiting and not self._paused and not self._transport.is_closing():
-            portion: list[bytes | memoryview] = []
-            room = WRITE_PORTION
-            while waiting and room:
-                chunk = waiting.popleft()
-                if len(chunk) > room:
-                    view = memoryview(chunk)
-                    waiting.appendleft(view[room:])
-                    chunk = view[:room]
-                portion.append(chunk)
-                room -= len(chunk)
-            self._waiting_size -= WRITE_PORTION - room
+        while self._waiting and not self._paused and not self._transport.is_closing():
+            portion = [self._take_waiting(WRITE_PORTION)]
+            room = WRITE_PORTION - len(portion[0])
+            while self._waiting and room:
+                portion.append(self._take_waiting(room))
+                room -= len(portion[-1])
             self._transport.write(portion[0] if len(portion) == 1 else b"".join(portion))
         self._count_output()
-        if self._closing and not waiting:
+        if self._closing and not self._waiting:
             self._close_transport()
+
+    def _take_waiting(self, most: int) -> bytes | memoryview:
+        """What is left of the first chunk that waits, or so many bytes of it."""
+        chunk, begun = self._waiting[0], self._begun
+        left = len(chunk) - begun
+        if left > most:
+            self._begun += most
+            self._waiting_size -= most
+            return memoryview(chunk)[begun : self._begun]
+        self._waiting.popleft()
+        self._waiting_size -= left
+        self._begun = 0
+        if len(chunk) > WRITE_PORTION:
+            self._network.unshare(chunk)
+        else:
+            self._unshared -= len(chunk)
+        return memoryview(chunk)[begun:] if begun else chunk
 
     def _output_size(self) -> int:
         transport = self._transport
@@ -389,16 +517,15 @@ class ClientProtocol(asyncio.Protocol):
 
     def _count_output(self) -> None:
         """Enter in the ledger what waits for this client, and tell it when that is too much."""
-        size = self._waiting_size
-        if self._paused and self._transport is not None:
-            size += self._transport.get_write_buffer_size() + self._hidden
         network = self._network
-        ledger = self._broker.ledger
-        ledger.queued_bytes += size - self._counted
-        network.output += size - self._counted
-        self._counted = size
-        plenty = network.output <= ledger.memory // 4
-        limit = OUTPUT_HIGH_WATER if plenty else OUTPUT_LOW_WATER
+        counted = self._unshared
+        if self._paused and self._transport is not None:
+            counted += self._transport.get_write_buffer_size()
+        network.count_output(counted - self._counted)
+        self._counted = counted
+        much = network.output > network.much_output
+        limit = OUTPUT_LOW_WATER if much else OUTPUT_HIGH_WATER
+        size = self._output_size()
         if size > limit and self._slow is None:
             self._client.writable = False
             # From here on its output grows by what it is answered only, and by no more than this.
@@ -411,7 +538,7 @@ class ClientProtocol(asyncio.Protocol):
             "slow",
             "%s is slow: it does not read %d bytes, and is sent nothing more until it does",
             self._client,
-            self._counted,
+            self._output_size(),
         )
 
     def pause_writing(self) -> None:
@@ -443,8 +570,8 @@ class ClientProtocol(asyncio.Protocol):
         self._network.in_background(self._log_in(connect))
 
     async def _log_in(self, connect: Connect) -> None:
-        tls = self._transport.get_extra_info("ssl_object") if self._transport else None
-        who = await self._network.authenticate(connect, self.address, tls)
+        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
+        who = await self._network.authenticate(connect, self.address, peer)
         self._logging_in = False
         if isinstance(who, Refusal):
             self._client.refuse(who.code, who.reason)
@@ -462,35 +589,36 @@ class ClientProtocol(asyncio.Protocol):
         self._timeout.cancel()
 
     def later(self) -> None:
-        """Let the others have their turn, then send on."""
-        self._loop.call_soon(self._send_on)
-
-    def _send_on(self) -> None:
-        self._broker.ledger.now = self._loop.time()
-        self._client.send_on()
-        self._broker.flush()
+        """Let the others have their turn, then let the client go on; it is not read before that."""
+        self._sends_on = True
+        self._read_later()
 
     def write(self, chunks: list[bytes]) -> None:
-        """Write the chunks: joined when small; else, and to who is slow, in portions."""
-        if self._paused or len(chunks[-1]) > WRITE_PORTION:
-            self._write_later(chunks)
-            return
-        data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
-        if len(data) > WRITE_PORTION:
-            self._write_later(chunks)
-            return
-        self._broker.counters.bytes_sent += len(data)
-        if self._transport is not None:
-            self._transport.write(data)
+        """Write the chunks, joined when they are small; to who is slow, in portions."""
+        if not self._paused:
+            data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
+            size = len(data)
+            if size <= WRITE_PORTION:
+                self._counters.bytes_sent += size
+                if self._transport is not None:
+                    self._transport.write(data)
+                return
+        self._write_later(chunks)
 
     def _write_later(self, chunks: list[bytes]) -> None:
-        # Kept as they are, not joined: the payload in them is the same object for all receivers.
-        size = sum(map(len, chunks))
-        self._broker.counters.bytes_sent += size
-        if self._transport is not None and not self._transport.is_closing():
-            self._waiting += chunks
-            self._waiting_size += size
-            self._write_on()
+        if len(chunks[-1]) <= WRITE_PORTION:  # a large payload is one object for all its receivers
+            chunks = [b"".join(chunks)]
+        self._counters.bytes_sent += sum(map(len, chunks))
+        if self._transport is None or self._transport.is_closing():
+            return
+        for chunk in chunks:
+            self._waiting.append(chunk)
+            self._waiting_size += len(chunk)
+            if len(chunk) > WRITE_PORTION:
+                self._network.share(chunk)
+            else:
+                self._unshared += len(chunk)
+        self._write_on()
 
     def close(self) -> None:
         """Write out what waits, then close."""
@@ -506,6 +634,9 @@ class ClientProtocol(asyncio.Protocol):
 
     def _close_transport(self) -> None:
         assert self._transport is not None
+        if not self._transport.get_write_buffer_size():
+            self._timeout.cancel()
+            self._timeout = self._loop.call_later(FAREWELL_TIMEOUT, self._transport.abort)
         if self._connection is None and not self._transport.is_closing():
             # A transport closes its socket as soon as it has written: of that only a copy is left.
             with contextlib.suppress(OSError):

@@ -495,6 +495,42 @@ def test_a_subscription_is_allowed_exactly_when_some_topic_could_be_delivered(
     assert bool(acl.decide(NOBODY, Action.SUBSCRIBE, filter)) is possible
 
 
+NAMES = ["a", "b", "c", "$SYS", ""]
+PERMISSIONS = [Permission.DENY, Permission.READ, Permission.WRITE, Permission.READWRITE]
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(PERMISSIONS),
+            st.lists(st.sampled_from([*NAMES, "+", "%c", "%u"]), min_size=1, max_size=4),
+            st.booleans(),
+            st.sampled_from(["own", "pattern"]),
+        ),
+        min_size=12,
+        max_size=24,
+    ),
+    st.sampled_from([NOBODY, Identity(None, "a"), Identity(None, "a/b"), Identity(None, "$SYS")]),
+    filters(),
+)
+def test_what_is_decided_quickly_is_what_all_rules_say(
+    lines: list[tuple[Permission, list[str], bool, str]], identity: Identity, filter: str
+) -> None:
+    acl = Acl(
+        "acl.conf",
+        [
+            Rule("f", number, "", permission, name, None, kind == "pattern")
+            for number, (permission, levels, open_ended, kind) in enumerate(lines)
+            if (name := "/".join([*levels, "#"] if open_ended else levels))
+        ],
+    )
+    for topic in (filter, filter.replace("+", "a").replace("#", "b"), "$SYS/a", "a/c/d/e/f"):
+        for verdict in acl.explain(identity, topic).verdicts:
+            decision = acl.decide(identity, verdict.action, topic)
+            assert (decision.allowed, decision.reason) == (verdict.allowed, verdict.reason)
+
+
 def test_an_acl_is_quick_where_it_is_long(tmp_path: Path) -> None:
     lines = [f"topic deny denied/{i}/#\ntopic read {i}/+/x" for i in range(300)]
     acl = acl_of(tmp_path, "\n".join(lines))
@@ -876,15 +912,27 @@ async def test_the_loop_goes_on_while_passwords_are_hashed(access: FileAccess) -
     assert turns > 5
 
 
-async def test_what_is_remembered_is_bounded_and_no_password(
-    access: FileAccess, monkeypatch: pytest.MonkeyPatch
+async def test_one_password_of_each_user_is_remembered_and_not_as_it_is(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("appliance.access.files._MAX_REMEMBERED", 2)
+    names = [f"user{number}" for number in range(200)]
+    stored = files[0].read_text().partition(":")[2].strip()
+    write(files[0], "".join(f"{name}:{stored}\n" for name in names))
+    access = FileAccess(*files, "r2d2")
     monkeypatch.setattr(passwords_module, "check_password", lambda stored, password: True)
-    for i in range(5):
-        await access.authenticate("alice", b"geheim%d" % i, "c", "::1")
-    assert len(access._remembered) == 2
-    assert b"geheim" not in b"".join(access._remembered)
+    for password in (b"before", b"geheim"):
+        for name in names:
+            await access.authenticate(name, password, "c", "::1")
+    assert sorted(access._remembered) == sorted(names)
+    assert "geheim" not in repr(access._remembered)
+    monkeypatch.setattr(passwords_module, "check_password", lambda stored, password: False)
+    for name in names:  # not one of them was forgotten, and none is let in with the one before
+        assert isinstance(await access.authenticate(name, b"geheim", "c", "::1"), Identity)
+        assert isinstance(await access.authenticate(name, b"before", "c", "::1"), Refusal)
+    write(files[0], f"user7:{stored}\n")
+    access.reload()
+    assert list(access._remembered) == ["user7"]
+    access.close()
 
 
 async def test_a_new_password_counts_from_the_reload_on(

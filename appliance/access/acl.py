@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Flag
 from itertools import zip_longest
@@ -20,6 +20,9 @@ _BLANK: Final = " \t\n\v\f\r"
 _KEYWORDS: Final = ("topic", "pattern", "user", "include")
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
+
+# Rules of which it is quicker to look at each than to search for the right ones.
+_FEW: Final = 4
 
 # A level that no rule can name, as no filter may hold U+0000 [MQTT-4.7.3-2].
 _FRESH: Final = "\0"
@@ -72,8 +75,82 @@ class Rule:
     user: str | None = None
     pattern: bool = False
 
+    @property
+    def denies(self) -> bool:
+        """Whether it takes, and does not give."""
+        return self.permission is Permission.DENY
+
+    def gives(self, permission: Permission) -> bool:
+        """Whether it gives this, READ or WRITE."""
+        return self.permission is permission or self.permission is Permission.READWRITE
+
     def __str__(self) -> str:
         return f"{self.file}:{self.line}: {self.text}"
+
+
+class _Level:
+    """A level of the filters of rules: those that end with it, and what comes below."""
+
+    __slots__ = ("below", "places")
+
+    def __init__(self) -> None:
+        self.below: dict[str, _Level] = {}
+        self.places: list[int] = []
+
+
+class _Group:
+    """Rules in the order in which they count: what denies comes first.
+
+    They are also a tree of their filters, so that of a long file only those few rules are looked at
+    that may say something about a topic: a decision must not take longer the more rules there are.
+    """
+
+    def __init__(self, rules: Iterable[Rule] = ()) -> None:
+        self.rules = sorted(rules, key=lambda rule: not rule.denies)  # It keeps the order else.
+        self._root = _Level()
+        self._always: list[int] = []
+        for place, rule in enumerate(self.rules):
+            levels = rule.filter.split("/")
+            named = rule.pattern and ("%c" in levels or "%u" in levels)
+            if named and rule.denies:  # With a name that cannot be put in it denies everything.
+                self._always.append(place)
+                continue
+            level = self._root
+            for name in levels:
+                key = "+" if named and name in ("%c", "%u") else name
+                level = level.below.setdefault(key, _Level())
+            level.places.append(place)
+
+    def about(self, filter: str) -> list[Rule]:
+        """At least all rules that may match some topic of `filter`, or the topic that it is."""
+        if len(self.rules) <= _FEW:
+            return self.rules
+        found = list(self._always)
+        reached = [self._root]
+        for name in filter.split("/"):
+            if name == "#":
+                while reached:
+                    level = reached.pop()
+                    found += level.places
+                    reached += level.below.values()
+                break
+            above, reached = reached, []
+            for level in above:
+                below = level.below
+                if "#" in below:
+                    found += below["#"].places
+                if name == "+":
+                    reached += below.values()
+                    continue
+                if name in below:
+                    reached.append(below[name])
+                if "+" in below:
+                    reached.append(below["+"])
+        for level in reached:
+            found += level.places
+            if "#" in level.below:  # `a/#` matches `a` too.
+                found += level.below["#"].places
+        return [self.rules[place] for place in sorted(set(found))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +166,12 @@ class _Applied:
 
     def matches(self, topic: str) -> bool:
         if self.filter is None:
-            return not self.rule.permission
+            return self.rule.denies
         return matches(self.filter, topic)
 
     def overlaps(self, filter: str) -> bool:
         if self.filter is None:
-            return not self.rule.permission
+            return self.rule.denies
         return overlaps(self.filter, filter)
 
     def __str__(self) -> str:
@@ -145,15 +222,15 @@ class Acl:
     def __init__(self, name: str, rules: Iterable[Rule]) -> None:
         """`name` is what the file is called in reasons."""
         self._name = name
-        self._own: dict[str | None, list[Rule]] = {}
-        self._patterns: list[Rule] = []
+        own: dict[str | None, list[Rule]] = {}
+        patterns: list[Rule] = []
         for rule in rules:
             if rule.pattern:
-                self._patterns.append(rule)
+                patterns.append(rule)
             else:
-                self._own.setdefault(rule.user, []).append(rule)
-        for group in (self._patterns, *self._own.values()):
-            group.sort(key=lambda rule: bool(rule.permission))  # Stable; what denies comes first.
+                own.setdefault(rule.user, []).append(rule)
+        self._own = {user: _Group(group) for user, group in own.items()}
+        self._patterns = _Group(patterns)
 
     @classmethod
     def load(cls, path: Path, robot: str) -> Acl:
@@ -172,7 +249,7 @@ class Acl:
     @property
     def rules(self) -> list[Rule]:
         """All rules: each user's, then the patterns, what denies before what allows."""
-        return [rule for group in (*self._own.values(), self._patterns) for rule in group]
+        return [rule for group in (*self._own.values(), self._patterns) for rule in group.rules]
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the client may do this; `topic` is valid, and a filter for SUBSCRIBE.
@@ -180,7 +257,9 @@ class Acl:
         A subscription is refused when no message could ever be delivered because of it. Of
         `$share/group/filter` the filter counts.
         """
-        verdict = self._verdict(identity, action, topic)
+        shared = parse_shared(topic) if action is Action.SUBSCRIBE else None
+        rules = self._applied(identity, shared[1] if shared is not None else topic)
+        verdict = self._verdict(identity, action, topic, rules)
         return Decision(verdict.allowed, verdict.reason)
 
     def explain(self, identity: Identity, topic: str) -> Explanation:
@@ -193,38 +272,41 @@ class Acl:
         actions = [Action.SUBSCRIBE]
         if not topic.startswith("$share/") and "+" not in topic and "#" not in topic:
             actions[:0] = [Action.RECEIVE, Action.PUBLISH]
-        verdicts = (self._verdict(identity, action, topic) for action in actions)
+        verdicts = (
+            self._verdict(identity, action, topic, self._applied(identity)) for action in actions
+        )
         return Explanation(identity, topic, tuple(verdicts))
 
-    def _verdict(self, identity: Identity, action: Action, topic: str) -> Verdict:
+    def _verdict(
+        self, identity: Identity, action: Action, topic: str, rules: Iterable[_Applied]
+    ) -> Verdict:
         if action is Action.SUBSCRIBE:
-            return self._subscribe(identity, topic)
+            return self._subscribe(identity, topic, list(rules))
         needed = _NEEDED[action]
         passed: list[tuple[Rule, str]] = []
-        for applied in self._applied(identity):
+        for applied in rules:
             rule = applied.rule
-            if rule.permission and not rule.permission & needed:
+            if not (rule.denies or rule.gives(needed)):
                 passed.append((rule, _ONLY[rule.permission]))
             elif applied.matches(topic):
-                return Verdict(action, bool(rule.permission), rule, str(applied), tuple(passed))
+                return Verdict(action, not rule.denies, rule, str(applied), tuple(passed))
             else:
                 passed.append((rule, "does not match" if applied.filter is not None else _UNFIT))
         return Verdict(action, False, None, self._silence(identity, action, topic), tuple(passed))
 
-    def _subscribe(self, identity: Identity, filter: str) -> Verdict:
+    def _subscribe(self, identity: Identity, filter: str, rules: Sequence[_Applied]) -> Verdict:
         action = Action.SUBSCRIBE
         shared = parse_shared(filter)
         wanted = shared[1] if shared is not None else filter
-        rules = list(self._applied(identity))
-        denying = [deny for deny in rules if not deny.rule.permission and deny.overlaps(wanted)]
+        denying = [deny for deny in rules if deny.rule.denies and deny.overlaps(wanted)]
         depth = max((deny.filter.count("/") + 1 for deny in denying if deny.filter), default=0)
         passed: list[tuple[Rule, str]] = []
         denied_by: _Applied | None = None
         for applied in rules:
             rule = applied.rule
-            if not rule.permission:
+            if rule.denies:
                 continue
-            if not rule.permission & Permission.READ:
+            if not rule.gives(Permission.READ):
                 passed.append((rule, _ONLY[rule.permission]))
             elif applied.filter is None:
                 passed.append((rule, _UNFIT))
@@ -248,11 +330,17 @@ class Acl:
             return Verdict(action, False, denied_by.rule, str(denied_by), tuple(passed))
         return Verdict(action, False, None, self._silence(identity, action, filter), tuple(passed))
 
-    def _applied(self, identity: Identity) -> Iterator[_Applied]:
-        """The rules for a client, in the order in which they count."""
-        for rule in self._own.get(identity.username, ()):
-            yield _Applied(rule, rule.filter)
-        for rule in self._patterns:
+    def _applied(self, identity: Identity, about: str | None = None) -> Iterator[_Applied]:
+        """The rules for a client, in the order in which they count.
+
+        With `about`, a topic or filter, those that have nothing to do with it may be left out.
+        """
+        own = self._own.get(identity.username)
+        if own is not None:
+            for rule in own.rules if about is None else own.about(about):
+                yield _Applied(rule, rule.filter)
+        patterns = self._patterns
+        for rule in patterns.rules if about is None else patterns.about(about):
             if identity.username is None and "%u" in rule.filter:
                 continue
             filter = _substitute(rule.filter, identity)

@@ -7,7 +7,6 @@ import hmac
 import logging
 import os
 import secrets
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
@@ -24,8 +23,6 @@ _log = logging.getLogger(__name__)
 
 # Logins that wait for a worker. More would wait longer than clients do, some 20 ms of CPU each.
 _MAX_WAITING: Final = 64
-# Passwords known to be right, 100 bytes each: as many as there may be clients with one each.
-_MAX_REMEMBERED: Final = 4096
 
 _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
 
@@ -33,9 +30,9 @@ _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
 class FileAccess:
     """The `Access` port on a users file and an ACL file; all methods are the event loop's.
 
-    Passwords are checked by threads of its own. A user and password that were right are
+    Passwords are checked by threads of its own. The password that was right for a user is
     remembered, as an HMAC under a key that only this process has ever had, until the user's hash
-    changes: when all clients come back at once, nothing is hashed again.
+    changes: when all clients come back at once, nothing is hashed again, however many users.
     """
 
     def __init__(
@@ -60,7 +57,8 @@ class FileAccess:
         if acl is None:
             _log.warning("no ACL file: whoever is let in may read and write every topic")
         self._key = secrets.token_bytes(32)
-        self._remembered: OrderedDict[bytes, str] = OrderedDict()
+        #: By user name: the login that was right, and the hash that it was right for.
+        self._remembered: dict[str, tuple[bytes, str]] = {}
         self._checking: dict[bytes, asyncio.Future[str | None]] = {}
         self._busy = 0
         self._closed = False
@@ -73,6 +71,11 @@ class FileAccess:
         """Reads both files again. AccessFileError leaves what was in force in force."""
         self._passwords, self._acl = self._load()
         self._checking.clear()  # They are about the old hashes, and are not joined any more.
+        self._remembered = {
+            username: (login, stored)
+            for username, (login, stored) in self._remembered.items()
+            if stored == self._passwords.hash_of(username)
+        }
         self.epoch += 1
 
     def close(self) -> None:
@@ -115,8 +118,7 @@ class FileAccess:
         while True:
             passwords = self._passwords
             stored = passwords.hash_of(username)
-            if stored is not None and self._remembered.get(login) == stored:
-                self._remembered.move_to_end(login)
+            if stored is not None and self._remembered.get(username) == (login, stored):
                 return Identity(username, client_id)
             check = self._checking.get(login) or self._check(login, username, password)
             if check is None:
@@ -128,8 +130,8 @@ class FileAccess:
             if check.cancelled():
                 return Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
             right = check.result()
-            if right is not None:
-                self._remember(login, right)
+            if right is not None and right == self._passwords.hash_of(username):
+                self._remembered[username] = login, right
             if self._passwords is not passwords:
                 continue  # Reloaded meanwhile: what was found is about a user of before.
             if right is not None:
@@ -155,12 +157,6 @@ class FileAccess:
         self._busy -= 1
         if self._checking.get(login) is check:
             del self._checking[login]
-
-    def _remember(self, login: bytes, stored: str) -> None:
-        self._remembered[login] = stored
-        self._remembered.move_to_end(login)
-        if len(self._remembered) > _MAX_REMEMBERED:
-            self._remembered.popitem(last=False)
 
     def _login(self, username: str, password: bytes) -> bytes:
         name = username.encode()

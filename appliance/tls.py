@@ -1,0 +1,301 @@
+"""TLS on the connections of a listener, made for many connections with small messages.
+
+asyncio and uvloop have TLS transports of their own. They look for another record behind every one,
+which ends in an exception and costs as much as the record itself, and keep a read buffer a
+connection. Here an idle connection takes half the memory, and a message less CPU time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import Callable
+from typing import Final, TypeAlias, cast
+
+Data: TypeAlias = "bytes | bytearray | memoryview"
+
+#: Bytes of plaintext in a record, at most (RFC 8446, section 5.1): a read of this size never leaves
+#: a part of a record behind. It is also what OpenSSL is handed at once, because the buffers between
+#: it and the network never shrink: a connection would keep the size of its largest message.
+RECORD_SIZE: Final = 16 * 1024
+
+#: Seconds that a client gets to read the last bytes before its connection is cut.
+CLOSE_TIMEOUT = 10.0
+
+#: What `get_extra_info` knows besides what the TCP connection does.
+_TLS_INFO: dict[str, Callable[[ssl.SSLObject], object]] = {
+    "ssl_object": lambda tls: tls,
+    "sslcontext": lambda tls: tls.context,
+    "peercert": lambda tls: tls.getpeercert(),
+    "cipher": lambda tls: tls.cipher(),
+    "compression": lambda tls: tls.compression(),
+}
+
+#: Who hears of a connection after its end.
+_NOBODY: Final = asyncio.Protocol()
+
+
+async def accept(
+    connection: socket.socket,
+    context: ssl.SSLContext,
+    protocol: asyncio.Protocol,
+    timeout: float,
+) -> None:
+    """Shake hands as the server on an accepted connection; from then on it is the protocol's.
+
+    When this fails the connection is closed, and the protocol has not heard of it.
+
+    Raises:
+        asyncio.TimeoutError: no handshake within `timeout` seconds.
+        ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
+        OSError: the client is gone.
+    """
+    loop = asyncio.get_running_loop()
+    transport = TlsTransport(protocol, context, loop)
+    await loop.connect_accepted_socket(lambda: transport, connection)
+    try:
+        await asyncio.wait_for(transport.handshake, timeout)
+    except asyncio.TimeoutError:
+        transport.abort()
+        raise asyncio.TimeoutError(f"no handshake within {timeout:g} s") from None
+    except BaseException:
+        transport.abort()
+        raise
+
+
+class TlsTransport(asyncio.Transport, asyncio.Protocol):
+    """A TLS connection: to its TCP connection the protocol, to the client's protocol the transport.
+
+    What arrives in one chunk is handed on in one chunk, and before the end of the connection or a
+    broken record behind it takes effect. There are no half-closed connections, as in asyncio.
+    """
+
+    def __init__(
+        self,
+        protocol: asyncio.Protocol,
+        context: ssl.SSLContext,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        super().__init__()
+        #: The end of the handshake, or why it failed.
+        self.handshake: asyncio.Future[None] = loop.create_future()
+        self._loop = loop
+        self._protocol = protocol
+        self._incoming = ssl.MemoryBIO()
+        self._outgoing = ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
+        self._tcp: asyncio.Transport
+        self._connected = False  # the protocol has heard of the connection
+        self._open = False  # connected, and not closing
+        self._writable = True
+        self._ended = False  # nothing more is to be read
+        self._error: Exception | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+
+    # --- the protocol of the TCP connection ----------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The TCP connection is there; in TLS the client speaks first."""
+        self._tcp = cast(asyncio.Transport, transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Hand on what a chunk from the network says."""
+        if not self._open:
+            if not self._connected:
+                self._shake_hands(data)
+            return
+        if len(data) <= RECORD_SIZE:
+            self._incoming.write(data)
+            plain = self._read()
+        else:
+            parts = []
+            for start in range(0, len(data), RECORD_SIZE):
+                self._incoming.write(data[start : start + RECORD_SIZE])
+                parts.append(self._read())
+                if self._ended:
+                    break
+            plain = b"".join(parts)
+        if plain:
+            self._protocol.data_received(plain)
+        if self._ended or self._outgoing.pending:
+            self._react()
+
+    def _read(self) -> bytes:
+        """The plaintext of the records that are complete; `_ended` when none can follow them."""
+        parts: list[bytes] = []
+        try:
+            part = self._tls.read(RECORD_SIZE)
+            if part and not self._incoming.pending:
+                return part  # one record: most chunks
+            while part:
+                parts.append(part)
+                if not self._incoming.pending:
+                    break
+                part = self._tls.read(RECORD_SIZE)
+            else:  # close_notify
+                self._ended = True
+        except ssl.SSLWantReadError:
+            pass
+        except ssl.SSLError as error:
+            self._ended = True
+            self._error = error
+        return b"".join(parts)
+
+    def _react(self) -> None:
+        """Send what reading has caused, such as an alert, and close a connection that has ended."""
+        if not self._open:
+            return
+        if not self._writable and self._outgoing.pending:
+            # Whoever makes OpenSSL answer again and again must read the answers.
+            self.abort()
+            return
+        if self._ended and self._error is None:
+            self._protocol.eof_received()
+        if self._ended:
+            self.close()
+        else:
+            self._flush()
+
+    def _shake_hands(self, data: bytes) -> None:
+        for start in range(0, len(data), RECORD_SIZE):
+            self._incoming.write(data[start : start + RECORD_SIZE])
+            try:
+                self._tls.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLError as error:
+                self._flush()  # the alert that tells the client
+                self._tcp.close()
+                if not self.handshake.done():
+                    self.handshake.set_exception(error)
+                return
+            self._flush()
+            self._connected = self._open = True
+            if not self.handshake.done():
+                self.handshake.set_result(None)
+            self._protocol.connection_made(self)
+            rest = data[start + RECORD_SIZE :]
+            if rest or self._incoming.pending:
+                self.data_received(rest)
+            return
+        self._flush()
+
+    def eof_received(self) -> None:
+        """The client has closed the TCP connection; some do so without close_notify."""
+        self._ended = True
+        self._react()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The TCP connection is gone."""
+        self._open = False
+        if self._deadline is not None:
+            self._deadline.cancel()
+        if not self.handshake.done():
+            error = ConnectionResetError("it hung up before the end of the handshake")
+            self.handshake.set_exception(exc or error)
+        # Two objects that hold each other would keep OpenSSL's memory until they are found.
+        protocol, self._protocol = self._protocol, _NOBODY
+        if self._connected:
+            protocol.connection_lost(exc or self._error)
+
+    def pause_writing(self) -> None:
+        """The client reads slower than it is written to."""
+        self._writable = False
+        self._protocol.pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has caught up."""
+        self._writable = True
+        self._protocol.resume_writing()
+
+    # --- the transport of the client's protocol ------------------------------------------------
+
+    def write(self, data: Data) -> None:
+        """Write, without waiting for a record to become full; nothing once it is closing."""
+        if not self._open:
+            return
+        try:
+            if len(data) <= RECORD_SIZE:
+                self._tls.write(data)
+                self._tcp.write(self._outgoing.read())
+            else:
+                view, records = memoryview(data), []
+                for start in range(0, len(view), RECORD_SIZE):
+                    self._tls.write(view[start : start + RECORD_SIZE])
+                    records.append(self._outgoing.read())
+                self._tcp.write(b"".join(records))
+        except ssl.SSLError as error:
+            # It must not reach the one whose message this is.
+            self._error = error
+            self.abort()
+
+    def _flush(self) -> None:
+        if self._outgoing.pending:
+            self._tcp.write(self._outgoing.read())
+
+    def close(self) -> None:
+        """Write out what waits and a close_notify, then close.
+
+        The client's close_notify is not waited for (RFC 8446, section 6.1).
+        """
+        if self._tcp.is_closing():
+            return
+        self._open = False
+        self._deadline = self._loop.call_later(CLOSE_TIMEOUT, self._tcp.abort)
+        with contextlib.suppress(ssl.SSLError):  # it asks for the client's close_notify as well
+            self._tls.unwrap()
+        self._flush()
+        self._tcp.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._open = False
+        self._tcp.abort()
+
+    def is_closing(self) -> bool:
+        """Whether the connection is closing or closed."""
+        return self._tcp.is_closing()
+
+    def pause_reading(self) -> None:
+        """Hand on nothing more."""
+        self._tcp.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Hand on what arrives."""
+        self._tcp.resume_reading()
+
+    def is_reading(self) -> bool:
+        """Whether what arrives is handed on."""
+        return self._tcp.is_reading()
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """From how many bytes on, encrypted, the protocol is told to pause, and to resume."""
+        self._tcp.set_write_buffer_limits(high, low)
+
+    def get_write_buffer_limits(self) -> tuple[int, int]:
+        """The two limits, the low one first."""
+        return self._tcp.get_write_buffer_limits()
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes, encrypted, that the network has not taken yet."""
+        return self._tcp.get_write_buffer_size()
+
+    def can_write_eof(self) -> bool:
+        """No: TLS closes in both directions."""
+        return False
+
+    def get_extra_info(self, name: str, default: object = None) -> object:
+        """As of the TCP connection, and what asyncio's TLS transports know."""
+        if name in _TLS_INFO:
+            return _TLS_INFO[name](self._tls)
+        return self._tcp.get_extra_info(name, default)
+
+    def get_protocol(self) -> asyncio.BaseProtocol:
+        """Who is told what happens here."""
+        return self._protocol
+
+    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
+        """Tell another one what happens from now on."""
+        self._protocol = cast(asyncio.Protocol, protocol)

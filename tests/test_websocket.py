@@ -1,0 +1,606 @@
+"""MQTT over WebSocket with real sockets: the `websockets` library's client, paho, and raw bytes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import random
+import threading
+import tracemalloc
+from collections.abc import AsyncIterator, Iterable
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+import uvloop
+from house import PATIENCE, Caller, House, make_contexts, until
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Response
+
+from appliance.broker.ports import Limits
+from appliance.mqtt.codec import decode_varint
+from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.packets import (
+    Connack,
+    Connect,
+    Disconnect,
+    Packet,
+    Pingreq,
+    Pingresp,
+    Puback,
+    Publish,
+    Suback,
+    Subscribe,
+    Subscription,
+    Will,
+    decode_packet,
+)
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+
+# The way that is left to override it, and to have both loops, is too new for some computers.
+pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
+
+MIB = 1 << 20
+
+
+@pytest.fixture(
+    scope="module",
+    params=[asyncio.DefaultEventLoopPolicy(), uvloop.EventLoopPolicy()],
+    ids=["asyncio", "uvloop"],
+)
+def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
+    return request.param  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def contexts(tmp_path_factory: pytest.TempPathFactory):
+    return make_contexts(tmp_path_factory.mktemp("certs") / "certs")
+
+
+@pytest.fixture
+async def house(contexts) -> AsyncIterator[House]:
+    house = House(*contexts, Limits(packet_size=4 * MIB))
+    house.broker.tick(asyncio.get_running_loop().time())
+    yield house
+    await house.close()
+
+
+def take_packet(received: bytes) -> tuple[Packet | None, bytes]:
+    """The first packet, if it is complete, and what comes behind it."""
+    try:
+        length, body = decode_varint(received, 1)
+    except ProtocolError:
+        return None, received
+    if len(received) < body + length:
+        return None, received
+    packet = decode_packet(received[0], received[body : body + length], 5)
+    return packet, received[body + length :]
+
+
+class Talker:
+    """A client that speaks through the `websockets` library."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self._unread = b""
+
+    async def say(self, *packets: Packet | bytes) -> None:
+        data = b"".join(p if isinstance(p, bytes) else p.encode(5) for p in packets)
+        await asyncio.wait_for(self.connection.send(data), PATIENCE)
+
+    async def hear(self) -> Packet:
+        return await asyncio.wait_for(self._hear(), PATIENCE)
+
+    async def _hear(self) -> Packet:
+        while True:
+            packet, self._unread = take_packet(self._unread)
+            if packet is not None:
+                return packet
+            message = await self.connection.recv()
+            assert isinstance(message, bytes)
+            self._unread += message
+
+
+async def talk(house: House, tls: bool = False, path: str = "/mqtt", **options: Any) -> Talker:
+    """A WebSocket connection to one of the listeners."""
+    scheme, port = ("wss", house.ports[3][1]) if tls else ("ws", house.ports[2][1])
+    options.setdefault("subprotocols", ["mqtt"])
+    connection = await connect(
+        f"{scheme}://localhost:{port}{path}",
+        ssl=house.client_context if tls else None,
+        max_size=None,
+        **options,
+    )
+    talker = Talker(connection)
+    house.callers.append(talker)  # type: ignore[arg-type]
+    talker.hang_up = connection.transport.abort  # type: ignore[attr-defined]
+    return talker
+
+
+async def join(house: House, client_id: str, tls: bool = False, **options: Any) -> Talker:
+    talker = await talk(house, tls)
+    await talker.say(Connect(client_id, **options))
+    assert isinstance(await talker.hear(), Connack)
+    return talker
+
+
+REQUEST = (
+    b"GET /mqtt HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Protocol: mqtt\r\n\r\n"
+)
+
+
+async def shake_hands(house: House, tls: bool = False) -> Caller:
+    """A connection that is upgraded, for frames by hand."""
+    house.ports[0:2] = house.ports[2:4]
+    caller = await house.dial(tls)
+    await caller.say(REQUEST)
+    head = await asyncio.wait_for(caller.reader.readuntil(b"\r\n\r\n"), PATIENCE)
+    assert head.startswith(b"HTTP/1.1 101 ")
+    return caller
+
+
+def frame(data: bytes, opcode: Opcode = Opcode.BINARY, *, fin: bool = True) -> bytes:
+    return Frame(opcode, data, fin).serialize(mask=True)
+
+
+async def hear_frame(caller: Caller) -> tuple[int, bytes]:
+    """The next frame: its first byte and its payload."""
+
+    async def read() -> tuple[int, bytes]:
+        first, length = await caller.reader.readexactly(2)
+        if length > 125:
+            length = int.from_bytes(await caller.reader.readexactly(2 if length == 126 else 8))
+        return first, await caller.reader.readexactly(length)
+
+    return await asyncio.wait_for(read(), PATIENCE)
+
+
+BINARY, CLOSE, PONG = 0x82, 0x88, 0x8A
+
+both = pytest.mark.parametrize("tls", [False, True], ids=["ws", "wss"])
+
+
+# --- opening -------------------------------------------------------------------------------------
+
+
+@both
+async def test_messages_between_websocket_and_tcp(house: House, tls):
+    await house.start()
+    talker, caller = await join(house, "web", tls), await house.join("tcp")
+    for client in (talker, caller):
+        await client.say(Subscribe(1, [Subscription("a", 2)]))
+        assert await client.hear() == Suback(1, [2])
+    for size in (0, 1, 125, 126, 65_535, 65_536, 3_000_000):
+        for client in (talker, caller):
+            await client.say(Publish("a", bytes(size), 1, packet_id=7))
+            heard = [await talker.hear(), await caller.hear(), await client.hear()]
+            sizes = [len(packet.payload) for packet in heard if isinstance(packet, Publish)]
+            assert sizes == [size, size]
+            assert Puback(7) in heard
+            for receiver in (talker, caller):
+                await receiver.say(*(Puback(n) for n in range(1, 40)))
+
+
+@pytest.mark.parametrize(
+    ("offered", "chosen"),
+    [
+        (["mqtt"], "mqtt"),
+        (["mqttv3.1"], "mqttv3.1"),
+        (["mqttv3.1", "mqtt"], "mqttv3.1"),
+        (["mqtt", "mqttv3.1"], "mqtt"),
+        (["chat", "mqtt"], "mqtt"),
+    ],
+)
+async def test_the_subprotocol_is_the_clients_choice(house: House, offered, chosen):
+    await house.start()
+    talker = await talk(house, subprotocols=offered)
+    assert talker.connection.subprotocol == chosen
+    assert talker.connection.response is not None
+    assert "Sec-WebSocket-Extensions" not in talker.connection.response.headers
+
+
+async def _refusal(house: House, **options: Any) -> Response:
+    with pytest.raises(InvalidStatus) as refused:
+        await talk(house, **options)
+    return refused.value.response
+
+
+@pytest.mark.parametrize("offered", [None, ["chat"], ["MQTT"]])
+async def test_without_a_subprotocol(house: House, offered, caplog):  # [MQTT-6.0.0-3]
+    await house.start()
+    response = await _refusal(house, subprotocols=offered)
+    assert response.status_code == 400
+    assert b"offer the subprotocol mqtt or mqttv3.1" in (response.body or b"")
+    assert "no WebSocket connection: offer the subprotocol" in caplog.text
+    await until(lambda: not house.network.open)
+
+
+async def test_paths(house: House, caplog):
+    await house.start()
+    for path in ("/", "/mqtt/", "/other?x=/mqtt"):
+        response = await _refusal(house, path=path)
+        assert response.status_code == 404
+        assert b"MQTT over WebSocket is at /mqtt" in (response.body or b"")
+    assert "'/': nothing is here" in caplog.text
+    await talk(house, path="/mqtt?token=1")
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "body"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: robot\r\n\r\n", b"404 Not Found", b"/mqtt"),
+        (b"GET /mqtt HTTP/1.1\r\nHost: robot\r\n\r\n", b"426 ", b"You need a WebSocket client"),
+        (b"POST /mqtt HTTP/1.1\r\nHost: robot\r\n\r\n", b"400 ", b"expected GET; got POST"),
+        (b"GET /mqtt HTTP/1.0\r\n\r\n", b"400 ", b"expected HTTP/1.1"),
+        (b"GET /mqtt\r\n\r\n", b"400 ", b"invalid HTTP request line"),
+        (REQUEST.replace(b"n: 13", b"n: 12"), b"400 ", b"Sec-WebSocket-Version"),
+        (REQUEST.replace(b"dGhl", b"?"), b"400 ", b"Sec-WebSocket-Key"),
+        (b"GET /mqtt HTTP/1.1\r\nCookie: " + b"x" * 20_000, b"431 ", b"longer than 16384 bytes"),
+        (
+            b"GET /mqtt HTTP/1.1\r\n" + b"A: b\r\n" * 200 + b"\r\n",
+            b"400 ",
+            b"too many HTTP headers",
+        ),
+    ],
+)
+async def test_what_is_no_upgrade(house: House, request_, status, body, caplog):
+    await house.start()
+    house.ports[0] = house.ports[2]
+    caller = await house.dial()
+    await caller.say(request_)
+    answer = await caller.hear_the_end()
+    assert answer.startswith(b"HTTP/1.1 " + status)
+    assert body in answer
+    assert "no WebSocket connection: " in caplog.text
+    await until(lambda: not house.network.open)
+
+
+@pytest.mark.parametrize("said", [Connect("lost").encode(), b"\x16\x03\x01\x02\0\x01\0\x01\xfc"])
+async def test_what_is_no_http_is_closed_at_once(house: House, said, caplog):
+    await house.start()
+    house.ports[0] = house.ports[2]
+    caller = await house.dial()
+    await caller.say(said)
+    assert await caller.hear_the_end() == b""
+    assert "what it sent is not HTTP" in caplog.text
+
+
+@both
+async def test_the_time_to_connect_begins_before_http(house: House, tls, caplog):
+    await house.start(connect_timeout=0.3)
+    house.ports[0:2] = house.ports[2:4]
+    silent, dripping = await house.dial(tls), await house.dial(tls)
+    upgraded = await shake_hands(house, tls)
+    with contextlib.suppress(ConnectionError):
+        for byte in itertools.cycle(REQUEST[:20]):
+            await dripping.say(bytes((byte,)))
+            await asyncio.sleep(0.02)
+            if not house.network.open:
+                break
+    for caller in (silent, dripping, upgraded):
+        assert await caller.hear_the_end() == b""
+    assert caplog.text.count("no complete CONNECT within 0.3 s") == 3
+
+
+# --- frames --------------------------------------------------------------------------------------
+
+
+def _scattered(rng: random.Random, data: bytes, largest: int) -> Iterable[bytes]:
+    position = 0
+    while position < len(data):
+        size = rng.randint(0, largest)
+        yield data[position : position + size]
+        position += size
+
+
+@pytest.mark.parametrize("seed", range(5))
+@both
+async def test_packets_are_split_and_joined_at_will(house: House, tls, seed):  # [MQTT-6.0.0-2]
+    """Packets over frames, frames over segments, messages in fragments, pings in between."""
+    rng = random.Random(seed)
+    await house.start()
+    caller = await shake_hands(house, tls)
+    sizes = [rng.choice([0, 1, 50, 200, 5000, 70_000]) for _ in range(40)]
+    packets: list[Packet] = [Connect("split"), Subscribe(1, [Subscription("#")])]
+    packets += [Publish(f"a/{n}", bytes(size)) for n, size in enumerate(sizes)]
+    data = b"".join(packet.encode(5) for packet in packets)
+    largest = rng.choice([3, 40, 1000, 100_000]) if seed else 1
+    frames: list[bytes] = []
+    opcode = Opcode.BINARY
+    for part in _scattered(rng, data[:20_000] if largest < 50 else data, largest):
+        fin = rng.random() < 0.5
+        frames.append(frame(part, opcode, fin=fin))
+        opcode = Opcode.BINARY if fin else Opcode.CONT
+        if rng.random() < 0.1:
+            frames.append(frame(b"?", Opcode.PING))
+    if largest < 50:
+        frames.append(frame(data[20_000:], opcode))
+    for segment in _scattered(rng, b"".join(frames), rng.choice([50, 3000, 200_000])):
+        await caller.say(segment)
+    unread, heard = b"", []
+    while len(heard) < len(sizes) + 2:
+        first, payload = await hear_frame(caller)
+        if first == PONG:
+            assert payload == b"?"
+            continue
+        assert first == BINARY
+        unread += payload
+        packet, unread = take_packet(unread)
+        while packet is not None:
+            heard.append(packet)
+            packet, unread = take_packet(unread)
+    assert [type(packet) for packet in heard[:2]] == [Connack, Suback]
+    topics = [(p.topic, len(p.payload)) for p in heard[2:] if isinstance(p, Publish)]
+    assert topics == [(f"a/{n}", size) for n, size in enumerate(sizes)]
+
+
+async def test_a_text_frame_ends_the_connection(house: House, caplog):  # [MQTT-6.0.0-1]
+    """What came before it is done; what comes behind it is not."""
+    await house.start()
+    watcher = await house.join("watcher")
+    await watcher.say(Subscribe(1, [Subscription("#")]))
+    await watcher.hear()
+    caller = await shake_hands(house)
+    text = frame(Publish("c", b"").encode(5), Opcode.TEXT)
+    await caller.say(frame(Connect("text", will=Will("w", b"gone")).encode(5)))
+    assert (await hear_frame(caller))[0] == BINARY
+    before, behind = frame(Publish("a", b"").encode(5)), frame(Publish("b", b"").encode(5))
+    await caller.say(before + text + behind)
+    first, payload = await hear_frame(caller)
+    assert (first, payload[:2]) == (CLOSE, (1003).to_bytes(2, "big"))
+    assert await caller.hear_the_end() == b""
+    heard = [await watcher.hear() for _ in range(2)]
+    assert [packet.topic for packet in heard if isinstance(packet, Publish)] == ["a", "w"]
+    assert "not the WebSocket protocol: a text frame" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (Frame(Opcode.BINARY, b"\xc0\0").serialize(mask=False), 1002),
+        (b"\xc2" + frame(b"\xc0\0")[1:], 1002),  # a reserved bit
+        (b"\x83" + frame(b"\xc0\0")[1:], 1002),  # an unknown kind
+        (frame(b"\xc0\0", Opcode.CONT), 1002),  # of nothing
+        (frame(b"\xc0", fin=False) + frame(b"\0"), 1002),  # a message inside a message
+        (b"\x09\x80\0\0\0\0", 1002),  # a part of a ping
+        (b"\x89\xfe\x00\x7e" + bytes(4 + 126), 1002),  # a ping that is too long
+        (b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009),
+    ],
+)
+async def test_wrong_frames_end_the_connection(house: House, data, code, caplog):
+    await house.start()
+    caller = await shake_hands(house)
+    await caller.say(frame(Connect("wrong").encode(5)))
+    assert (await hear_frame(caller))[0] == BINARY
+    await caller.say(data)
+    first, payload = await hear_frame(caller)
+    assert (first, int.from_bytes(payload[:2], "big")) == (CLOSE, code)
+    assert await caller.hear_the_end() == b""
+    assert "not the WebSocket protocol: " in caplog.text
+    await until(lambda: not house.broker.clients)
+
+
+async def test_the_size_of_a_frame(house: House):
+    """A stranger's is bounded by what a CONNECT may take, a client's by the largest packet."""
+    await house.start()
+    caller = await shake_hands(house)
+    await caller.say(b"\x82\xff" + (MAXIMUM_CONTROL + 1).to_bytes(8, "big") + bytes(4))
+    first, payload = await hear_frame(caller)
+    assert (first, payload[:2]) == (CLOSE, (1009).to_bytes(2, "big"))
+    talker = await join(house, "large")
+    # Fragments are no part of a whole here: together they may be larger than a packet.
+    message = Publish("a", bytes(MIB)).encode(5)
+    await talker.connection.send(itertools.chain([message] * 6, [Pingreq().encode(5)]))
+    assert isinstance(await talker.hear(), Pingresp)
+    assert house.broker.counters.publish_received == 6
+    await talker.say(message * 3, Pingreq())
+    assert isinstance(await talker.hear(), Pingresp)
+    with pytest.raises(ConnectionClosed) as closed:
+        await talker.connection.send(message * 5)
+        await talker.hear()
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
+async def test_an_announced_length_takes_no_memory(house: House):
+    await house.start()
+    talkers = [await join(house, f"c{n}") for n in range(10)]
+    tracemalloc.start()
+    try:
+        for talker in talkers:
+            talker.connection.transport.write(
+                b"\x82\xff" + (4 * MIB).to_bytes(8, "big") + bytes(4 + 100)
+            )
+        await asyncio.sleep(0.1)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(house.network.open) == 10
+    assert most < 4 * MIB
+
+
+async def test_pings_are_answered(house: House):
+    await house.start()
+    talker = await join(house, "ping")
+    await asyncio.wait_for(await talker.connection.ping(b"hello"), PATIENCE)
+    caller = await shake_hands(house)
+    await caller.say(frame(b"1", Opcode.PING) + frame(b"", Opcode.PONG) + frame(b"2", Opcode.PING))
+    assert await hear_frame(caller) == (PONG, b"1")
+    assert await hear_frame(caller) == (PONG, b"2")
+
+
+async def test_who_pings_and_does_not_read_is_bounded(house: House):
+    await house.start()
+    house.ports[0] = house.ports[2]
+    caller = await house.dial(receive_buffer=4096)
+    await caller.say(REQUEST)
+    await caller.say(frame(Connect("ping").encode(5)))
+    await until(lambda: house.broker.clients)
+    protocol = house.protocol("ping")
+    pings = frame(bytes(125), Opcode.PING) * 2000
+    for _ in range(100):
+        await caller.say(pings)
+    await caller.say(frame(b"last", Opcode.PING) + frame(Pingreq().encode(5)))
+    assert protocol._output_size() < MIB
+    await asyncio.wait_for(caller.reader.readuntil(b"\r\n\r\n"), PATIENCE)
+    heard = [(0, b"")]
+    while heard[-1] != (BINARY, Pingresp().encode(5)):
+        heard.append(await hear_frame(caller))
+    assert (PONG, b"last") in heard
+
+
+@both
+async def test_a_slow_reader_is_bounded(house: House, tls):
+    await house.start()
+    house.ports[0:2] = house.ports[2:4]
+    slow = await house.dial(tls, receive_buffer=4096)
+    packets = Connect("slow").encode(5) + Subscribe(1, [Subscription("a")]).encode(5)
+    await slow.say(REQUEST + frame(packets))
+    await until(lambda: house.broker.subscription_count)
+    quick = await join(house, "quick", tls)
+    await quick.say(Subscribe(1, [Subscription("a")]))
+    await quick.hear()
+    publisher = await join(house, "pub", tls)
+    protocol = house.protocol("slow")
+    for n in range(50):
+        await publisher.say(Publish("a", b"%02d" % n + bytes(MIB)), Pingreq())
+        assert isinstance(await publisher.hear(), Pingresp)
+        heard = await quick.hear()
+        assert isinstance(heard, Publish) and heard.payload[:2] == b"%02d" % n
+        assert protocol._output_size() < 4 * MIB
+
+
+async def test_a_flood_of_empty_frames_leaves_others_their_turn(house: House):
+    await house.start()
+    caller = await shake_hands(house)
+    await caller.say(frame(Connect("flood").encode(5)))
+    await hear_frame(caller)
+    other = await join(house, "other")
+    caller.writer.write(frame(b"") * 100_000 + frame(Pingreq().encode(5)))
+    end = asyncio.ensure_future(hear_frame(caller))
+    answers = 0
+    while not end.done():
+        await other.say(Pingreq())
+        assert isinstance(await other.hear(), Pingresp)
+        answers += 1
+    assert (await end)[0] == BINARY
+    assert answers > 20
+
+
+async def test_packets_behind_connect_wait_for_the_login(house: House):
+    house.gate.clear()
+    await house.start()
+    talker = await talk(house)
+    await talker.say(Connect("quick"), Subscribe(1, [Subscription("a")]))
+    for _ in range(10):
+        await talker.say(Publish("a", bytes(10_000)))
+    await until(lambda: house.network.tasks)
+    assert not house.broker.sessions
+    house.gate.set()
+    kinds = [type(await talker.hear()) for _ in range(12)]
+    assert kinds == [Connack, Suback] + [Publish] * 10
+
+
+# --- closing -------------------------------------------------------------------------------------
+
+
+@both
+async def test_the_last_packet_comes_before_the_close_frame(house: House, tls):
+    await house.start()
+    talker = await join(house, "same", tls)
+    await house.join("same")
+    assert await talker.hear() == Disconnect(ReasonCode.SESSION_TAKEN_OVER)
+    with pytest.raises(ConnectionClosed) as closed:
+        await talker.hear()
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 1000
+    assert closed.value.rcvd_then_sent
+
+
+@both
+async def test_a_client_that_closes(house: House, tls):
+    """With DISCONNECT its will is not sent, without it is."""
+    await house.start()
+    watcher = await house.join("watcher")
+    await watcher.say(Subscribe(1, [Subscription("w/#")]))
+    await watcher.hear()
+    for client_id, last in (("polite", [Disconnect()]), ("rude", [])):
+        talker = await join(house, client_id, tls, will=Will(f"w/{client_id}", b"gone"))
+        await talker.say(*last, b"")
+        await asyncio.wait_for(talker.connection.close(), PATIENCE)
+        assert talker.connection.close_code == 1000
+    heard = await watcher.hear()
+    assert isinstance(heard, Publish) and heard.topic == "w/rude"
+    await until(lambda: len(house.network.open) == 1)
+
+
+async def test_what_was_said_before_the_close_frame_is_done(house: House):
+    await house.start()
+    caller = await shake_hands(house)
+    await caller.say(frame(Connect("brief", will=Will("w", b"gone")).encode(5)))
+    await hear_frame(caller)
+    data = Publish("a", bytes(100)).encode(5) * 2000 + Disconnect().encode(5)
+    await caller.say(frame(data) + frame(b"", Opcode.CLOSE))
+    assert await hear_frame(caller) == (CLOSE, b"")
+    await until(lambda: not house.network.open)
+    assert house.broker.counters.publish_received == 2000
+    assert not house.broker.sessions
+
+
+async def test_stop_with_open_clients(house: House):
+    await house.start()
+    talkers = [await join(house, f"c{n}", tls=n == 1) for n in range(2)]
+    await asyncio.wait_for(house.listeners.stop(), PATIENCE)
+    for talker in talkers:
+        assert await talker.hear() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
+        with pytest.raises(ConnectionClosed):
+            await talker.hear()
+
+
+# --- paho ----------------------------------------------------------------------------------------
+
+
+def _exchange_with_paho(house: House, tls: bool, version: MQTTProtocolVersion) -> list[bytes]:
+    """Publish to itself with QoS 0 to 2, and return what came back."""
+    client = paho.Client(
+        CallbackAPIVersion.VERSION2, f"paho-{version}", protocol=version, transport="websockets"
+    )
+    received: list[bytes] = []
+    subscribed, done = threading.Event(), threading.Event()
+
+    def on_message(_client: object, _data: object, message: paho.MQTTMessage) -> None:
+        received.append(message.payload)
+        if len(received) == 30:
+            done.set()
+
+    client.on_connect = lambda *_: client.subscribe("a/#", 2)
+    client.on_subscribe = lambda *_: subscribed.set()
+    client.on_message = on_message
+    if tls:
+        client.tls_set_context(house.client_context)
+    client.connect("localhost", house.ports[2 + tls][1])
+    client.loop_start()
+    try:
+        assert subscribed.wait(PATIENCE)
+        sent = [client.publish(f"a/{n % 3}", b"%d" % n + bytes(n * 1000), n % 3) for n in range(30)]
+        for info in sent:
+            info.wait_for_publish(PATIENCE)
+        assert done.wait(PATIENCE)
+    finally:
+        client.disconnect()
+        client.loop_stop()
+    return received
+
+
+@pytest.mark.parametrize("version", [MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5])
+@both
+async def test_paho(house: House, tls, version):
+    await house.start()
+    received = await asyncio.to_thread(_exchange_with_paho, house, tls, version)
+    numbers = sorted(int(payload.rstrip(b"\0")) for payload in received)
+    assert numbers == list(range(30))
+    await until(lambda: not house.network.open)
