@@ -53,6 +53,9 @@ FEW_MESSAGES = 64
 #: `Counters.effort`: some five milliseconds.
 EFFORT_A_ROUND = 5000
 
+#: Turns that a client takes, without a second's rest, until the log is told.
+MANY_TURNS = 200
+
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
 
@@ -237,6 +240,8 @@ class ClientProtocol(Upper):
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
         self._in_turn = False
+        self._turns_taken = 0  # without a second's rest
+        self._turned_at = 0.0
         self._resting: asyncio.TimerHandle | None = None
         self._choked = False
         self._logging_in = False
@@ -328,9 +333,13 @@ class ClientProtocol(Upper):
             self._sends_on = False
             self._client.send_on()
             self._loop.call_soon(self._leave)
+            self._broker.flush()
         else:
             self._client.lost()
-        self._broker.flush()
+            self._broker.flush()
+            # The client and its wire know each other: this lets both, and the TLS connection with
+            # them, go now, and not when all that lives here is searched for garbage.
+            self._client.wire = _Gone(self.address)
 
     def _forget(self) -> None:
         self._network.closed(self)
@@ -592,6 +601,19 @@ class ClientProtocol(Upper):
         """Let the others have their turn, then let the client go on; it is not read before that."""
         self._sends_on = True
         self._read_later()
+        now = self._ledger.now
+        if now - self._turned_at > 1.0:  # it was idle
+            self._turns_taken = 0
+        self._turned_at = now
+        self._turns_taken += 1
+        if self._turns_taken == MANY_TURNS:
+            self._turns_taken = 0
+            self._broker.complaints.tell(
+                self._ledger.now,
+                "turns",
+                "%s asks for more than there is time for, and is read later",
+                self._client,
+            )
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined when they are small; to who is slow, in portions."""
@@ -644,6 +666,32 @@ class ClientProtocol(Upper):
                 self._connection = socket.socket(fileno=file)
                 self._connection.setblocking(False)
         self._transport.close()
+
+
+class _Gone:
+    """The wire of a client whose connection has ended: nothing comes of what it is told."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def authenticate(self, connect: Connect) -> None:
+        """Nobody waits for it."""
+
+    def exchange(self, method: str) -> Exchange | None:
+        """There is none to be had."""
+        return None
+
+    def accepted(self) -> None:
+        """Nobody waits for it."""
+
+    def later(self) -> None:
+        """There is nothing to go on with."""
+
+    def write(self, chunks: list[bytes]) -> None:
+        """Nobody reads it."""
+
+    def close(self) -> None:
+        """It is closed."""
 
 
 class _Farewell:

@@ -16,9 +16,11 @@ from pathlib import Path
 
 import pytest
 import uvloop
+import yaml
 from house import PATIENCE, Caller, House, make_contexts, until
 
-from appliance import listeners, wire
+from appliance import config, listeners, wire
+from appliance.app import App
 from appliance.broker.ports import Limits
 from appliance.listeners import ListenerSettings
 from appliance.mqtt.packets import (
@@ -509,6 +511,56 @@ async def test_what_was_said_before_an_abrupt_end_is_done(house: House):
     assert house.broker.counters.publish_received == 20_000  # and no will
 
 
+# --- what appliance.yaml says ---------------------------------------------------------------------
+
+
+def test_listeners_of_the_configuration(tmp_path):
+    certs = tmp_path / "certs"
+    make_contexts(certs)
+    text = """
+broker:
+  listeners:
+    - {bind: "127.0.0.1:0", tls: true}
+    - {bind: "[::1]:0"}
+    - {bind: "127.0.0.1:0", tls: true, protocol: websocket}
+    - {bind: "unix:run/mqtt.sock", mode: 0600}
+    - {bind: "unix:/run/web.sock", protocol: websocket}
+"""
+    settings = config.loads(text, tmp_path / "appliance.yaml", {})
+    tls, plain, web, private, shared = App(settings)._listener_settings()
+    assert (plain.host, plain.context, plain.protocol, plain.path) == ("::1", None, "mqtt", None)
+    assert tls.context is not None and tls.context.verify_mode == ssl.CERT_OPTIONAL
+    # Asked for a certificate that it does not have, a browser gives up.
+    assert web.context is not None and web.context.verify_mode == ssl.CERT_NONE
+    assert web.protocol == "websocket"
+    assert (private.path, private.mode) == (tmp_path / "run/mqtt.sock", 0o600)
+    assert (shared.path, shared.mode) == (Path("/run/web.sock"), 0o660)
+    assert [str(listener.bind) for listener in settings.broker.listeners][3:] == [
+        f"unix:{tmp_path}/run/mqtt.sock",
+        "unix:/run/web.sock",
+    ]
+    assert all(listener.bind.loopback for listener in settings.broker.listeners)
+    assert config.loads(yaml.safe_dump(config.describe(settings)), settings.file or tmp_path, {})
+
+
+@pytest.mark.parametrize(
+    ("listener", "problem"),
+    [
+        ("{bind: 'unix:x', tls: true}", "tls: must be false for a Unix socket"),
+        ("{bind: 'unix:x', mode: 660}", "mode: must be 0600, 0660 or 0666"),
+        ("{bind: 'unix:x', mode: '0777'}", "mode: must be 0600, 0660 or 0666"),
+        ("{bind: 'unix:x', mode: true}", "mode: must be 0600, 0660 or 0666"),
+        ("{bind: 'unix:'}", 'bind: must be "host:port"'),
+        ("{bind: ':1', protocol: ws}", "protocol: must be mqtt or websocket"),
+        ("{bind: 'unix:x'}, {bind: 'unix:./x'}", "bind: broker.listeners[0] listens there already"),
+    ],
+)
+def test_what_is_no_listener(listener, problem, tmp_path):
+    with pytest.raises(config.ConfigError) as refused:
+        config.loads(f"broker: {{listeners: [{listener}]}}", tmp_path / "appliance.yaml", {})
+    assert problem in str(refused.value)
+
+
 # --- Unix sockets --------------------------------------------------------------------------------
 
 
@@ -768,7 +820,7 @@ async def test_what_is_cut_in_portions_stays_in_order(house: House, monkeypatch)
 async def test_a_flood_of_small_packets_leaves_others_their_turn(house: House, tls):
     await house.start()
     flood, other = await house.join("flood", tls=tls), await house.join("other", tls=tls)
-    count = 100_000
+    count = 50_000
     flood.writer.write(Publish("a", b"").encode(5) * count)
     received = house.broker.counters
     await until(lambda: received.publish_received)

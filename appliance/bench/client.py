@@ -5,11 +5,14 @@ It uses nothing of `appliance.mqtt`: the measure must not share a mistake with w
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import os
+import resource
 import select
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -32,6 +35,43 @@ class Target:
     username: str | None = None
     password: bytes | None = None
     pids: tuple[int, ...] = ()  # the processes whose CPU time and memory are the broker's
+
+    @staticmethod
+    def add_options(parser: argparse.ArgumentParser) -> None:
+        """Let a program take a target on its command line."""
+        parser.add_argument("--host", default="127.0.0.1")
+        parser.add_argument("--port", type=int, help="default: 1883, with TLS 8883")
+        parser.add_argument("--tls", action="store_true", help="connect over TLS")
+        parser.add_argument("--ca", metavar="FILE", help="the CA of the broker's certificate")
+        parser.add_argument("--user", help="user name")
+        parser.add_argument("--password-env", metavar="NAME", help="variable with the password")
+        parser.add_argument(
+            "--pid", type=int, action="append", default=[], help="the broker's process; repeatable"
+        )
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> Target:
+        """What the options say. Raises LoadError, OSError."""
+        password = os.environ.get(options.password_env) if options.password_env else None
+        if options.password_env and password is None:
+            raise LoadError(f"there is no variable {options.password_env}")
+        return cls(
+            host=options.host,
+            port=options.port or (8883 if options.tls else 1883),
+            tls=ssl.create_default_context(cafile=options.ca) if options.tls else None,
+            username=options.user,
+            password=password.encode() if password is not None else None,
+            pids=tuple(options.pid),
+        )
+
+
+def allow_files(count: int) -> bool:
+    """Let this process, and what it starts, open so many files; False when it may not."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = hard == resource.RLIM_INFINITY or hard >= count
+    if soft != resource.RLIM_INFINITY and soft < count:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (count if allowed else hard, hard))
+    return allowed
 
 
 def field(data: bytes) -> bytes:
@@ -59,11 +99,18 @@ def connect_packet(client_id: str, username: str | None, password: bytes | None)
     return packet(0x10, field(b"MQTT") + bytes([4, flags, 0, 0]) + body)
 
 
-def publish_packet(topic: str, payload: bytes, packet_id: int | None = None) -> bytes:
+def publish_packet(
+    topic: str, payload: bytes, packet_id: int | None = None, retain: bool = False
+) -> bytes:
     """PUBLISH with QoS 1, or QoS 0 without a packet identifier (section 3.3)."""
     if packet_id is None:
-        return packet(0x30, field(topic.encode()) + payload)
-    return packet(0x32, field(topic.encode()) + packet_id.to_bytes(2, "big") + payload)
+        return packet(0x30 | retain, field(topic.encode()) + payload)
+    return packet(0x32 | retain, field(topic.encode()) + packet_id.to_bytes(2, "big") + payload)
+
+
+def subscribe_packet(filters: Sequence[str], qos: int) -> bytes:
+    """SUBSCRIBE to all the filters (section 3.8)."""
+    return packet(0x82, b"\0\1" + b"".join(field(each.encode()) + bytes([qos]) for each in filters))
 
 
 class Plain:
@@ -167,16 +214,17 @@ class Client:
 
     def connected(self) -> None:
         """Wait for the CONNACK."""
-        if (code := self._expect(0x20, 4)[3]) != 0:
+        if (code := self.expect(0x20, 4)[3]) != 0:
             raise LoadError(f"{self.client_id}: the broker refuses the connection, code {code}")
 
     def subscribe(self, topic: str, qos: int) -> None:
         """Subscribe, and wait for the SUBACK."""
-        self.write(packet(0x82, b"\0\1" + field(topic.encode()) + bytes([qos])))
-        if (code := self._expect(0x90, 5)[4]) != qos:
+        self.write(subscribe_packet([topic], qos))
+        if (code := self.expect(0x90, 5)[4]) != qos:
             raise LoadError(f"{self.client_id}: subscription to {topic} answered with {code:#x}")
 
-    def _expect(self, first_byte: int, size: int) -> bytes:
+    def expect(self, first_byte: int, size: int) -> bytes:
+        """Wait for a packet of this length, and of this kind."""
         answer, filled = memoryview(bytearray(size)), 0
         while filled < size:
             filled += self.transport.recv_into(answer[filled:])

@@ -2,7 +2,8 @@
 
 Both brokers are started with equal settings on this computer, driven in turn from a separate
 process, and compared by what they need: CPU time a delivered message first, as it is the steadiest
-on a computer that does other things, then messages a second and latency.
+on a computer that does other things, then messages a second and latency. The cells of growth have a
+table of their own, with goals for each broker by itself.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from appliance.bench import report
-from appliance.bench.cells import CELLS, REPEATS, Row, compare
+from appliance.bench.cells import CELLS, REPEATS, Cell, Row, compare
+from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, grow
 from appliance.bench.peers import find_mosquitto, mosquitto_version
 
 INTERRUPTED = 130  # as a shell says it
@@ -25,7 +27,8 @@ INTERRUPTED = 130  # as a shell says it
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
     """What `appliance.bench.main` says."""
     console = Console(stderr=True)
-    known = {cell.name: cell for cell in CELLS}
+    every: tuple[Cell | GrowthCell, ...] = (*CELLS, *GROWTH)
+    known = {cell.name: cell for cell in every}
     if unknown := [name for name in cells or () if name not in known]:
         console.print(f"no such cell: {', '.join(unknown)}; there are {', '.join(known)}")
         return 2
@@ -40,8 +43,9 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
         console.print(
             "mosquitto is not installed (apt install mosquitto): measuring the appliance alone"
         )
-    chosen = [known[name] for name in cells] if cells else list(CELLS)
+    chosen = [known[name] for name in cells or known]
     rows: list[Row] = []
+    grown: list[GrowthRow] = []
     status = 0
     with _Terminated(), console.status("") as shown:
         try:
@@ -53,16 +57,19 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
                 def progress(text: str, where: str = where) -> None:
                     shown.update(escape(f"{where}: {text}"))
 
-                rows.append(compare(cell, command, seconds, progress=progress))
+                if isinstance(cell, GrowthCell):
+                    grown.append(grow(cell, command, seconds, progress))
+                else:
+                    rows.append(compare(cell, command, seconds, progress=progress))
         except KeyboardInterrupt:
             console.print("interrupted; what was measured until then:")
             status = INTERRUPTED
     version = mosquitto_version(command) if command else None
     if as_json:
-        sys.stdout.write(report.to_json(rows, version, seconds, REPEATS) + "\n")
+        sys.stdout.write(report.to_json(rows, grown, version, seconds, REPEATS) + "\n")
     else:
-        report.show(rows, version)
-    return status or int(any(row.problem for row in rows))
+        report.show(rows, grown, version)
+    return status or int(any(row.problem for row in rows) or any(row.problem for row in grown))
 
 
 class _Terminated:

@@ -14,9 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import select
-import ssl
 import statistics
 import sys
 import time
@@ -25,7 +23,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from appliance.bench.client import Client, LoadError, Target, publish_packet
+from appliance.bench.client import Client, LoadError, Target, allow_files, publish_packet
 
 STALL_SECONDS = 3.0  # nothing arrives for so long: the broker has lost messages, or stands still
 DRAIN_SECONDS = 2.0  # what is still on the way after the last message was sent
@@ -45,6 +43,7 @@ class Load:
     window: int = 1  # messages of one publisher neither delivered nor acknowledged
     batch: int = 1  # send only when this many fit into the window
     payload: int = 64  # bytes
+    topics: int = 1  # of each publisher, each in its turn; the subscriber has one wildcard for all
     idle: int = 0  # connections that only stay: measures memory, not messages
 
 
@@ -54,6 +53,7 @@ CELLS: dict[str, Load] = {
     "qos1-inflight50": Load(qos=1, window=50),
     "qos1-50pairs": Load(qos=1, pairs=50),
     "qos0-fanout50": Load(subscribers=50),
+    "qos0-topics": Load(window=200, batch=100, topics=10_000),
     "qos1-100k": Load(qos=1, payload=100_000, window=10),
     "idle": Load(idle=500),
 }
@@ -75,6 +75,11 @@ class Result:
     broker_busy: float | None = None  # CPU time / time; 1.0 is one core
     generator_busy: float | None = None
     memory_kib: float | None = None  # the broker's resident memory a connection, KiB
+
+
+def topic_of(topic: str, load: Load, number: int) -> str:
+    """The topic of a publisher's message with this number; all are equally long."""
+    return topic if load.topics == 1 else f"{topic}/{number:06d}"
 
 
 class Flow:
@@ -141,14 +146,17 @@ class Publisher(Client):
         super().__init__(target, client_id)
         load = flow.load
         payload = bytes(index & 0x7F for index in range(load.payload))
+        topics = [topic_of(topic, load, number) for number in range(load.topics)]
         self._flow = flow
-        self._size = len(publish_packet(topic, payload, 1 if load.qos else None))
+        self._size = len(publish_packet(topics[0], payload, 1 if load.qos else None))
         # Twice the window: an identifier is free again long before its packet's turn comes.
         count = min(max(2 * load.window, 64), max(2 * load.window, RING_BYTES // self._size), 65535)
         self._ring = memoryview(
             b"".join(
-                publish_packet(topic, payload, 1 + index if load.qos else None)
-                for index in range(count)
+                publish_packet(
+                    topics[index % load.topics], payload, 1 + index if load.qos else None
+                )
+                for index in range(max(count, load.topics))
             )
         )
         self._position = 0
@@ -188,7 +196,9 @@ class Subscriber(Client):
     def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
         super().__init__(target, client_id)
         load = flow.load
-        example = publish_packet(topic, bytes(load.payload), 0 if load.qos else None)
+        example = publish_packet(
+            topic_of(topic, load, 0), bytes(load.payload), 0 if load.qos else None
+        )
         self._flow = flow
         self._qos = load.qos
         self._size = len(example)
@@ -295,7 +305,8 @@ class Run:
         for client in self._clients:
             client.connected()
         for subscriber, topic in self._subscribers:
-            subscriber.subscribe(topic, self._load.qos)
+            wanted = topic if self._load.topics == 1 else f"{topic}/+"
+            subscriber.subscribe(wanted, self._load.qos)
         for client in self._clients:
             client.attach(self._poll, self._events)
 
@@ -392,9 +403,7 @@ def run_idle(cell: str, target: Target, load: Load, seconds: float) -> Result:
     """Open connections that stay idle, and see what memory each costs a freshly started broker."""
     if not target.pids:
         raise LoadError("the idle cell measures memory: tell the broker's process with --pid")
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = 2 * load.idle + 100
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, wanted)), hard))
+    allow_files(2 * load.idle + 100)
     clients: list[Client] = []
     try:
         # The first connections also pay for what is made once.
@@ -435,15 +444,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Drive an MQTT broker with one cell's load and measure it.",
     )
     parser.add_argument("cell", choices=CELLS, metavar="CELL", help=", ".join(CELLS))
-    parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, help="default: 1883, with TLS 8883")
-    parser.add_argument("--tls", action="store_true", help="connect over TLS")
-    parser.add_argument("--ca", metavar="FILE", help="the CA that signed the broker's certificate")
-    parser.add_argument("--user", help="user name")
-    parser.add_argument("--password-env", metavar="NAME", help="variable that holds the password")
-    parser.add_argument(
-        "--pid", type=int, action="append", default=[], help="the broker's process; repeatable"
-    )
+    Target.add_options(parser)
     parser.add_argument("--seconds", type=float, default=3.0, help="time to measure (default: 3)")
     parser.add_argument("--no-pin", action="store_true", help="leave both to the scheduler")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -466,18 +467,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     load = replace(CELLS[options.cell], **changes)
     if load.batch > load.window:
         parser.error("a batch larger than the window would never be sent")
-    password = os.environ.get(options.password_env) if options.password_env else None
-    if options.password_env and password is None:
-        parser.error(f"there is no variable {options.password_env}")
     try:
-        target = Target(
-            host=options.host,
-            port=options.port or (8883 if options.tls else 1883),
-            tls=ssl.create_default_context(cafile=options.ca) if options.tls else None,
-            username=options.user,
-            password=password.encode() if password is not None else None,
-            pids=tuple(options.pid),
-        )
+        target = Target.of(options)
         spin = not options.no_pin and pin(target.pids)
         if load.idle:
             result = run_idle(options.cell, target, load, options.seconds)

@@ -18,6 +18,7 @@ import socket
 import ssl
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,6 +42,16 @@ topic readwrite bench/#
 pattern readwrite clients/%c/#
 """
 INFLIGHT = 100  # towards a subscriber; mosquitto's default of 20 would stand in the load's way
+LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or does not meet it here
+    "connections": 10_000,
+    "connections_per_address": 10_000,
+    "connection_rate": 1_000_000,
+    "publish_rate": 1_000_000_000,
+    "subscriptions": 100_000,
+    "retained_messages": 1_000_000,
+    "retained_bytes": "1 GiB",
+    "memory": "1 GiB",
+}
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
 START_SECONDS = 20.0
 STOP_SECONDS = 10.0
@@ -118,8 +129,7 @@ def mosquitto_version(command: str) -> str:
 @contextlib.contextmanager
 def mosquitto(command: str, site: Site) -> Iterator[Server]:
     """Run mosquitto; it is stopped in the end. Raises PeerError."""
-    directory = site.directory / "mosquitto"
-    directory.mkdir()
+    directory = Path(tempfile.mkdtemp(prefix="mosquitto-", dir=site.directory))
     (directory / "acl").write_text(ACL)
     salt = secrets.token_bytes(12)
     digest = hashlib.pbkdf2_hmac("sha512", site.password.encode(), salt, 101)
@@ -140,6 +150,7 @@ log_dest stderr
 log_type error
 log_type warning
 max_inflight_messages {INFLIGHT}
+max_queued_messages 0
 listener {port} 127.0.0.1
 listener {tls_port} 127.0.0.1
 certfile {site.directory / "server.crt"}
@@ -158,8 +169,7 @@ def appliance(
     site: Site, routes: Sequence[Mapping[str, object]], environment: Mapping[str, str]
 ) -> Iterator[Server]:
     """Run this appliance, with a bridge when there are routes; stopped in the end. PeerError."""
-    directory = site.directory / "appliance"
-    directory.mkdir()
+    directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
     passwords = Passwords(directory / "users.passwd")
     passwords.set(USER, site.password)
     passwords.save()
@@ -180,7 +190,7 @@ def appliance(
                 "ca": str(site.ca),
                 "client_certificates": "none",
             },
-            "limits": {"inflight": INFLIGHT},
+            "limits": {"inflight": INFLIGHT, **LIMITS},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
         "log": {"level": "warning"},
@@ -196,13 +206,24 @@ def appliance(
 
 @contextlib.contextmanager
 def running(
-    name: str, argv: Sequence[str], environment: Mapping[str, str], log: Path
+    name: str,
+    argv: Sequence[str],
+    environment: Mapping[str, str],
+    log: Path,
+    talks: bool = False,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program whose output goes to `log`; it is stopped in the end. Raises PeerError."""
+    """Run a program whose output goes to `log`; it is stopped in the end. Raises PeerError.
+
+    With `talks` its input and output are pipes, and only its errors go to `log`.
+    """
     with log.open("wb") as output:
         try:
             process = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment
+                argv,
+                stdin=subprocess.PIPE if talks else subprocess.DEVNULL,
+                stdout=subprocess.PIPE if talks else output,
+                stderr=output,
+                env=environment,
             )
         except OSError as error:
             raise PeerError(f"{name} does not start: {error}") from error
@@ -221,6 +242,10 @@ def running(
             raise PeerError(ended())
     finally:
         stop(process)
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:

@@ -14,6 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from appliance.bench.cells import Row
+from appliance.bench.growth import Figures, GrowthRow, Statement
+from appliance.bench.peers import LIMITS
 
 HEADINGS = {
     "cpu_us": "CPU µs a message",
@@ -23,9 +25,19 @@ HEADINGS = {
     "memory_kib": "KiB",
 }
 WIDTH_ELSEWHERE = 200  # of a file or a pipe, which wraps nothing
+LIMITS_NOTE = (
+    "Limits of this broker that mosquitto has not, or does not meet here, were raised out of reach "
+    f"(broker.limits: {', '.join(LIMITS)})."
+)
 
 
-def to_json(rows: Sequence[Row], peer: str | None, seconds: float, repeats: int) -> str:
+def to_json(
+    rows: Sequence[Row],
+    grown: Sequence[GrowthRow],
+    peer: str | None,
+    seconds: float,
+    repeats: int,
+) -> str:
     """All figures, ratios and goals, with where and how they were measured."""
     return json.dumps(
         {
@@ -35,6 +47,7 @@ def to_json(rows: Sequence[Row], peer: str | None, seconds: float, repeats: int)
             "cores": os.cpu_count(),
             "machine": platform.machine(),
             "python": platform.python_version(),
+            "limits": LIMITS,
             "rows": [
                 {
                     "cell": row.cell.name,
@@ -48,6 +61,30 @@ def to_json(rows: Sequence[Row], peer: str | None, seconds: float, repeats: int)
                     "missing": row.missing,
                 }
                 for row in rows
+            ],
+            "growth": [
+                {
+                    "cell": row.cell.name,
+                    "title": row.cell.title,
+                    "size": row.cell.size,
+                    "ours": row.ours,
+                    "peer": row.peer,
+                    "statements": [
+                        {
+                            "figure": each.figure,
+                            "title": each.title,
+                            "unit": each.unit,
+                            "at_most": each.most,
+                            "reached": each.reached(row.ours),
+                            "reached_by_peer": each.reached(row.peer),
+                        }
+                        for each in row.cell.statements
+                    ],
+                    "reached": row.reached,
+                    "problem": row.problem,
+                    "missing": row.missing,
+                }
+                for row in grown
             ],
         },
         indent=2,
@@ -98,6 +135,48 @@ def table(rows: Sequence[Row], peer: str | None) -> Table:
     return result
 
 
+def growth_table(rows: Sequence[GrowthRow], peer: str | None) -> Table:
+    """One line a statement: ours, the peer's, the most that it may be, and whether ours is."""
+    result = Table(title="what must not grow, and how long others wait")
+    result.add_column("")
+    result.add_column("appliance", justify="right")
+    if peer:
+        result.add_column(peer.partition(" ")[0], justify="right")
+    result.add_column("goal", justify="right")
+    result.add_column("")
+    for row in rows:
+        result.add_row(f"[bold]{escape(row.cell.title)}[/bold]")
+        for each in row.cell.statements:
+            cells = [f"· {each.title}", growth_figure(each, row.ours)]
+            cells += [growth_figure(each, row.peer)] if peer else []
+            cells += [
+                "" if each.most is None else f"≤ {each.most:g} {each.unit}" if each.most else "0"
+            ]
+            result.add_row(*cells, reached(each.reached(row.ours)))
+        for note in (row.problem, row.missing):
+            if note:
+                result.add_row(f"[red]{escape(note)}[/red]")
+        result.add_section()
+    return result
+
+
+def growth_figure(statement: Statement, figures: Figures | None) -> str:
+    """A figure with its unit, and its note in brackets."""
+    if figures is None or statement.figure not in figures:
+        return ""
+    value = figures[statement.figure]
+    shown = number(value) if statement.unit not in ("×", "s", "") else f"{value:.2f}"
+    note = f" ({statement.note.format_map(figures)})" if statement.note else ""
+    return (f"{shown} {statement.unit}" if statement.unit else f"{value:,.0f}") + note
+
+
+def reached(verdict: bool | None) -> str:
+    """Whether a statement's goal is."""
+    if verdict is None:
+        return ""
+    return "[green]reached[/green]" if verdict else "[red]not reached[/red]"
+
+
 def verdict(ratio: float | None, goal: float | None) -> str:
     """Whether a goal is met."""
     if ratio is None or goal is None:
@@ -105,9 +184,16 @@ def verdict(ratio: float | None, goal: float | None) -> str:
     return "[green]met[/green]" if ratio >= goal else "[red]not met[/red]"
 
 
-def show(rows: Sequence[Row], peer: str | None) -> None:
-    """The table: on a terminal in its width, elsewhere as Markdown without colours."""
-    console, shown = Console(), table(rows, peer)
+def show(rows: Sequence[Row], grown: Sequence[GrowthRow], peer: str | None) -> None:
+    """The tables: on a terminal in its width, elsewhere as Markdown without colours."""
+    console = Console()
+    tables = [table(rows, peer)] if rows else []
+    tables += [growth_table(grown, peer)] if grown else []
     if not console.is_terminal:
-        console, shown.box = Console(width=WIDTH_ELSEWHERE, no_color=True), box.MARKDOWN
-    console.print(shown)
+        console = Console(width=WIDTH_ELSEWHERE, no_color=True)
+        for each in tables:
+            each.box = box.MARKDOWN
+    for each in tables:
+        console.print(each)
+    if peer:
+        console.print(LIMITS_NOTE, highlight=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -9,18 +10,23 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
 from appliance import bench
-from appliance.bench import cells, client, command, ends, load, report
+from appliance.bench import cells, client, command, ends, growth, load, report
 from appliance.bench.cells import CELLS, BridgeCell, Cell, LoadCell, Row, compare, median
 from appliance.bench.client import LoadError, Target
+from appliance.bench.crowd import Crowd
+from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, Statement, grow
 from appliance.bench.load import Flow, Load, Publisher, Result, Subscriber
-from appliance.bench.peers import find_mosquitto
+from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
+from appliance.mqtt.topics import check_filter, matches
 
 MOSQUITTO = find_mosquitto(None)
 needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
@@ -73,6 +79,28 @@ def test_every_bridge_gives_sane_figures_on_both_sides(
         assert figures.rate is not None and figures.rate < 2000
 
 
+@needs_mosquitto
+@pytest.mark.parametrize("cell", GROWTH, ids=lambda cell: cell.name)
+def test_every_statement_about_growth_gets_its_figure_from_both_brokers(
+    cell: GrowthCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(growth, "RUNS", 1)
+    monkeypatch.setattr(growth, "SETTLE_SECONDS", 0.1)
+    size = 40 if cell.name == "growth-clients" else 1000
+    row = grow(dataclasses.replace(cell, size=size), MOSQUITTO, 0.2)
+    assert row.problem is None and row.missing is None
+    for figures in (row.ours, row.peer):
+        assert figures is not None
+        for statement in cell.statements:
+            assert 0 <= figures[statement.figure] < 100_000
+            assert report.growth_figure(statement, figures)
+            if statement.most == 0:
+                assert figures[statement.figure] == 0
+            if statement.unit == "ms":
+                assert 0.01 < figures[statement.figure] < 20_000
+    assert row.reached is not None
+
+
 def test_a_broker_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None:
     broken = tmp_path / "mosquitto"
     broken.write_text("#!/bin/sh\necho out of order >&2\nexit 3\n")
@@ -92,6 +120,16 @@ def test_ratios_and_goals() -> None:
     assert Row(cell, ours).met is None
 
 
+def test_what_is_reached_is_at_most_the_goal() -> None:
+    statements = (Statement("a", "a", "ms", 50.0), Statement("b", "b"), Statement("c", "c", "", 0))
+    cell = GrowthCell("g", "a cell", 7, statements)
+    assert GrowthRow(cell, {"a": 50.0, "b": 1e9, "c": 0}).reached is True
+    assert GrowthRow(cell, {"a": 50.1, "b": 1.0, "c": 0}).reached is False
+    assert GrowthRow(cell, {"a": 1.0, "b": 1.0, "c": 1}).reached is False
+    assert GrowthRow(cell, {"a": 1.0}).reached is None
+    assert GrowthRow(cell).reached is None
+
+
 def test_medians_but_every_loss() -> None:
     runs = [Result("c", True, 1.0, lost=1, cpu_us=cpu, memory_kib=None) for cpu in (9.0, 1.0, 2.0)]
     assert median(runs) == Result("c", True, 1.0, lost=3, cpu_us=2.0)
@@ -109,6 +147,24 @@ def test_json_for_machines(capsys: pytest.CaptureFixture[str]) -> None:
     assert row["goals"] == {"cpu_us": 1.0}
     assert row["ratios"]["cpu_us"] == pytest.approx(row["peer"]["cpu_us"] / row["ours"]["cpu_us"])
     assert row["problem"] is None
+
+
+@needs_mosquitto
+def test_growth_in_json_for_machines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = dataclasses.replace(GROWTH[2], size=20)
+    monkeypatch.setattr(command, "GROWTH", (cell,))
+    monkeypatch.setattr(growth, "SETTLE_SECONDS", 0.1)
+    assert bench.main(["growth-clients"], 0.2, None, True) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["rows"] == []
+    assert printed["limits"]["publish_rate"] > 1_000_000
+    (row,) = printed["growth"]
+    assert (row["cell"], row["size"], row["problem"]) == ("growth-clients", 20, None)
+    told = {each["figure"]: each for each in row["statements"]}
+    assert told["failed"]["at_most"] == row["ours"]["failed"] == row["peer"]["failed"] == 0
+    assert told["failed"]["reached"] is told["failed"]["reached_by_peer"] is True
 
 
 def test_without_a_peer_ours_alone(
@@ -176,12 +232,25 @@ def test_interrupted_it_leaves_nothing_behind(tmp_path: Path, number: signal.Sig
 def test_the_table_says_what_was_not_reached(capsys: pytest.CaptureFixture[str]) -> None:
     cell = Cell("c", "a cell", {"cpu_us": 1.5})
     ours = Result("c", False, 1.0, messages=9, lost=1, cpu_us=3.0, rate=1000.0)
-    report.show([Row(cell, ours, dataclasses.replace(ours, lost=0, rate=500.0))], "mosquitto 2")
+    peer = dataclasses.replace(ours, lost=0, rate=500.0)
+    statements = (
+        Statement("x", "a ratio", "×", 1.15, "{a-us:.1f} → {b-us:.1f} µs"),
+        Statement("y", "a stop", "ms", 50.0),
+        Statement("z", "a loss", "", 0),
+    )
+    figures = {"x": 1.5, "a-us": 2.0, "b-us": 3.0, "y": 2.0, "z": 0}
+    grown = GrowthRow(GrowthCell("g", "much", 7, statements), figures, problem="mosquitto: gone")
+    report.show([Row(cell, ours, peer)], [grown], "mosquitto 2")
     lines = capsys.readouterr().out.splitlines()
     words = [" ".join(line.replace("|", " ").split()) for line in lines]
     assert "a cell CPU µs a message 3.0 3.0 1.00 ≥ 1.5 not met" in words
     assert "messages/s 1,000 500 2.00" in words
     assert "lost by appliance 1 of 10" in words
+    assert "· a ratio 1.50 × (2.0 → 3.0 µs) ≤ 1.15 × not reached" in words
+    assert "· a stop 2.0 ms ≤ 50 ms reached" in words
+    assert "· a loss 0 0 reached" in words
+    assert "mosquitto: gone" in words
+    assert "publish_rate" in " ".join(words)
 
 
 # The load generator
@@ -269,6 +338,20 @@ def test_one_at_a_time_waits_for_every_subscriber() -> None:
         flow.deliver(4)
 
 
+def test_each_of_many_topics_has_its_turn_and_the_wildcard_has_all() -> None:
+    wire, flow = Wire(), Flow(Load(topics=5000))
+    publisher = Publisher(wire.target, "p", flow, "bench/t")
+    publisher.close()
+    wire.listener.close()
+    size = len(client.publish_packet(load.topic_of("bench/t", flow.load, 0), bytes(64)))
+    ring = bytes(publisher._ring)
+    assert len(ring) % size == 0
+    packets = [ring[start : start + size] for start in range(0, len(ring), size)]
+    topics = [packet[4 : 4 + packet[3]].decode() for packet in packets[:5000]]
+    assert len(set(topics)) == 5000
+    assert all(matches("bench/t/+", topic) for topic in topics)
+
+
 def test_percentiles_are_weighted() -> None:
     assert load.percentile([(5.0, 1), (1.0, 98), (9.0, 1)], 0.50) == 1.0
     assert load.percentile([(5.0, 1), (1.0, 98), (9.0, 1)], 0.99) == 5.0
@@ -288,6 +371,133 @@ def test_a_refused_connection_is_told(capsys: pytest.CaptureFixture[str]) -> Non
         port = listener.getsockname()[1]
     assert load.main(["qos0-pair", "--port", str(port), "--no-pin"]) == 1
     assert "qos0-pair: " in capsys.readouterr().err
+
+
+# Growth
+
+
+def test_other_subscriptions_are_other_ones() -> None:
+    filters = [growth.other_filter(number) for number in range(10_000)]
+    assert len(set(filters)) == 10_000
+    assert sum("+" in each or "#" in each for each in filters) == 3000
+    published = ["bench/load/00", load.topic_of("bench/load/00", Load(topics=9), 7)]
+    for each in filters:
+        check_filter(each)
+        assert not any(matches(each, topic) for topic in published)
+    kept = [growth.kept_topic(number) for number in range(10_000)]
+    assert len(set(kept)) == 10_000 and len(set(map(len, kept))) == 1
+
+
+class Pretender:
+    """A broker of one thread that does what a test says with each of its connections."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.target = Target(port=self.listener.getsockname()[1])
+        self.pause = 0.0  # before the next PUBLISH is sent back
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def server(self, directory: Path) -> Server:
+        return Server("pretender", Site(directory), self.target.port, self.target.port, ())
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self.listener.accept()
+            except OSError:
+                return
+            self._threads.append(threading.Thread(target=self._serve, args=[connection]))
+            self._threads[-1].start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection:
+            connection.settimeout(10)
+            data = connection.recv(1000)
+            if data.endswith(b"-1"):
+                return  # of a crowd, number 1 is closed before its CONNACK
+            refused = data.endswith(b"-2")
+            connection.sendall(b"\x20\x02\0" + (b"\x05" if refused else b"\0"))
+            if data.endswith(b"-3"):
+                return  # and number 3 behind it
+            with contextlib.suppress(ConnectionError):  # the other end is closed in a hurry
+                while data := connection.recv(1000):
+                    if data[0] == 0x82:
+                        connection.sendall(b"\x90\x03\0\1\0")
+                    else:
+                        time.sleep(self.pause)
+                        self.pause = 0.0
+                        connection.sendall(data)
+
+    def close(self) -> None:
+        # A thread in accept() is not woken up by a close.
+        self.listener.shutdown(socket.SHUT_RDWR)
+        self.listener.close()
+        for each in self._threads:
+            each.join(10)
+
+
+@pytest.fixture
+def pretender() -> Iterator[Pretender]:
+    broker = Pretender()
+    yield broker
+    broker.close()
+
+
+def test_the_probe_sees_how_long_a_broker_stands_still(
+    pretender: Pretender, tmp_path: Path
+) -> None:
+    with growth.probing(pretender.server(tmp_path)) as probe:
+        time.sleep(0.1)
+        assert 0 < probe.ask()["longest"] < 0.4
+        pretender.pause = 0.5
+        time.sleep(0.6)
+        answer = probe.ask()
+        assert 0.5 <= answer["longest"] < 5
+        assert answer["median"] < 0.4
+        time.sleep(0.1)
+        assert probe.ask()["longest"] < 0.4  # since the last question only
+
+
+def test_a_crowd_counts_who_could_not_connect_and_who_did_not_stay(pretender: Pretender) -> None:
+    crowd = Crowd(pretender.target)
+    with contextlib.ExitStack() as stack:
+        stack.callback(crowd.leave)
+        came = crowd.connect(6)
+        assert (came["failed"], came["timed_out"]) == (2, 0)
+        assert 0 < came["p50"] <= came["p99"] <= came["seconds"]  # type: ignore[operator]
+        until = time.monotonic() + 10
+        while "closed after the CONNACK" not in crowd._problems and time.monotonic() < until:
+            crowd._serve(0.1)
+        assert crowd.leave() == {
+            "stayed": 3,
+            "problems": {
+                "closed before the CONNACK": 1,
+                "answered with 20 02 00 05": 1,
+                "closed after the CONNACK": 1,
+            },
+        }
+
+
+def test_who_gets_no_answer_has_timed_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("appliance.bench.crowd.CONNECT_SECONDS", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        crowd = Crowd(Target(port=listener.getsockname()[1]))
+        came = crowd.connect(3)
+        assert (came["failed"], came["timed_out"]) == (3, 3)
+        assert "p50" not in came
+        assert crowd.leave()["stayed"] == 0
+
+
+def test_a_program_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    server = Server("nobody", Site(tmp_path), port, port, ())
+    with (
+        pytest.raises(PeerError, match=r"the probe ended.*Connection refused"),
+        growth.probing(server),
+    ):
+        pass
 
 
 # The ends of a bridge

@@ -1,0 +1,203 @@
+"""A crowd: thousands of clients that connect at once, stay, and leave at once.
+
+Each line on standard input is one step, answered when it is done: the first lets them connect, the
+second leave. It ends with its input::
+
+    python -m appliance.bench.crowd --clients 5000 --port 8883 --tls --ca ca.crt --user NAME \
+        --password-env VARIABLE
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import select
+import socket
+import ssl
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from appliance.bench.client import LoadError, Target, allow_files, connect_packet
+from appliance.bench.load import percentile, pin
+from appliance.bench.probe import tell
+
+CONNECT_SECONDS = 30.0  # from the TCP connection to the CONNACK, as MQTT.js has it
+OTHER_FILES = 64
+NICENESS = 5  # clients are elsewhere, and a bystander is not to wait for them
+_READ, _WRITE = select.EPOLLIN | select.EPOLLRDHUP, select.EPOLLOUT
+
+
+class Newcomer:
+    """One client on its way: TCP connection, TLS handshake, CONNECT, CONNACK."""
+
+    def __init__(self, target: Target, client_id: str) -> None:
+        self._target = target
+        self._connect = connect_packet(client_id, target.username, target.password)
+        self._answer = b""
+        self._step = self._on_tcp
+        self.began = time.perf_counter()
+        self.took: float | None = None
+        self.socket = socket.socket()
+        self.socket.setblocking(False)
+        self.socket.connect_ex((target.host, target.port))
+
+    def go_on(self) -> int:
+        """Do what can be done; returns what epoll is to wait for.
+
+        Raises LoadError and OSError, of which those of TLS are, when it cannot connect.
+        """
+        return self._step()
+
+    def _on_tcp(self) -> int:
+        if error := self.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(error, os.strerror(error))
+        if self._target.tls is None:
+            return self._send()
+        self.socket = self._target.tls.wrap_socket(
+            self.socket, do_handshake_on_connect=False, server_hostname=self._target.host
+        )
+        self._step = self._on_tls
+        return self._on_tls()
+
+    def _on_tls(self) -> int:
+        assert isinstance(self.socket, ssl.SSLSocket)
+        try:
+            self.socket.do_handshake()
+        except ssl.SSLWantReadError:
+            return _READ
+        except ssl.SSLWantWriteError:
+            return _WRITE
+        return self._send()
+
+    def _send(self) -> int:
+        self.socket.send(self._connect)  # the first bytes that it sends always fit
+        self._step = self._on_connack
+        return self._on_connack()
+
+    def _on_connack(self) -> int:
+        try:
+            data = self.socket.recv(4 - len(self._answer))
+        except (BlockingIOError, ssl.SSLWantReadError):
+            return _READ
+        if not data:
+            raise LoadError("closed before the CONNACK")
+        self._answer += data
+        if len(self._answer) == 4:
+            if self._answer[0] != 0x20 or self._answer[3]:
+                raise LoadError(f"answered with {self._answer.hex(' ')}")
+            self.took = time.perf_counter() - self.began
+            self._step = self._on_more
+        return _READ
+
+    def _on_more(self) -> int:
+        """TLS may say something more; else there is only an end to be read."""
+        try:
+            if not self.socket.recv(1):
+                raise LoadError("closed after the CONNACK")
+        except (BlockingIOError, ssl.SSLWantReadError):
+            pass
+        return _READ
+
+
+class Crowd:
+    """All of them, and the loop that serves them."""
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
+        self._poll = select.epoll()
+        self._waiting: dict[int, Newcomer] = {}
+        self._inside: dict[int, Newcomer] = {}
+        self._took: list[float] = []  # seconds, of each that connected, whether it stayed or not
+        self._problems: Counter[str] = Counter()
+
+    def connect(self, count: int) -> dict[str, object]:
+        """Let so many connect at once; returns how that went when all have, or their time is up."""
+        began = time.perf_counter()
+        for number in range(count):
+            newcomer = Newcomer(self._target, f"bench-crowd-{os.getpid()}-{number}")
+            self._waiting[newcomer.socket.fileno()] = newcomer
+            self._poll.register(newcomer.socket.fileno(), _WRITE)
+        until = time.perf_counter() + CONNECT_SECONDS
+        while self._waiting and time.perf_counter() < until:
+            self._serve(0.1)
+        took = self._took
+        answer: dict[str, object] = {
+            "failed": count - len(took),
+            "timed_out": len(self._waiting),
+            "seconds": time.perf_counter() - began,
+            "problems": dict(self._problems.most_common(3)),
+        }
+        if took:
+            answer["p50"] = percentile([(each, 1) for each in took], 0.50)
+            answer["p99"] = percentile([(each, 1) for each in took], 0.99)
+        return answer
+
+    def stay(self) -> None:
+        """Serve the connections until there is a line of input, or its end."""
+        self._poll.register(sys.stdin.fileno(), select.EPOLLIN)
+        while not self._serve(None):
+            pass
+        self._poll.unregister(sys.stdin.fileno())
+
+    def leave(self) -> dict[str, object]:
+        """Close all connections, without a word; returns how many there were."""
+        stayed = len(self._inside)
+        for client in (*self._inside.values(), *self._waiting.values()):
+            client.socket.close()
+        return {"stayed": stayed, "problems": dict(self._problems.most_common(3))}
+
+    def _serve(self, seconds: float | None) -> bool:
+        """Serve those who have something to do; whether there is a line of input."""
+        asked = False
+        for descriptor, _ in self._poll.poll(seconds):
+            client = self._waiting.get(descriptor) or self._inside.get(descriptor)
+            if client is None:
+                asked = True
+                continue
+            try:
+                self._poll.modify(descriptor, client.go_on())
+            except (LoadError, OSError) as error:
+                self._problems[getattr(error, "reason", None) or str(error)] += 1
+                self._waiting.pop(descriptor, None)
+                self._inside.pop(descriptor, None)
+                client.socket.close()
+            else:
+                if client.took is not None and descriptor in self._waiting:
+                    self._took.append(client.took)
+                    self._inside[descriptor] = self._waiting.pop(descriptor)
+        return asked
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m appliance.bench.crowd", description="Connect many MQTT clients at once."
+    )
+    Target.add_options(parser)
+    parser.add_argument("--clients", type=int, default=5000)
+    options = parser.parse_args(arguments)
+    gc.disable()
+    allow_files(options.clients + OTHER_FILES)
+    try:
+        target = Target.of(options)
+        crowd = Crowd(target)
+        pin(target.pids)
+        os.nice(NICENESS)
+        tell({"ready": True})
+        if sys.stdin.readline():
+            tell(crowd.connect(options.clients))
+            crowd.stay()
+            if sys.stdin.readline():
+                tell(crowd.leave())
+                sys.stdin.readline()
+    except (LoadError, OSError) as error:
+        sys.stderr.write(f"crowd: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

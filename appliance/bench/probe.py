@@ -1,0 +1,85 @@
+"""A bystander: one client whose round trips show whether the broker stands still for others.
+
+It publishes to itself, one message after the other with a pause between. Each line on its standard
+input is answered with the round trips since the line before; it ends with its input::
+
+    python -m appliance.bench.probe --port 1883 --user NAME --password-env VARIABLE
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import select
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+
+from appliance.bench.client import Client, LoadError, Target, publish_packet
+from appliance.bench.load import percentile
+
+PAUSE_SECONDS = 0.002  # between two round trips: the broker is watched, and not kept busy
+PATIENCE_SECONDS = 60.0  # for one round trip
+
+
+def round_trips(client: Client) -> Iterator[float]:
+    """Seconds of one round trip after the other. Raises LoadError when one never ends."""
+    topic = f"bench/probe/{os.getpid()}"
+    packet = publish_packet(topic, bytes(64))
+    client.subscribe(topic, 0)
+    client.socket.settimeout(PATIENCE_SECONDS)
+    while True:
+        began = time.perf_counter()
+        client.write(packet)
+        try:
+            client.expect(packet[0], len(packet))
+        except TimeoutError:
+            raise LoadError(f"no answer within {PATIENCE_SECONDS:g} s") from None
+        yield time.perf_counter() - began
+
+
+def watch(client: Client) -> None:
+    """Make round trips, and tell of them when asked, until the input ends."""
+    samples: list[tuple[float, int]] = []
+    trips = round_trips(client)
+    next(trips)  # the first is not like the others
+    tell({"ready": True})
+    while True:
+        samples.append((next(trips), 1))
+        if not select.select([sys.stdin], [], [], PAUSE_SECONDS)[0]:
+            continue
+        if not sys.stdin.readline():
+            return
+        tell({"longest": percentile(samples, 1.0), "median": percentile(samples, 0.5)})
+        samples.clear()
+
+
+def tell(answer: dict[str, object]) -> None:
+    """Print a line for the process that asks."""
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m appliance.bench.probe", description="Time an MQTT client's round trips."
+    )
+    Target.add_options(parser)
+    gc.disable()  # its pauses would be taken for the broker's
+    try:
+        target = Target.of(parser.parse_args(arguments))
+        with closing(Client(target, f"bench-probe-{os.getpid()}")) as client:
+            client.connected()
+            watch(client)
+    except (LoadError, OSError) as error:
+        sys.stderr.write(f"probe: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

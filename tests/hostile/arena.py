@@ -1,0 +1,165 @@
+"""One attack on a real appliance, with a healthy client beside it, and what came of it."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from appliance_process import ApplianceProcess
+from combat import USER, Attack, Attacker
+from witness import Report, Target, Witness
+
+MIB = 1 << 20
+
+#: Seconds that the healthy client may have to wait for its own message.
+ROUND_TRIP = 0.5
+
+#: The rules for both: the attacker may do everything, so that only limits are in its way.
+ACL = f"""\
+user alice
+topic readwrite {{robot}}/#
+
+user {USER}
+topic readwrite {{robot}}/#
+topic deny {{robot}}/forbidden/#
+"""
+
+#: Where the defaults are not: less memory, so that its bound is reached in a short time, and all
+#: attackers come from one address here.
+LIMITS: dict[str, Any] = {
+    "memory": "64 MiB",
+    "retained_bytes": "16 MiB",
+    "connections_per_address": 1000,
+    "connection_rate": 100_000,
+    "connect_timeout": "1 s",
+}
+
+#: What the process may take beyond the configured limits, in bytes: the objects and buffers of a
+#: thousand connections with TLS, and what the allocator does not give back at once.
+ALLOWANCE = 96 * MIB
+
+#: Lines that the log may grow by: a second, and a connection, whose number has limits of its own
+#: (that are raised here); and the bytes of a line.
+LOG_LINES = 100
+CONNECTION_LINES = 8
+LINE = 500
+
+#: Seconds that the healthy client is watched for after the attack: its end is a part of it.
+AFTERMATH = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one attack did; sizes in bytes. `problems` is empty when the broker withstood it."""
+
+    attack: Attack
+    transport: str
+    seen: Report
+    base: int
+    peak: int
+    bound: int
+    log_lines: int
+    about_it: int
+    seconds: float
+    counts: Counter[str]
+    problems: list[str]
+
+
+class Arena:
+    """A directory with an appliance that is started anew for every attack, and two processes."""
+
+    def __init__(self, directory: Path) -> None:
+        self._appliance = ApplianceProcess(directory, users={USER: "knows the password"}, acl=ACL)
+        self._settings: dict[str, Any] = yaml.safe_load(self._appliance.config.read_text())
+        self._witness: Witness | None = None
+        self._attacker: Attacker | None = None
+
+    def close(self) -> None:
+        """Leave nothing running; may be called twice."""
+        for process in (self._witness, self._attacker):
+            if process is not None:
+                process.end()
+        self._witness = self._attacker = None
+
+    def run(self, attack: Attack, tls: bool | None, seconds: float) -> Outcome:
+        """The attack over TLS, over plain TCP or, when `tls` is None, over both at once."""
+        appliance = self._appliance
+        limits = LIMITS | attack.limits
+        self._settings["broker"]["limits"] = limits
+        appliance.config.write_text(yaml.safe_dump(self._settings))
+        logged_before = len(appliance.log)
+        problems: list[str] = []
+        appliance.start()
+        try:
+            fought = self._fight(attack, tls, max(seconds, attack.at_least))
+        except (AssertionError, OSError, EOFError) as error:
+            self.close()
+            raise AssertionError(f"{attack.name}: {error!r}") from error
+        finally:
+            try:
+                appliance.stop()
+            except AssertionError as error:
+                problems.append(str(error)[-600:])
+        log = appliance.log[logged_before:]
+        seen, counts, failure, base, peak, took = fought
+        if failure:
+            problems.append(f"the attack failed: {failure}")
+        if seen.failure:
+            problems.append(seen.failure)
+        if seen.worst > ROUND_TRIP:
+            problems.append(f"a round trip took {seen.worst * 1000:.0f} ms")
+        bound = base + _size(limits["memory"]) + _size(limits["retained_bytes"]) + ALLOWANCE
+        if peak > bound:
+            problems.append(f"memory: {peak // MIB} MiB, over the bound of {bound // MIB} MiB")
+        lines = log.splitlines()
+        about_it = sum(1 for line in lines if re.search(attack.says, line))
+        if not about_it and took >= attack.said_after:
+            problems.append(f"no line of the log matches {attack.says!r}")
+        allowed = LOG_LINES * (1 + took) + CONNECTION_LINES * counts["connections"]
+        if len(lines) > allowed:
+            problems.append(f"the log was flooded: {len(lines)} lines in {took:.1f} s")
+        if len(log) > LINE * allowed:
+            problems.append(f"the log was flooded: {len(log)} bytes in {took:.1f} s")
+        for sign in ("Traceback", "internal error", "never awaited", "Exception in"):
+            if sign in log:
+                at = log.index(sign)
+                problems.append(f"in the log: {log[max(0, at - 300) : at + 1000]}")
+                break
+        over = {None: "both", True: "TLS", False: "plain"}[tls]
+        sizes = base, peak, bound
+        return Outcome(attack, over, seen, *sizes, len(lines), about_it, took, counts, problems)
+
+    def _fight(
+        self, attack: Attack, tls: bool | None, seconds: float
+    ) -> tuple[Report, Counter[str], str, int, int, float]:
+        """What the healthy client and the attacker report, memory before and at most, seconds."""
+        appliance = self._appliance
+        self._witness = witness = self._witness or Witness()
+        self._attacker = attacker = self._attacker or Attacker()
+        ports = appliance.port, appliance.plain_port
+        target = Target(*ports, appliance.ca, dict(appliance.passwords))
+        witness.begin(target, tls=tls is not False)
+        base = _status(appliance.pid, "VmRSS")
+        # The peak is counted from here on; see proc(5), clear_refs.
+        Path(f"/proc/{appliance.pid}/clear_refs").write_text("5")
+        began = time.monotonic()
+        counts, failure = attacker.attack(attack.name, target, tls, seconds)
+        took = time.monotonic() - began
+        time.sleep(AFTERMATH)
+        seen = witness.report()
+        return seen, counts, failure, base, _status(appliance.pid, "VmHWM"), took
+
+
+def _size(text: str) -> int:
+    number, unit = text.split()
+    return int(number) * {"KiB": 1 << 10, "MiB": MIB}[unit]
+
+
+def _status(pid: int, name: str) -> int:
+    found = re.search(rf"^{name}:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.M)
+    return int(found[1]) * 1024 if found is not None else 0  # none of a process that has died

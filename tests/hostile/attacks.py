@@ -1,0 +1,977 @@
+"""The attacks. Each says in its docstring what it does, and in `says` what the log must tell."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import ssl
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from combat import USER, Attack, Fight, Line, encode4, encode5
+
+from appliance.mqtt.codec import Property, encode_varint
+from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.packets import (
+    V311,
+    Pingreq,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Subscribe,
+    Subscription,
+    Unsubscribe,
+    Will,
+)
+
+ATTACKS: dict[str, Attack] = {}
+
+#: Where the attackers write and read; the healthy client's topic lies beside it.
+AREA = "r2d2/mallory"
+HEALTHY = "r2d2/healthy/echo"
+
+#: An address as the log has it, and a client of the attacker's.
+ADDRESS = r"127\.0\.0\.1:\d+"
+CLIENT = rf"client '[^']*' \(user '{USER}'\)"
+
+Run = Callable[[Fight], Awaitable[None]]
+
+
+def attack(
+    says: str,
+    *,
+    at_least: float = 0.0,
+    short: bool = True,
+    said_after: float = 0.0,
+    **limits: Any,
+) -> Callable[[Run], Run]:
+    """Enter a function into ATTACKS under its name."""
+
+    def enter(run: Run) -> Run:
+        name = run.__name__.replace("_", "-")
+        what = " ".join((run.__doc__ or "").split())
+        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after)
+        return run
+
+    return enter
+
+
+# --- before the login
+
+
+@attack(rf"{ADDRESS}: no complete CONNECT within", at_least=1.4)
+async def slow_connects(fight: Fight) -> None:
+    """A thousand strangers say their CONNECT byte by byte, and come again when they are cut."""
+    packet = fight.connect_packet("slow")
+
+    async def drip(number: int) -> Line:
+        line = await fight.dial()
+        line.say(packet[:1])
+        return line
+
+    async def keep_on() -> None:
+        said = 1
+        while fight.on:
+            lines = [line for line in fight.lines if line.open]
+            for line in lines:
+                line.say(packet[said : said + 1])
+            said = min(said + 1, len(packet) - 2)
+            fight.counts["bytes"] += len(lines)
+            fight.lines.intersection_update(lines)
+            await asyncio.sleep(0.1)
+
+    async def come() -> None:
+        while fight.on:
+            await fight.crowd(900 - len(fight.lines), drip, 1.0)
+            await asyncio.sleep(0.05)
+
+    await fight.together(keep_on(), come())
+
+
+@attack(rf"{ADDRESS}(: no complete CONNECT within| broke the protocol)", at_least=1.4)
+async def heavy_strangers(fight: Fight) -> None:
+    """Strangers send almost all of the largest CONNECT there can be, and wait."""
+    packet = fight.connect_packet("heavy", will=_heavy_will(MAXIMUM_CONTROL - 200))[:-1]
+
+    async def stay(number: int) -> Line:
+        line = await fight.dial()
+        await line.send(packet)
+        return line
+
+    while fight.on:
+        await fight.crowd(900, stay, 1.0)
+
+
+@attack(rf"({ADDRESS} broke the protocol|user 'mallory'\) at 127\.0\.0\.1:\d+ refused)")
+async def costly_strangers(fight: Fight) -> None:
+    """CONNECTs that are long to take apart, full of user properties, with a wrong password."""
+    pairs = [("", "")] * ((MAXIMUM_CONTROL - 400) // 5)
+    will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
+    packet = fight.connect_packet("costly", password=b"wrong", will=will)
+
+    async def say(number: int) -> Line:
+        line = await fight.dial()
+        await line.send(packet)
+        return line
+
+    while fight.on:
+        await fight.crowd(200, say, 1.0)
+
+
+@attack(r"127\.0\.0\.1\S* .*connection_rate", connection_rate=100, connections_per_address=250)
+async def connect_flood(fight: Fight) -> None:
+    """Connections that are closed as soon as they are there, as fast as they can be made."""
+
+    async def come_and_go() -> None:
+        while fight.on:
+            try:
+                (await fight.raw()).close()
+            except (OSError, asyncio.TimeoutError):
+                await asyncio.sleep(0.001)
+
+    await fight.together(*(come_and_go() for _ in range(16)))
+
+
+@attack(rf"{ADDRESS} broke the protocol")
+async def garbage_flood(fight: Fight) -> None:
+    """As many connections as can be made, each with bytes that are no MQTT."""
+    rng = random.Random(1)
+    garbage = [
+        b"GET / HTTP/1.1\r\nHost: robot\r\n\r\n",
+        b"\x16\x03\x01\x02\0\x01\0\x01\xfc\x03\x03" + rng.randbytes(500),
+        b"\x10\xff\xff\xff\xff\xff",
+        b"\x10\x0c\0\x04MQTT\x09\0\0\0\0\0",
+        b"\xc0\0",
+        b"\0" * 1000,
+        *(rng.randbytes(rng.randint(1, 2000)) for _ in range(50)),
+    ]
+
+    async def come_and_go() -> None:
+        while fight.on:
+            try:
+                line = await fight.dial()
+            except (OSError, asyncio.TimeoutError):
+                await asyncio.sleep(0.001)
+                continue
+            line.say(rng.choice(garbage))
+            await asyncio.sleep(0)
+            if rng.random() < 0.5:
+                line.hang_up()
+            else:
+                line.transport.close()
+            fight.lines.discard(line)
+
+    await fight.together(*(come_and_go() for _ in range(32)))
+
+
+@attack(rf"{ADDRESS}: no TLS connection")
+async def tls_flood(fight: Fight) -> None:
+    """TLS handshakes one behind the other, whole ones, and ones that end in the middle."""
+
+    async def whole() -> None:
+        while fight.on:
+            try:
+                line = await fight.dial(tls=True)
+            except (OSError, asyncio.TimeoutError):
+                await asyncio.sleep(0.001)
+                continue
+            fight.counts["handshakes"] += 1
+            line.hang_up()
+            fight.lines.discard(line)
+
+    hello = _client_hello(fight)
+
+    async def half() -> None:
+        loop = asyncio.get_running_loop()
+        while fight.on:
+            try:
+                sock = await fight.raw(tls=True)
+            except (OSError, asyncio.TimeoutError):
+                await asyncio.sleep(0.001)
+                continue
+            try:
+                await loop.sock_sendall(sock, hello)
+                await asyncio.wait_for(loop.sock_recv(sock, 100), 5)
+                fight.counts["half handshakes"] += 1
+            except (OSError, asyncio.TimeoutError):
+                pass
+            sock.close()
+
+    await fight.together(*(whole() for _ in range(12)), *(half() for _ in range(12)))
+
+
+@attack(rf"{ADDRESS}: no (TLS connection|complete CONNECT)", at_least=1.4, short=False)
+async def tls_half_open(fight: Fight) -> None:
+    """Hundreds of TLS handshakes that stop after, or drip, their first message."""
+    hello = _client_hello(fight)
+    loop = asyncio.get_running_loop()
+    socks = []
+    try:
+        async for round_ in fight.rounds(0.02):
+            if len(socks) < 900 and fight.within(0.8):
+                for _ in range(20):
+                    sock = await fight.raw(tls=True)
+                    socks.append(sock)
+                    part = hello if round_ % 2 else hello[: len(hello) // 2]
+                    await loop.sock_sendall(sock, part)
+        fight.counts["crowd"] = len(socks)
+    finally:
+        for sock in socks:
+            sock.close()
+
+
+@attack(r"(user|client) 'mallory.*refused: (wrong password|unknown user|too many passwords)")
+async def wrong_passwords(fight: Fight) -> None:
+    """Logins with wrong passwords and unknown names, as many as can be made."""
+
+    async def guess(worker: int) -> None:
+        async for number in fight.rounds():
+            try:
+                line = await fight.dial(tls=False if fight.tls is None else None)
+            except (OSError, asyncio.TimeoutError):
+                continue
+            user = USER if number % 2 else f"{USER}{number}"
+            secret = b"%d.%d" % (worker, number)
+            line.say(fight.connect_packet(f"{USER}-guess", username=user, password=secret))
+            await line.hear(5)
+            fight.counts["guesses"] += 1
+            line.hang_up()
+            fight.lines.discard(line)
+
+    await fight.together(*(guess(number) for number in range(100)))
+
+
+# --- behind a login: who does not listen
+
+
+@attack(rf"{CLIENT}.*queue is full", said_after=3.0)
+async def never_acknowledging(fight: Fight) -> None:
+    """Subscribers that acknowledge nothing of QoS 1 and 2, with a flood of both behind them."""
+
+    async def stay(number: int) -> Line:
+        expiry = {Property.SESSION_EXPIRY_INTERVAL: 3600} if number % 2 else None
+        line = await fight.join(f"silent-{number}", clean_start=False, properties=expiry)
+        wanted = [Subscription(f"{AREA}/flood/#", 1 + number % 4 // 2)]
+        line.say(encode5(Subscribe(1, wanted)))
+        return line
+
+    await fight.crowd(200, stay, 0.4)
+    await fight.together(
+        _publish_forever(fight, "flood-1", 1, 100), _publish_forever(fight, "flood-2", 2, 1000)
+    )
+
+
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", said_after=3.0)
+async def never_reading_small(fight: Fight) -> None:
+    """Subscribers with every QoS that never read, and a flood of small messages behind them."""
+    await _never_reading(fight, 200, 50)
+
+
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)")
+async def never_reading_large(fight: Fight) -> None:
+    """Subscribers with every QoS that never read, and a flood of large messages behind them."""
+    await _never_reading(fight, 200, 200_000)
+
+
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|asks for more)", said_after=5.0)
+async def never_reading_qos0(fight: Fight) -> None:
+    """Subscribers with QoS 0 that never read, for whom messages are replaced and dropped."""
+    await _never_reading(fight, 200, 2000, (0,))
+
+
+async def _never_reading(
+    fight: Fight, readers: int, size: int, levels: tuple[int, ...] = (0, 1, 2)
+) -> None:
+    async def stay(number: int) -> Line:
+        line = await fight.join(f"deaf-{number}", receive_buffer=4096)
+        qos = levels[number % len(levels)]
+        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", qos)])))
+        line.deaf()
+        return line
+
+    await fight.crowd(readers, stay, 0.4)
+    await fight.together(*(_publish_forever(fight, f"flood-{qos}", qos, size) for qos in levels))
+
+
+@attack(rf"{CLIENT}", short=False)
+async def fan_out(fight: Fight) -> None:
+    """Subscribers that read all, and so many small messages for each that it takes forever."""
+
+    async def stay(number: int) -> Line:
+        line = await fight.join(f"reader-{number}", version=V311)
+        line.say(encode4(Subscribe(1, [Subscription(f"{AREA}/flood/#")])))
+        return line
+
+    await fight.crowd(100, stay, 0.4)
+    await fight.together(*(_publish_forever(fight, f"flood-{n}", 0, 1) for n in range(3)))
+
+
+@attack(rf"{CLIENT}.*(does not read|asks for more|slow)", said_after=5.0)
+async def ping_flood(fight: Fight) -> None:
+    """PINGREQs without end, and nobody who reads the answers."""
+    pings = Pingreq().encode(4) * 60_000
+
+    async def stay(number: int) -> Line:
+        line = await fight.join(f"ping-{number}", version=V311, receive_buffer=4096)
+        line.deaf()
+        return line
+
+    lines = await fight.crowd(50, stay, 0.3)
+    await fight.together(*(fight.flood(line, pings, 60_000, "pings") for line in lines))
+
+
+@attack(rf"{CLIENT}")
+async def small_packets(fight: Fight) -> None:
+    """A hundred clients that send the smallest packets there are, as fast as they are read."""
+    ids = range(1, 10_000)
+    chunks = [
+        Publish("r2d2/x", b"").encode(4) * 20_000,
+        encode4(*(Pubrel(number) for number in ids)) + b"\x40\x02\x12\x34" * 10_000,
+        encode4(*(Pubrec(number) for number in ids)) + b"\x70\x02\x12\x34" * 10_000,
+        Pingreq().encode(4) * 20_000,
+    ]
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"small-{number}", version=V311)
+
+    lines = await fight.crowd(100, stay, 0.4)
+    floods = (
+        fight.flood(line, chunks[number % 4], 20_000, "packets")
+        for number, line in enumerate(lines)
+    )
+    await fight.together(*floods)
+
+
+@attack(rf"{CLIENT}")
+async def costly_filters(fight: Fight) -> None:
+    """SUBSCRIBE and UNSUBSCRIBE with as many filters as one packet can hold."""
+    many = MAXIMUM_CONTROL // 4 - 100
+    packets = [
+        encode5(Subscribe(1, [Subscription("x", 0)] * many)),
+        encode5(Unsubscribe(1, ["x"] * many)),
+    ]
+    await _say_often(fight, packets)
+
+
+@attack(rf"{CLIENT}")
+async def costly_properties(fight: Fight) -> None:
+    """Messages that are nothing but user properties, three million of them."""
+    topic = len(AREA).to_bytes(2, "big") + AREA.encode()
+    pairs = 3_000_000
+    body = topic + encode_varint(pairs * 5) + b"\x26\0\0\0\0" * pairs
+    await _say_often(fight, [b"\x30" + encode_varint(len(body)) + body])
+
+
+async def _say_often(fight: Fight, packets: list[bytes]) -> None:
+    """Many clients that send one of the packets again and again, and come again when cut off."""
+
+    async def say(number: int) -> None:
+        async for turn in fight.rounds():
+            line = await fight.join(f"costly-{number}-{turn}")
+            await fight.flood(line, packets[number % len(packets)], 1, "packets")
+
+    await fight.together(*(say(number) for number in range(8)))
+
+
+# --- subscriptions
+
+
+@attack(r"may not subscribe to .*(limits\.subscriptions|limits\.memory)")
+async def subscription_bomb(fight: Fight) -> None:
+    """A hundred thousand filters, 1,000 a client and one more, in packets as large as may be."""
+
+    async def subscribe(number: int) -> Line:
+        line = await fight.join(f"bomb-{number}")
+        wanted = [Subscription(f"{AREA}/{number}/{index}/+") for index in range(1001)]
+        await line.send(encode5(Subscribe(1, wanted)))
+        fight.counts["filters"] += len(wanted)
+        return line
+
+    await fight.crowd(100, subscribe, 1.0)
+
+
+@attack(r"client 'deep.*levels")
+async def deep_filters(fight: Fight) -> None:
+    """Filters of 200 levels that share none but the first ones, and of more levels than allowed."""
+
+    async def subscribe(number: int) -> Line:
+        line = await fight.join(f"deep-{number}")
+        for start in range(0, 1000, 250):
+            wanted = [
+                Subscription(f"{AREA}/{number}/{index}" + "/+" * 196)
+                for index in range(start, start + 250)
+            ]
+            await line.send(encode5(Subscribe(1, wanted)))
+            fight.counts["filters"] += len(wanted)
+        line.say(encode5(Subscribe(1, [Subscription(AREA + "/+" * 200)])))
+        return line
+
+    await fight.crowd(200, subscribe, 1.0)
+
+
+@attack(r"may not subscribe to .*limits\.(subscriptions|memory)")
+async def long_filters(fight: Fight) -> None:
+    """Filters of 65,535 bytes, a thousand a client, one of their characters beyond the BMP."""
+
+    async def subscribe(number: int) -> Line:
+        line = await fight.join(f"long-{number}")
+        for index in range(1001):
+            topic = f"{AREA}/\U0001f916{number}/{index}/"
+            wanted = [Subscription(topic + "x" * (65535 - len(topic.encode())))]
+            await line.send(encode5(Subscribe(1, wanted)))
+            fight.counts["filters"] += 1
+        return line
+
+    await fight.crowd(50, subscribe, 1.0)
+
+
+@attack(rf"{CLIENT}")
+async def matching_filters(fight: Fight) -> None:
+    """All filters that match one topic of 14 levels, and messages to ever new ones of these."""
+    levels = 12
+    combinations = [
+        AREA + "".join("/+" if bits >> level & 1 else "/a" for level in range(levels))
+        for bits in range(1 << levels)
+    ]
+
+    async def subscribe(number: int) -> Line:
+        line = await fight.join(f"match-{number}")
+        mine = combinations[number * 1000 : (number + 1) * 1000]
+        await line.send(encode5(Subscribe(1, [Subscription(text) for text in mine])))
+        fight.counts["filters"] += len(mine)
+        return line
+
+    await fight.crowd(-(-len(combinations) // 1000), subscribe, 0.4)
+    publisher = await fight.join("match-publisher")
+    async for number in fight.rounds():
+        # Each topic is a new one: nothing that was looked up for the last helps.
+        topics = [f"{AREA}{'/a' * (levels - 1)}/{number}-{index}" for index in range(500)]
+        await publisher.send(encode5(*(Publish(topic, b"") for topic in topics)))
+        fight.counts["messages"] += len(topics)
+
+
+@attack(rf"{CLIENT}", short=False)
+async def everybody_listens(fight: Fight) -> None:
+    """Hundreds of clients that subscribe to the healthy client's topic in every way there is."""
+    healthy = HEALTHY.split("/")
+    ways = [
+        "/".join("+" if bits >> level & 1 else name for level, name in enumerate(healthy))
+        for bits in range(8)
+    ]
+    ways += ["#", "+/#", "+/+/#", "+/+/+/#", "r2d2/#", "r2d2/healthy/#", f"{HEALTHY}/#"]
+
+    async def subscribe(number: int) -> Line:
+        line = await fight.join(f"listen-{number}")
+        line.say(encode5(Subscribe(1, [Subscription(way, number % 3) for way in ways])))
+        return line
+
+    await fight.crowd(300, subscribe, 0.8)
+    async for _ in fight.rounds(0.1):
+        pass
+
+
+@attack(rf"{CLIENT}")
+async def subscription_churn(fight: Fight) -> None:
+    """Subscribe and unsubscribe without end, so that nothing that was looked up holds for long."""
+    wanted = [Subscription(f"{AREA}/{index}/#", 1) for index in range(100)]
+    names = [one.filter for one in wanted]
+    chunk = encode5(Subscribe(1, wanted), Unsubscribe(2, names)) * 20
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"churn-{number}")
+
+    lines = await fight.crowd(20, stay, 0.3)
+    await fight.together(*(fight.flood(line, chunk, 4000, "changes") for line in lines))
+
+
+# --- topics
+
+
+@attack(r"may not publish to .*levels|(connection|limits)\.?_?topic_levels")
+async def deep_topics(fight: Fight) -> None:
+    """Topics of 200 levels, of 65,535 bytes, of more levels than allowed; never the same twice."""
+
+    async def publish(number: int) -> None:
+        line = await fight.join(f"deep-{number}")
+        async for turn in fight.rounds():
+            begin = f"{AREA}/{number}/{turn}"
+            packets = [
+                Publish(begin + "/a" * (200 - begin.count("/") - 1), b"x", 1, packet_id=1),
+                Publish(begin + "/" + "x" * (65535 - len(begin) - 1), b"x", 1, packet_id=2),
+                Publish(begin + "/" * 195 + "\U0001f916" * 8000, b"x", 1, packet_id=3),
+            ]
+            if not turn % 100:
+                packets.append(Publish(begin + "/" * 60000, b"x", 1, packet_id=4))
+            await line.send(encode5(*packets))
+            fight.counts["messages"] += len(packets)
+
+    await fight.together(*(publish(number) for number in range(50)))
+
+
+@attack(rf"{CLIENT}", short=False)
+async def invented_topics(fight: Fight) -> None:
+    """Each client publishes to a thousand topics of its own, so that all of them are remembered."""
+    filler = "x" * 440
+
+    async def publish(number: int) -> Line:
+        line = await fight.join(f"many-{number}")
+        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/none/{number}/#")])))
+        for start in range(0, 1000, 100):
+            topics = (f"{AREA}/{number}/{start + index}/{filler}" for index in range(100))
+            await line.send(encode5(*(Publish(topic, b"") for topic in topics)))
+        fight.counts["topics"] += 1000
+        return line
+
+    await fight.crowd(400, publish, 1.0)
+
+
+@attack(r"topic alias (11|0|7)|TOPIC_ALIAS must not be")
+async def topic_aliases(fight: Fight) -> None:
+    """All the aliases there are, each for a topic of 65,535 bytes; and ones that there are not."""
+
+    async def keep(number: int) -> Line:
+        line = await fight.join(f"alias-{number}")
+        for alias in range(1, 11):
+            begin = f"{AREA}/\U0001f916{number}/{alias}/"
+            topic = begin + "x" * (65535 - len(begin.encode()))
+            await line.send(encode5(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias})))
+        fight.counts["aliases"] += 10
+        return line
+
+    async def abuse() -> None:
+        async for number in fight.rounds(0.01):
+            line = await fight.join(f"alias-abuse-{number % 50}")
+            alias = (0, 7, 11, 65535)[number % 4]
+            topic = "" if alias == 7 else AREA
+            line.say(encode5(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias})))
+            await line.closed.wait()
+            fight.lines.discard(line)
+            fight.counts["wrong aliases"] += 1
+
+    async def crowd() -> None:
+        await fight.crowd(400, keep, 1.0)
+
+    await fight.together(crowd(), abuse())
+
+
+# --- retained messages
+
+
+@attack(r"no room to retain")
+async def retained_flood(fight: Fight) -> None:
+    """Retained messages, small ones to ever new topics and large ones, beyond the limit."""
+
+    async def publish(number: int) -> None:
+        line = await fight.join(f"retain-{number}")
+        size = (10, 100, 100_000)[number % 3]
+        async for turn in fight.rounds():
+            packets = [
+                Publish(f"{AREA}/{number}/{turn}-{index}", b"x" * size, retain=True)
+                for index in range(max(1, min(100, 100_000 // size)))
+            ]
+            await line.send(encode5(*packets))
+            fight.counts["messages"] += len(packets)
+
+    await fight.together(*(publish(number) for number in range(6)))
+
+
+@attack(r"no room to retain|may not publish")
+async def retained_deep(fight: Fight) -> None:
+    """Retained messages of one byte to ever new topics of 200 levels."""
+
+    async def publish(number: int) -> None:
+        line = await fight.join(f"retain-{number}")
+        async for turn in fight.rounds():
+            packets = [
+                Publish(f"{AREA}/{number}/{turn}/{index}" + "/a" * 194, b"x", retain=True)
+                for index in range(50)
+            ]
+            await line.send(encode5(*packets))
+            fight.counts["messages"] += len(packets)
+
+    await fight.together(*(publish(number) for number in range(6)))
+
+
+@attack(rf"{CLIENT}")
+async def retained_replays(fight: Fight) -> None:
+    """Clients that ask for all retained messages again and again, with every QoS."""
+    publisher = await fight.join("retain")
+    for start in range(0, 10_000, 500):
+        if not fight.within(0.4):
+            break
+        numbers = range(start, start + 500)
+        packets = [Publish(f"{AREA}/{n % 10}/{n}", b"x" * 50, retain=True) for n in numbers]
+        await publisher.send(encode5(*packets))
+        fight.counts["retained"] += 500
+
+    async def ask(number: int) -> None:
+        line = await fight.join(f"replay-{number}")
+        if number % 2:
+            line.deaf()
+        wanted = [Subscription(way, number % 3) for way in ("#", "+/#", "r2d2/#", "+/+/+/+")]
+        packet = encode5(Subscribe(1, wanted))
+        async for _ in fight.rounds(0.02):
+            await line.send(packet)
+            fight.counts["subscriptions"] += len(wanted)
+
+    await fight.together(*(ask(number) for number in range(20)))
+
+
+@attack(rf"{CLIENT}")
+async def retained_needles(fight: Fight) -> None:
+    """Filters whose search goes through all retained messages and finds none."""
+    publisher = await fight.join("retain")
+    for start in range(0, 15_000, 500):
+        if not fight.within(0.5):
+            break
+        numbers = range(start, start + 500)
+        packets = [Publish(f"{AREA}/{n}/a/b", b"x", retain=True) for n in numbers]
+        await publisher.send(encode5(*packets))
+        fight.counts["retained"] += 500
+
+    async def ask(number: int) -> None:
+        line = await fight.join(f"needle-{number}")
+        wanted = [Subscription(f"{AREA}/+/a/+/{index}") for index in range(100)]
+        packet = encode5(Subscribe(1, wanted))
+        async for _ in fight.rounds(0.01):
+            await line.send(packet)
+            fight.counts["searches"] += len(wanted)
+
+    await fight.together(*(ask(number) for number in range(10)))
+
+
+# --- large packets
+
+
+@attack(r"client '.*more than the limit of")
+async def announced_giants(fight: Fight) -> None:
+    """Packets that announce 256 MB and drip; and ones that announce what is just allowed."""
+    huge = b"\x30" + encode_varint(268_435_455)
+    allowed = b"\x32" + encode_varint((16 << 20) - 5)
+    topic = len(AREA).to_bytes(2, "big") + AREA.encode()
+
+    async def announce(number: int) -> Line:
+        line = await fight.join(f"giant-{number}")
+        line.say((allowed if number % 4 else huge) + topic)
+        return line
+
+    await fight.crowd(400, announce, 0.6)
+    async for _ in fight.rounds(0.05):
+        lines = [line for line in fight.lines if line.open]
+        for line in lines:
+            line.say(b"x" * 10)
+        fight.counts["drips"] += len(lines)
+
+
+@attack(rf"{CLIENT}")
+async def unfinished_giants(fight: Fight) -> None:
+    """Many clients that send packets of 16 MB but for the last byte, all at the same time."""
+    body = len(AREA).to_bytes(2, "big") + AREA.encode() + b"\0"
+    size = (16 << 20) - 5
+    packet = b"\x30" + encode_varint(size) + body + bytes(size - len(body) - 1)
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"giant-{number}")
+
+    lines = await fight.crowd(50, stay, 0.3)
+
+    async def send(line: Line) -> None:
+        for start in range(0, len(packet), 1 << 18):
+            await line.send(packet[start : start + (1 << 18)])
+            fight.counts["MiB"] = round(fight.counts["bytes"] / (1 << 20))
+            fight.counts["bytes"] += 1 << 18
+
+    await fight.together(*(send(line) for line in lines))
+
+
+@attack(rf"{CLIENT}")
+async def giants(fight: Fight) -> None:
+    """Messages of 16 MB, many at the same time, to receivers of which most do not read."""
+    packet = encode5(Publish(f"{AREA}/giant", bytes((16 << 20) - 100)))
+
+    async def receive(number: int) -> Line:
+        line = await fight.join(f"giant-reader-{number}", receive_buffer=65536)
+        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/giant", number % 3)])))
+        if number % 4:
+            line.deaf()
+        return line
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"giant-{number}")
+
+    await fight.crowd(20, receive, 0.3)
+    lines = await fight.crowd(10, stay, 0.4)
+    await fight.together(*(fight.flood(line, packet, 1, "messages") for line in lines))
+
+
+# --- packet ids, QoS 2
+
+
+@attack(r"client '.*(no room for its unfinished|unfinished QoS 2|packet ids)", said_after=3.0)
+async def packet_ids(fight: Fight) -> None:
+    """65,535 messages of QoS 2 that are never released, of 3.1.1 clients and of 5.0 ones."""
+    every = [
+        encode4(
+            *(Publish(AREA, b"x", 2, packet_id=number) for number in range(start, start + 4369))
+        )
+        for start in range(1, 65536, 4369)
+    ]
+    fives = encode5(*(Publish(AREA, b"x", 2, packet_id=number) for number in range(1, 100)))
+
+    async def exhaust(number: int) -> None:
+        async for turn in fight.rounds():
+            line = await fight.join(f"ids-{number}-{turn}", version=V311, clean_start=False)
+            for chunk in every:
+                await line.send(chunk)
+                fight.counts["ids"] += 4369
+            five = await fight.join(f"ids5-{number}-{turn}")
+            await five.send(fives)
+            await five.closed.wait()
+
+    await fight.together(*(exhaust(number) for number in range(5)))
+
+
+@attack(rf"{CLIENT}")
+async def never_completing(fight: Fight) -> None:
+    """Subscribers that answer a QoS 2 message with PUBREC and never with PUBCOMP."""
+
+    async def stay(number: int) -> Line:
+        line = await fight.join(f"half-{number}")
+        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 2)])))
+        line.say(encode5(*(Pubrec(packet_id) for packet_id in range(1, 21))))
+        return line
+
+    lines = await fight.crowd(50, stay, 0.4)
+
+    async def half() -> None:
+        answer = encode5(*(Pubrec(packet_id) for packet_id in range(1, 21)))
+        async for _ in fight.rounds(0.05):
+            for line in lines:
+                line.say(answer)
+
+    await fight.together(half(), _publish_forever(fight, "flood", 2, 1000))
+
+
+# --- connections that are not what they seem
+
+
+@attack(rf"{CLIENT}.*(connection lost|closed)")
+async def half_closed(fight: Fight) -> None:
+    """Clients that end their half of the connection and stay, before the login and behind it."""
+
+    async def close(number: int) -> Line:
+        if number % 3:
+            line = await fight.join(f"half-{number}", receive_buffer=4096)
+            line.say(encode5(Subscribe(1, [Subscription(HEALTHY, 1)])))
+        else:
+            line = await fight.dial()
+            line.say(fight.connect_packet(f"half-{number}")[:20])
+        line.deaf()
+        line.half_close()
+        return line
+
+    while fight.on:
+        await fight.crowd(300, close, 1.0)
+
+
+@attack(rf"{CLIENT}.*silent for", at_least=4.0)
+async def dripping_keep_alive(fight: Fight) -> None:
+    """Clients that drip the bytes of one long packet so as to be kept alive for ever."""
+    packet = encode5(Publish(AREA, bytes(10_000)))
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"drip-{number}", keep_alive=1)
+
+    lines = await fight.crowd(300, stay, 0.3)
+    async for number in fight.rounds(0.1):
+        for line in lines:
+            line.say(packet[number : number + 1])
+    alive = sum(line.open for line in lines)
+    assert not alive, f"{alive} of {len(lines)} clients are still there"
+
+
+@attack(rf"{CLIENT}.*connection lost")
+async def wills(fight: Fight) -> None:
+    """Clients with the largest wills, all gone in one moment, and again; some of them listen."""
+    large = fight.connect_packet("will-000000", will=_heavy_will(MAXIMUM_CONTROL - 300))
+    watcher = await fight.join("will-watcher")
+    watcher.say(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
+    watcher.deaf()
+
+    async def stay(number: int) -> Line:
+        if number % 2:
+            packet = large.replace(b"will-000000", b"will-%06d" % number)
+            return await fight.join("", packet=packet)
+        small = Will(f"{AREA}/will/{number}", b"gone", 1, retain=True)
+        return await fight.join(f"will-{number}", will=small)
+
+    while fight.on:
+        lines = await fight.crowd(500, stay, 0.9)
+        for line in lines:
+            line.hang_up()
+        fight.counts["wills"] += len(lines)
+        await asyncio.sleep(0.2)
+
+
+@attack(
+    r"client '.*(sessions are kept, as many as allowed|limits\.(sessions|memory))",
+    said_after=3.0,
+    sessions=300,
+)
+async def session_bomb(fight: Fight) -> None:
+    """Ever new client ids, each with a session to be kept for days, with all that may be in it."""
+    long = "\U0001f916" + "x" * 60_000
+
+    async def leave(number: int) -> Line:
+        # Every other id is as long as may be.
+        client_id = f"session-{number}" + (long if number % 2 else "")
+        line = await fight.join(
+            client_id,
+            clean_start=False,
+            properties={Property.SESSION_EXPIRY_INTERVAL: 604800},
+            will=Will(AREA, bytes(60_000), properties={Property.WILL_DELAY_INTERVAL: 604800}),
+        )
+        wanted = [Subscription(f"{AREA}/{number}/{index}/#", 1) for index in range(100)]
+        await line.send(encode5(Subscribe(1, wanted)))
+        await line.hear(line.received + 50)
+        line.hang_up()
+        fight.lines.discard(line)
+        fight.counts["sessions"] += 1
+        return line
+
+    while fight.on:
+        await fight.crowd(2000, leave, 1.0)
+
+
+@attack(rf"{CLIENT}.*taken over")
+async def take_overs(fight: Fight) -> None:
+    """Many connections at a time for one client id, with a full queue to be sent to each."""
+    kept = {"clean_start": False, "properties": {Property.SESSION_EXPIRY_INTERVAL: 600}}
+    first = await fight.join("one", **kept)
+    first.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 1)])))
+
+    async def take() -> None:
+        while fight.on:
+            line = await fight.dial()
+            line.say(fight.connect_packet("one", **kept))
+            fight.counts["take-overs"] += 1
+            await line.hear(4)
+            fight.lines.discard(line)
+
+    await fight.together(
+        *(take() for _ in range(20)), _publish_forever(fight, "take-flood", 1, 50_000)
+    )
+
+
+# --- what is refused, and logged
+
+
+@attack(r"client 'forbidden.*may not publish|may not publish.*forbidden")
+async def refused_publishes(fight: Fight) -> None:
+    """Messages that the rules refuse, thousands a second, to the same topic and to new ones."""
+
+    async def publish(number: int) -> None:
+        line = await fight.join(f"forbidden-{number}")
+        async for turn in fight.rounds():
+            topics = (f"r2d2/forbidden/{turn}/{index // 10}" for index in range(500))
+            packets = [Publish(topic, b"x", 1, packet_id=1) for topic in topics]
+            packets.append(Publish("r2d2/forbidden/" + "long" * 15_000, b"x"))
+            packets.append(Publish("$SYS/broker/version", b"x", 1, packet_id=2))
+            await line.send(encode5(*packets))
+            fight.counts["messages"] += len(packets)
+
+    await fight.together(*(publish(number) for number in range(10)))
+
+
+@attack(r"client 'forbidden.*may not subscribe")
+async def refused_subscriptions(fight: Fight) -> None:
+    """Filters that the rules refuse, thousands a second, and ones that are wrong."""
+    wrong = [AREA + "/a#b", "$share//x", "$share/g", "a+/b"]
+
+    async def subscribe(number: int) -> None:
+        line = await fight.join(f"forbidden-{number}")
+        async for turn in fight.rounds():
+            wanted = [Subscription(f"c3po/{turn}/{index}") for index in range(500)]
+            wanted += [Subscription("c3po/" + "long" * 15_000)]
+            await line.send(encode5(Subscribe(1, wanted)))
+            fight.counts["filters"] += len(wanted)
+
+    async def blunder() -> None:
+        async for turn in fight.rounds(0.01):
+            line = await fight.join("blunder")
+            line.say(encode5(Subscribe(1, [Subscription(wrong[turn % 4])])))
+            await line.closed.wait()
+            fight.lines.discard(line)
+
+    await fight.together(blunder(), *(subscribe(number) for number in range(10)))
+
+
+@attack(r"x{50}")
+async def long_names(fight: Fight) -> None:
+    """Client ids and user names of 60,000 bytes, which every line about the client would hold."""
+    name = "x" * 60_000
+
+    async def come(number: int) -> None:
+        async for turn in fight.rounds():
+            line = await fight.dial()
+            if turn % 2:
+                line.say(fight.connect_packet(f"{number}-{turn}-{name}"))
+            else:
+                line.say(fight.connect_packet("", username=name))
+            await line.hear(4)
+            line.hang_up()
+            fight.lines.discard(line)
+            fight.counts["names"] += 1
+
+    await fight.together(*(come(number) for number in range(10)))
+
+
+@attack(r"127\.0\.0\.1.*connections_per_address", connections_per_address=50, connection_rate=1000)
+async def one_address(fight: Fight) -> None:
+    """More connections from one address than it may have: only so many are let in."""
+    lines = await fight.crowd(200, lambda number: fight.join(f"crowd-{number}"), 0.7)
+    await asyncio.sleep(0.1)
+    there = sum(line.open for line in lines)
+    assert 20 <= there < 50, f"{there} of 200 connections are there; the healthy one is another"
+
+
+@attack(r"127\.0\.0\.1.*connection_rate", connection_rate=20, short=False)
+async def one_address_in_haste(fight: Fight) -> None:
+    """More connections a second from one address than it may make."""
+    lines = await fight.crowd(1000, lambda number: fight.join(f"crowd-{number}"), 0.9)
+    allowed = 5 * 20 + 20 * fight.seconds  # a burst is five times the rate
+    assert len(lines) <= allowed + 10, f"{len(lines)} connections, and {allowed} are allowed"
+
+
+# --- parts
+
+
+def _heavy_will(size: int) -> Will:
+    """A will that makes a CONNECT of about so many bytes, most of them in user properties."""
+    pairs = [("", "")] * ((size - 65_000) // 5)
+    return Will(f"{AREA}/will", bytes(64_000), 1, properties={Property.USER_PROPERTY: pairs})
+
+
+def _client_hello(fight: Fight) -> bytes:
+    outgoing = ssl.MemoryBIO()
+    tls = fight.target.context().wrap_bio(ssl.MemoryBIO(), outgoing, server_hostname="localhost")
+    try:
+        tls.do_handshake()
+    except ssl.SSLWantReadError:
+        return outgoing.read()
+    raise AssertionError("a handshake without the other side")
+
+
+async def _publish_forever(fight: Fight, client_id: str, qos: int, size: int) -> None:
+    """A flood of messages to a hundred topics under flood/, each exchange brought to its end."""
+    line = await fight.join(client_id, version=V311)
+    count = max(1, min(1000, (1 << 18) // (size + 50)))
+    chunk = b""
+    for index in range(count):
+        topic = f"{AREA}/flood/{client_id}/{index % 100}"
+        packet_id = index + 1 if qos else None
+        chunk += encode4(Publish(topic, bytes(size), qos, packet_id=packet_id))
+        if qos == 2:
+            assert packet_id is not None
+            chunk += encode4(Pubrel(packet_id))
+    await fight.flood(line, chunk, count, "messages")

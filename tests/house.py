@@ -1,0 +1,174 @@
+"""Listeners with a broker behind them, in the event loop of a test, and clients by raw sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import Callable
+from pathlib import Path
+
+from appliance import certs
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Action, Decision, Identity, Limits, Refusal
+from appliance.listeners import Listeners, ListenerSettings
+from appliance.mqtt.codec import decode_varint
+from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
+from appliance.mqtt.reason import ReasonCode
+from appliance.store import MemoryStore
+from appliance.wire import ClientProtocol, Network
+
+PATIENCE = 10.0  # seconds for what takes milliseconds
+
+
+def make_contexts(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
+    """The server's and the client's settings for TLS."""
+    certs.create_authority(directory, "test")
+    certs.issue_server(directory, ["localhost"], [])
+    server = certs.server_context(directory / "server.crt", directory / "server.key")
+    return server, ssl.create_default_context(cafile=directory / "ca.crt")
+
+
+class AllAllowed:
+    epoch = 0
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        return Decision(True, "everything is")
+
+
+class House:
+    """A broker with four listeners: plain and with TLS, and both of these for WebSocket."""
+
+    def __init__(
+        self, context: ssl.SSLContext, client_context: ssl.SSLContext, limits: Limits | None = None
+    ) -> None:
+        self.broker = Broker(AllAllowed(), MemoryStore(), limits or Limits())
+        self.client_context = client_context
+        self.context = context
+        self.gate = asyncio.Event()  # logins wait for it
+        self.gate.set()
+        self.refused: set[str] = set()
+        self.callers: list[Caller] = []
+        self.listeners = self.make()
+
+    def make(
+        self, connections: int = 100, connect_timeout: float = PATIENCE, **limits: float
+    ) -> Listeners:
+        self.listeners = Listeners(
+            self.broker,
+            self._ask,
+            lambda method: None,
+            connections=connections,
+            connect_timeout=connect_timeout,
+            **limits,
+        )
+        return self.listeners
+
+    @property
+    def network(self) -> Network:
+        return self.listeners.network
+
+    async def _ask(
+        self, connect: Connect, address: str, tls: ssl.SSLObject | None
+    ) -> Identity | Refusal:
+        await self.gate.wait()
+        if connect.client_id in self.refused:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, "the test says so")
+        return Identity(connect.username, connect.client_id)
+
+    async def start(
+        self, connections: int = 100, connect_timeout: float = PATIENCE, **limits: float
+    ) -> None:
+        self.make(connections, connect_timeout, **limits)
+        self.ports = await self.listeners.start(
+            [
+                ListenerSettings("127.0.0.1", 0, None),
+                ListenerSettings("127.0.0.1", 0, self.context),
+                ListenerSettings("127.0.0.1", 0, None, "websocket"),
+                ListenerSettings("127.0.0.1", 0, self.context, "websocket"),
+            ]
+        )
+
+    async def dial(self, tls: bool = False, receive_buffer: int = 0) -> Caller:
+        """A connection to one of the listeners."""
+        sock = socket.socket()
+        if receive_buffer:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+        sock.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(sock, self.ports[tls])
+        reader, writer = await asyncio.open_connection(
+            sock=sock,
+            ssl=self.client_context if tls else None,
+            server_hostname="localhost" if tls else None,
+        )
+        caller = Caller(reader, writer)
+        self.callers.append(caller)
+        return caller
+
+    async def join(self, client_id: str, *, tls: bool = False, receive_buffer: int = 0) -> Caller:
+        """A client that has logged in."""
+        caller = await self.dial(tls, receive_buffer)
+        await caller.say(Connect(client_id))
+        assert isinstance(await caller.hear(), Connack)
+        return caller
+
+    async def close(self) -> None:
+        """The end of a test: nobody is there any more, and nothing is left of them."""
+        for caller in self.callers:
+            caller.hang_up()
+        await self.listeners.stop()
+        assert not self.network.open
+        assert not self.broker.clients
+        assert self.broker.ledger.queued_bytes == 0
+        assert self.network.output == 0
+
+    def protocol(self, client_id: str) -> ClientProtocol:
+        """The server's end of a client's connection."""
+        for protocol in self.network.open:
+            session = protocol._client.session
+            if session is not None and session.client_id == client_id:
+                return protocol
+        raise AssertionError(f"{client_id} is not connected")
+
+
+class Caller:
+    """A client's end of a connection."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader = reader
+        self.writer = writer
+
+    async def say(self, *packets: Packet | bytes) -> None:
+        self.writer.write(b"".join(p if isinstance(p, bytes) else p.encode(5) for p in packets))
+        await asyncio.wait_for(self.writer.drain(), PATIENCE)
+
+    async def hear(self) -> Packet:
+        """The next packet; IncompleteReadError or ConnectionError when there is none."""
+        return await asyncio.wait_for(self._hear(), PATIENCE)
+
+    async def _hear(self) -> Packet:
+        header = await self.reader.readexactly(2)
+        while header[-1] & 0x80:
+            header += await self.reader.readexactly(1)
+        length, _ = decode_varint(header, 1)
+        return decode_packet(header[0], await self.reader.readexactly(length), 5)
+
+    async def hear_the_end(self) -> bytes:
+        """What comes until the connection ends."""
+        with contextlib.suppress(ConnectionError):
+            return await asyncio.wait_for(self.reader.read(-1), PATIENCE)
+        return b""
+
+    def hang_up(self) -> None:
+        self.writer.transport.abort()
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for what is about to happen."""
+
+    async def wait() -> None:
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.002)
+
+    await asyncio.wait_for(wait(), PATIENCE)

@@ -1,0 +1,1 @@
+"""A soak: random clients against a live broker, every delivery checked against a model."""
