@@ -496,7 +496,7 @@ def _target(
     # Without a configuration it is a client on some other computer: the options say everything.
     if config or (port is None and ca is None and any(path.is_file() for path in SEARCH_PATH)):
         broker = _load(config).broker
-        ports = [listener.bind.port for listener in broker.listeners if listener.tls]
+        ports = [listener.bind.port for listener in broker.listeners if listener.is_mqtts]
         port = port or (ports[0] if ports else None)
         ca = ca or broker.tls.ca
     if user is None:

@@ -324,6 +324,11 @@ class Listener(_Section):
     protocol: Literal["mqtt", "websocket"] = "mqtt"
     mode: Mode = 0o660
 
+    @property
+    def is_mqtts(self) -> bool:
+        """Whether a plain MQTT client with TLS connects to it."""
+        return self.tls and self.protocol == "mqtt"
+
     @field_validator("tls")
     @classmethod
     def _check_tls(cls, tls: bool, info: ValidationInfo) -> bool:

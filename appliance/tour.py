@@ -32,10 +32,11 @@ class TourError(Exception):
 
 def run(settings: Settings) -> int:
     """Runs broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
-    if not any(listener.tls for listener in settings.broker.listeners):
+    if not any(listener.is_mqtts for listener in settings.broker.listeners):
         raise TourError("the demo needs a listener with tls: true")
     for listener in settings.broker.listeners:
-        _check_free(listener.bind)
+        if listener.bind.path is None:
+            _check_free(listener.bind)
     uvloop.run(_main(settings))
     return 0
 
@@ -61,7 +62,7 @@ class Tour(App):
         for listener, (host, port) in zip(
             self.settings.broker.listeners, self.addresses, strict=True
         ):
-            if listener.tls:
+            if listener.is_mqtts:
                 here = "localhost" if host in ("", "0.0.0.0", "::", "127.0.0.1") else host
                 _say(instructions(self.settings, here, port))
                 break
