@@ -75,6 +75,10 @@ SUBSCRIBE_EFFORT = 10
 EFFORT_A_TURN = 1000
 
 
+#: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
+HOST_BURST = 100
+
+
 class Wire(Protocol):
     """The connection under a client, as a listener implements it."""
 
@@ -790,7 +794,8 @@ class Client:
     def _complain(self, message: str, *args: object) -> None:
         """Log what came from the client's address, unless it is a flood."""
         host, _, _ = self.wire.address.rpartition(":")
-        self.broker.complaints.tell(self._ledger.now, (host, message), message, *args)
+        now = self._ledger.now
+        self.broker.complaints.tell(now, (host, message), message, *args, burst=HOST_BURST)
 
     def lost(self) -> None:
         """The connection ended without a DISCONNECT."""

@@ -34,8 +34,10 @@ class Complaints:
     def __init__(self) -> None:
         self._heard: OrderedDict[Hashable, _Heard] = OrderedDict()
 
-    def tell(self, now: float, key: Hashable, message: str, *args: object) -> None:
-        """Log a warning, unless there were enough with this key in the last seconds."""
+    def tell(
+        self, now: float, key: Hashable, message: str, *args: object, burst: int = BURST
+    ) -> None:
+        """Log a warning, unless there were `burst` of them with this key in the last seconds."""
         heard = self._heard.get(key)
         if heard is None or now - heard.since >= INTERVAL:
             if heard is not None:
@@ -44,7 +46,7 @@ class Complaints:
             if len(self._heard) > REMEMBERED:
                 self._tell_untold(self._heard.popitem(last=False)[1])
         self._heard.move_to_end(key)
-        if heard.told < BURST:
+        if heard.told < burst:
             heard.told += 1
             log.warning(message, *args)
         else:
