@@ -18,9 +18,9 @@ SECONDS = 4.0
 
 
 @pytest.fixture(autouse=True)
-def quiet() -> None:
+def quiet(caplog: pytest.LogCaptureFixture) -> None:
     """What is refused is told in the log, by the ten thousand."""
-    logging.getLogger("appliance").setLevel(logging.CRITICAL)
+    caplog.set_level(logging.CRITICAL, "appliance")  # until the test ends
 
 
 @pytest.mark.parametrize("one_case", [codec.one_case, states.one_case], ids=["codec", "states"])
