@@ -34,7 +34,7 @@ OUTPUT_HIGH_WATER = 1024 * 1024
 OUTPUT_LOW_WATER = 16 * 1024
 
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
-WRITE_PORTION = 128 * 1024
+WRITE_PORTION = 512 * 1024
 
 #: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
 LARGEST_PORTION = 256 * 1024
