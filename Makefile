@@ -1,5 +1,7 @@
 # make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884
 # make test  every check: format, lint, types, import directions, tests
+# make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
+#                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
 # What they install goes to .venv, what they make to run; both can be deleted at any time.
 
 PYTHON ?= python3
@@ -17,7 +19,7 @@ RUN_EXTRAS := [ros]
 TEST_EXTRAS := [ros,test]
 endif
 
-.PHONY: run test
+.PHONY: run test compiled
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
@@ -28,6 +30,9 @@ test: .venv/test.stamp $(INTEROP)/node_modules
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/pytest
+
+compiled: .venv/run.stamp
+	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
 .venv/run.stamp: pyproject.toml constraints.txt
 	@echo "Setting up .venv; the first time this takes a minute."

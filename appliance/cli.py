@@ -523,12 +523,18 @@ def _shown(path: Path) -> str:
 
 def _version(wanted: bool) -> None:
     if wanted:
+        from importlib.machinery import ExtensionFileLoader
         from importlib.metadata import PackageNotFoundError, version
+        from importlib.util import find_spec
 
         try:
-            typer.echo(f"appliance {version('ros-mqtt-appliance')}")
+            text = f"appliance {version('ros-mqtt-appliance')}"
         except PackageNotFoundError:
-            typer.echo("appliance, run from its source without being installed")
+            text = "appliance, run from its source without being installed"
+        broker = find_spec("appliance.broker.broker")
+        if broker is not None and isinstance(broker.loader, ExtensionFileLoader):
+            text += ", compiled"
+        typer.echo(text)
         raise typer.Exit
 
 

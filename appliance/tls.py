@@ -17,9 +17,12 @@ from typing import Final, TypeAlias, cast
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
 #: Bytes of plaintext in a record, at most (RFC 8446, section 5.1): a read of this size never leaves
-#: a part of a record behind. It is also what OpenSSL is handed at once, because the buffers between
-#: it and the network never shrink: a connection would keep the size of its largest message.
+#: a part of a record behind.
 RECORD_SIZE: Final = 16 * 1024
+
+#: Bytes that OpenSSL is handed at once. Its buffers to and from the network never shrink: for each
+#: connection they would keep the size of its largest message.
+PIECE = 2 * RECORD_SIZE
 
 #: Seconds that a client gets to read the last bytes before its connection is cut.
 CLOSE_TIMEOUT = 10.0
@@ -52,17 +55,14 @@ async def accept(
         ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
         OSError: the client is gone.
     """
-    loop = asyncio.get_running_loop()
-    transport = TlsTransport(protocol, context, loop)
-    await loop.connect_accepted_socket(lambda: transport, connection)
-    try:
-        await asyncio.wait_for(transport.handshake, timeout)
-    except asyncio.TimeoutError:
-        transport.abort()
-        raise asyncio.TimeoutError(f"no handshake within {timeout:g} s") from None
-    except BaseException:
-        transport.abort()
-        raise
+    error = await TlsTransport(protocol, context).shake_hands(connection, timeout)
+    if error is not None:
+        try:
+            raise error
+        finally:
+            # It holds the frames that it comes through. None of them may hold it, as what holds
+            # itself is only freed when garbage is looked for; hence `with_traceback(None)` below.
+            del error
 
 
 class TlsTransport(asyncio.Transport, asyncio.Protocol):
@@ -72,16 +72,11 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
     broken record behind it takes effect. There are no half-closed connections, as in asyncio.
     """
 
-    def __init__(
-        self,
-        protocol: asyncio.Protocol,
-        context: ssl.SSLContext,
-        loop: asyncio.AbstractEventLoop,
-    ) -> None:
+    def __init__(self, protocol: asyncio.Protocol, context: ssl.SSLContext) -> None:
         super().__init__()
-        #: The end of the handshake, or why it failed.
-        self.handshake: asyncio.Future[None] = loop.create_future()
-        self._loop = loop
+        self._loop = asyncio.get_running_loop()
+        #: The end of the handshake, and why it failed if it did.
+        self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
         self._protocol = protocol
         self._incoming = ssl.MemoryBIO()
         self._outgoing = ssl.MemoryBIO()
@@ -94,6 +89,18 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
         self._error: Exception | None = None
         self._deadline: asyncio.TimerHandle | None = None
 
+    async def shake_hands(self, connection: socket.socket, timeout: float) -> Exception | None:
+        """Begin, on an accepted connection; returns why that failed if it did, see `accept`."""
+        await self._loop.connect_accepted_socket(lambda: self, connection)
+        try:
+            return await asyncio.wait_for(self._handshake, timeout)
+        except asyncio.TimeoutError:
+            self.abort()
+            return asyncio.TimeoutError(f"no handshake within {timeout:g} s")
+        except BaseException:
+            self.abort()
+            raise
+
     # --- the protocol of the TCP connection ----------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -104,44 +111,37 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
         """Hand on what a chunk from the network says."""
         if not self._open:
             if not self._connected:
-                self._shake_hands(data)
+                self._handshake_received(data)
             return
-        if len(data) <= RECORD_SIZE:
+        parts: list[bytes] = []
+        if len(data) <= PIECE:
             self._incoming.write(data)
-            plain = self._read()
+            self._read(parts)
         else:
-            parts = []
-            for start in range(0, len(data), RECORD_SIZE):
-                self._incoming.write(data[start : start + RECORD_SIZE])
-                parts.append(self._read())
+            view = memoryview(data)
+            for start in range(0, len(view), PIECE):
+                self._incoming.write(view[start : start + PIECE])
+                self._read(parts)
                 if self._ended:
                     break
-            plain = b"".join(parts)
-        if plain:
-            self._protocol.data_received(plain)
+        if parts:
+            self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
         if self._ended or self._outgoing.pending:
             self._react()
 
-    def _read(self) -> bytes:
-        """The plaintext of the records that are complete; `_ended` when none can follow them."""
-        parts: list[bytes] = []
+    def _read(self, parts: list[bytes]) -> None:
+        """Append the plaintext of complete records; `_ended` when none can follow them."""
         try:
-            part = self._tls.read(RECORD_SIZE)
-            if part and not self._incoming.pending:
-                return part  # one record: most chunks
-            while part:
+            while part := self._tls.read(RECORD_SIZE):
                 parts.append(part)
-                if not self._incoming.pending:
-                    break
-                part = self._tls.read(RECORD_SIZE)
-            else:  # close_notify
-                self._ended = True
+                if not self._incoming.pending:  # not to be told so by an exception
+                    return
+            self._ended = True  # by a close_notify
         except ssl.SSLWantReadError:
             pass
         except ssl.SSLError as error:
             self._ended = True
-            self._error = error
-        return b"".join(parts)
+            self._error = error.with_traceback(None)
 
     def _react(self) -> None:
         """Send what reading has caused, such as an alert, and close a connection that has ended."""
@@ -158,9 +158,9 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
         else:
             self._flush()
 
-    def _shake_hands(self, data: bytes) -> None:
-        for start in range(0, len(data), RECORD_SIZE):
-            self._incoming.write(data[start : start + RECORD_SIZE])
+    def _handshake_received(self, data: bytes) -> None:
+        for start in range(0, len(data), PIECE):
+            self._incoming.write(data[start : start + PIECE])
             try:
                 self._tls.do_handshake()
             except ssl.SSLWantReadError:
@@ -168,15 +168,15 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
             except ssl.SSLError as error:
                 self._flush()  # the alert that tells the client
                 self._tcp.close()
-                if not self.handshake.done():
-                    self.handshake.set_exception(error)
+                if not self._handshake.done():
+                    self._handshake.set_result(error.with_traceback(None))
                 return
             self._flush()
             self._connected = self._open = True
-            if not self.handshake.done():
-                self.handshake.set_result(None)
+            if not self._handshake.done():
+                self._handshake.set_result(None)
             self._protocol.connection_made(self)
-            rest = data[start + RECORD_SIZE :]
+            rest = data[start + PIECE :]
             if rest or self._incoming.pending:
                 self.data_received(rest)
             return
@@ -192,10 +192,9 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
         self._open = False
         if self._deadline is not None:
             self._deadline.cancel()
-        if not self.handshake.done():
+        if not self._handshake.done():
             error = ConnectionResetError("it hung up before the end of the handshake")
-            self.handshake.set_exception(exc or error)
-        # Two objects that hold each other would keep OpenSSL's memory until they are found.
+            self._handshake.set_result(exc or error)
         protocol, self._protocol = self._protocol, _NOBODY
         if self._connected:
             protocol.connection_lost(exc or self._error)
@@ -217,18 +216,18 @@ class TlsTransport(asyncio.Transport, asyncio.Protocol):
         if not self._open:
             return
         try:
-            if len(data) <= RECORD_SIZE:
+            if len(data) <= PIECE:
                 self._tls.write(data)
                 self._tcp.write(self._outgoing.read())
             else:
-                view, records = memoryview(data), []
-                for start in range(0, len(view), RECORD_SIZE):
-                    self._tls.write(view[start : start + RECORD_SIZE])
-                    records.append(self._outgoing.read())
-                self._tcp.write(b"".join(records))
+                view, sealed = memoryview(data), []
+                for start in range(0, len(view), PIECE):
+                    self._tls.write(view[start : start + PIECE])
+                    sealed.append(self._outgoing.read())
+                self._tcp.write(b"".join(sealed))
         except ssl.SSLError as error:
             # It must not reach the one whose message this is.
-            self._error = error
+            self._error = error.with_traceback(None)
             self.abort()
 
     def _flush(self) -> None:

@@ -292,7 +292,7 @@ def noise(size: int, seed: int = 1) -> bytes:
 # --- data --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [1, RECORD_SIZE, RECORD_SIZE + 1, 3 * MIB + 7])
+@pytest.mark.parametrize("size", [1, RECORD_SIZE, RECORD_SIZE + 1, tls.PIECE + 1, 3 * MIB + 7])
 async def test_what_is_said_comes_back(house: House, size):
     caller, served = await house.join(echo)
     data = noise(size)
@@ -684,23 +684,57 @@ async def test_a_failing_write_ends_its_own_connection_only(house: House, monkey
     assert isinstance(served.error, ssl.SSLError)
 
 
-async def test_the_memory_of_a_connection_is_free_at_once(house: House):
-    """And not only when garbage is looked for, or when the time to read the last bytes is over."""
-    caller, served = await house.join(receive_buffer=8192)
-    served.transport.write(bytes(4 * MIB))
-    served.transport.close()
-    deadline = served.transport._deadline
-    memory = weakref.ref(served.transport.get_extra_info("ssl_object"))
-    assert memory() and not deadline.cancelled()
+ENDS = ["hung up", "never", "not TLS", "cancelled", "goodbye", "eof", "reset", "broken"]
+
+
+@pytest.mark.parametrize("end", [*ENDS, "closed", "closed unread", "aborted"])
+async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypatch, end):
+    """However it ends, not only when garbage is looked for, which may never find it."""
+    transports = []
+
+    class Watched(TlsTransport):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            transports.append(weakref.ref(self))
+
+    monkeypatch.setattr(tls, "TlsTransport", Watched)
+    caller, accepted = await house.dial(receive_buffer=8192)
+
+    async def serve(timeout: float) -> None:
+        served = Served()
+        with contextlib.suppress(OSError, asyncio.TimeoutError):
+            await tls.accept(accepted, house.server, served, timeout)
+            if end.startswith("closed"):
+                served.transport.write(bytes(4 * MIB if end == "closed unread" else 10))
+                served.transport.close()
+            elif end == "aborted":
+                served.transport.abort()
+            await served.ended()
+
     gc.disable()
     try:
-        caller.reset()
-        await served.ended()
-        house.all.remove(served)
-        del served
+        serving = asyncio.ensure_future(serve(0.05 if end == "never" else PATIENCE))
         await turns()
-        assert memory() is None
-        assert deadline.cancelled()
+        if end == "not TLS":
+            await caller.put(b"GET / HTTP/1.1\r\n\r\n")
+        elif end == "cancelled":
+            serving.cancel()
+        elif end != "hung up" and end != "never":
+            await caller.shake_hands()
+        if end == "goodbye":
+            await caller.put(caller.seal_end())
+        elif end == "eof":
+            caller.sock.shutdown(socket.SHUT_WR)
+        elif end == "broken":
+            await caller.put(b"\x17\x03\x03\x00\x20" + bytes(32))
+        elif end in {"hung up", "reset", "closed unread"}:
+            await turns()
+            caller.reset()
+        with contextlib.suppress(asyncio.CancelledError):
+            await serving
+        del serving
+        accepted.close()
+        await until(lambda: transports[0]() is None)
     finally:
         gc.enable()
 
@@ -837,11 +871,10 @@ class Network:
 )
 async def test_any_split_of_the_bytes_says_the_same(server, client, sizes, cuts, hello_cuts, flip):
     """Handshake included; a flipped bit ends it where it is, whatever was in the same chunk."""
-    loop = asyncio.get_running_loop()
     seen = []
     for split in (False, True):
         served, network = Served(), Network()
-        transport = TlsTransport(served, server, loop)
+        transport = TlsTransport(served, server)
         transport.connection_made(network)  # type: ignore[arg-type]
         with socket.socket() as unused:
             caller = Caller(unused, client)
@@ -850,7 +883,7 @@ async def test_any_split_of_the_bytes_says_the_same(server, client, sizes, cuts,
                 transport.data_received(chunk)
             caller._incoming.write(bytes(network.sent))
             network.sent.clear()
-        assert transport.handshake.done() and served.heard == ["made"]
+        assert served.heard == ["made"]
         transport.write(b"")
         assert not network.sent
         records = [caller.seal(noise(size, n)) for n, size in enumerate(sizes) if size]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
+from appliance.mqtt.codec import quote
 from appliance.mqtt.reason import ReasonCode
 
 from .acl import Acl
@@ -113,7 +114,7 @@ class FileAccess:
                 return Identity(None, client_id)
             return Refusal(ReasonCode.NOT_AUTHORIZED, "no user name, and anonymous is off")
         if password is None:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, f"no password for user {username!r}")
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"no password for user {quote(username)}")
         login = self._login(username, password)
         while True:
             passwords = self._passwords
@@ -137,7 +138,7 @@ class FileAccess:
             if right is not None:
                 return Identity(username, client_id)
             what = "unknown user" if stored is None else "wrong password for user"
-            return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {username!r}")
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {quote(username)}")
 
     def _check(
         self, login: bytes, username: str, password: bytes

@@ -385,12 +385,12 @@ def _decode_property(
     if kind is Kind.STRING_PAIR:
         name, pos = decode_string(buf, pos)
         text, pos = decode_string(buf, pos)
-        if len(cast("list[object]", properties.get(identifier, ()))) >= MAXIMUM_PAIRS:
+        # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
+        pairs = cast("list[tuple[str, str]]", properties.setdefault(identifier, []))
+        if len(pairs) >= MAXIMUM_PAIRS:
             raise ProtocolError(
                 ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_PAIRS} User Properties"
             )
-        # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
-        pairs = cast("list[tuple[str, str]]", properties.setdefault(identifier, []))
         pairs.append((name, text))
         return pos
     if kind is Kind.STRING:

@@ -244,6 +244,9 @@ class _TopicNode(Generic[V]):
         self.entry: tuple[str, V] | None = None
         self.listing: tuple[_TopicNode[V], ...] | None = None
 
+    def is_empty(self) -> bool:
+        return self.entry is None and not self.children
+
 
 class TopicTree(Generic[V]):
     """Topics, each with one value, found by a filter: what retained messages need.
@@ -295,7 +298,7 @@ class TopicTree(Generic[V]):
             return False
         node.entry = None
         self._size -= 1
-        while path and node.entry is None and not node.children:
+        while path and node.is_empty():
             node, level = path.pop()
             del node.children[level]
             node.listing = None
@@ -307,7 +310,9 @@ class TopicTree(Generic[V]):
         The tree may change between two of them; it is then open whether what was set or deleted
         meanwhile is in the rest.
         """
-        return (found for found in self.find_in_steps(filter) if found is not None)
+        for found in self.find_in_steps(filter):
+            if found is not None:
+                yield found
 
     def find_in_steps(self, filter: str) -> Iterator[tuple[str, V] | None]:
         """`find`, with a None now and then, so that a long search can be put off in its middle."""

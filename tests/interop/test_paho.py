@@ -399,9 +399,7 @@ def test_connack_tells_what_holds(appliance: ApplianceProcess) -> None:
     assert told == {
         "SessionExpiryInterval": 7 * 24 * 3600,
         "ReceiveMaximum": 20,
-        "MaximumPacketSize": 16 << 20,
         "TopicAliasMaximum": 10,
-        "SharedSubscriptionAvailable": 0,
     }
 
 

@@ -51,8 +51,9 @@ class Ping:
     """A PINGREQ, and what the broker has seen for certain when its answer is there."""
 
     sent_at: float
-    #: The client does not read, so that the time to the answer says nothing.
-    paused: bool
+    #: How often the client had stopped to read; None when it did not read. If it does so before
+    #: the answer, the time to it says nothing.
+    pauses: int | None
     acknowledged: Acknowledged
     messages: list[Message]
 
@@ -375,7 +376,8 @@ class Client:
         now = self.model.clock()
         acknowledged = self.inbox.take_acknowledged()
         messages = self.outbox.take_unanswered()
-        self._pings.append(Ping(now, self.wire.paused, acknowledged, messages))
+        pauses = None if self.wire.paused else self.wire.pauses
+        self._pings.append(Ping(now, pauses, acknowledged, messages))
         self.send(Pingreq())
 
     # --- receiving -----------------------------------------------------------------------------
@@ -427,7 +429,7 @@ class Client:
             return
         ping = self._pings.popleft()
         assert self.wire is not None
-        if not ping.paused and not self.wire.paused:
+        if ping.pauses == self.wire.pauses:
             self.round_trips.append(self.model.clock() - ping.sent_at)
         # The broker has read what was sent before: from here on none of it may be repeated.
         self.inbox.confirm(ping.acknowledged)

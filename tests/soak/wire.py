@@ -97,6 +97,8 @@ class Wire(asyncio.Protocol):
     def __init__(self, owner: Owner) -> None:
         self.owner = owner
         self.paused = False
+        #: How often it was paused.
+        self.pauses = 0
         #: Why the broker says that it ends the connection.
         self.reason: ReasonCode | None = None
         self.closed = asyncio.Event()
@@ -162,6 +164,7 @@ class Wire(asyncio.Protocol):
         """Read nothing until `resume`."""
         if not self.paused and self._transport is not None and not self._transport.is_closing():
             self.paused = True
+            self.pauses += 1
             self._transport.pause_reading()
 
     def resume(self) -> None:
