@@ -690,18 +690,19 @@ ENDS = ["hung up", "never", "not TLS", "cancelled", "goodbye", "eof", "reset", "
 @pytest.mark.parametrize("end", [*ENDS, "closed", "closed unread", "aborted"])
 async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypatch, end):
     """However it ends, not only when garbage is looked for, which may never find it."""
-    transports = []
+    both_ends: list[weakref.ref[object]] = []
 
     class Watched(TlsTransport):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments)
-            transports.append(weakref.ref(self))
+            both_ends.append(weakref.ref(self))
 
     monkeypatch.setattr(tls, "TlsTransport", Watched)
     caller, accepted = await house.dial(receive_buffer=8192)
 
     async def serve(timeout: float) -> None:
         served = Served()
+        both_ends.append(weakref.ref(served))
         with contextlib.suppress(OSError, asyncio.TimeoutError):
             await tls.accept(accepted, house.server, served, timeout)
             if end.startswith("closed"):
@@ -710,6 +711,7 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
             elif end == "aborted":
                 served.transport.abort()
             await served.ended()
+            served.transport = None
 
     gc.disable()
     try:
@@ -734,7 +736,7 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
             await serving
         del serving
         accepted.close()
-        await until(lambda: transports[0]() is None)
+        await until(lambda: not any(end() for end in both_ends))
     finally:
         gc.enable()
 
