@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 from websockets.exceptions import NegotiationError, PayloadTooBig
 from websockets.frames import CloseCode, Frame, Opcode
@@ -32,22 +31,36 @@ _library_log = logging.getLogger(f"{__name__}.frames")
 _library_log.setLevel(logging.ERROR)
 
 
-class Upper(asyncio.Protocol, ABC):
-    """What can be above a WebSocket: a protocol that answers for the connection."""
+class Upper(Protocol):
+    """What can be above a WebSocket: an `asyncio.Protocol` that answers for the connection."""
 
-    @abstractmethod
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """As asyncio tells it."""
+
+    def data_received(self, data: bytes) -> None:
+        """As asyncio tells it."""
+
+    def eof_received(self) -> bool | None:
+        """As asyncio tells it."""
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """As asyncio tells it."""
+
+    def pause_writing(self) -> None:
+        """As asyncio tells it."""
+
+    def resume_writing(self) -> None:
+        """As asyncio tells it."""
+
     def frame_limit(self) -> int:
         """How large a frame may be that is received now, in bytes."""
 
-    @abstractmethod
     def keep(self, size: int) -> None:
         """So many bytes of a frame are kept until it is complete."""
 
-    @abstractmethod
     def complain(self, what: str, why: str) -> None:
         """Tell the log what was refused or ended."""
 
-    @abstractmethod
     def close(self) -> None:
         """Close the connection: what is below was told why."""
 

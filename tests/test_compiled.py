@@ -1,0 +1,66 @@
+"""The optional compiled build: it is made as a user makes it, and passes the broker's own tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+#: The tests of what is compiled, as far as they run in their own process.
+TESTS = ["tests/broker", "tests/mqtt", "tests/test_tls.py", "tests/test_websocket.py"]
+
+#: Prints where two of the compiled modules come from.
+WHERE = "from appliance import wire; from appliance.broker import client; print(wire, client)"
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the compiled package, out of its wheel."""
+    headers = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    if not (shutil.which("cc") and headers.exists()):
+        pytest.skip("needs a C compiler and Python's headers: apt install gcc python3-dev")
+    directory = tmp_path_factory.mktemp("compiled")
+    source = directory / "source"
+    # A copy: building leaves files behind.
+    shutil.copytree(ROOT / "appliance", source / "appliance")
+    for name in ("setup.py", "pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps"]
+    subprocess.run(
+        [*pip, "--use-pep517", "--disable-pip-version-check", "-w", str(directory), str(source)],
+        env={**os.environ, "APPLIANCE_COMPILE": "1"},
+        check=True,
+        timeout=500,
+    )
+    (wheel,) = directory.glob("*.whl")
+    package = directory / "package"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(package)
+    return package
+
+
+@pytest.mark.timeout(900)
+def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
+    environment = {**os.environ, "PYTHONPATH": str(compiled)}
+    where = [sys.executable, "-c", WHERE]
+    used = subprocess.run(where, env=environment, cwd=compiled, check=True, capture_output=True)
+    assert used.stdout.count(b".so") == 2
+    pytest_command = Path(sys.executable).with_name("pytest")  # `-m pytest` would import from here
+    run = subprocess.run(
+        [str(pytest_command), "-q", "-x", "-p", "no:cacheprovider", *TESTS],
+        env=environment,
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    assert run.returncode == 0, run.stdout[-4000:]
+    assert " passed" in run.stdout or "[100%]" in run.stdout
