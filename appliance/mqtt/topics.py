@@ -115,20 +115,6 @@ def overlaps(a: str, b: str) -> bool:
     return all(x == y or "+" in (x, y) for x, y in zip(levels_a, levels_b, strict=False))
 
 
-def covers(a: str, b: str) -> bool:
-    """Whether filter `a` matches every topic that filter `b` matches, both valid."""
-    if _dollar_apart(a, b):
-        return False
-    levels_a, open_a = _shape(a)
-    levels_b, open_b = _shape(b)
-    if open_a:
-        if len(levels_a) > len(levels_b):
-            return False
-    elif open_b or len(levels_a) != len(levels_b):
-        return False
-    return all(x in ("+", y) for x, y in zip(levels_a, levels_b, strict=False))
-
-
 def _dollar_apart(wild: str, other: str) -> bool:
     """`wild` begins with a wildcard and `other` with `$`: they share no topic [MQTT-4.7.2-1]."""
     return wild[:1] in ("+", "#") and other[:1] == "$"

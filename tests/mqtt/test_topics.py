@@ -12,7 +12,6 @@ from appliance.mqtt.topics import (
     TopicTree,
     check_filter,
     check_topic,
-    covers,
     matches,
     overlaps,
     parse_shared,
@@ -196,36 +195,32 @@ def test_matches_as_the_naive_one(matched):
         assert fast == matched[topic_filter], topic_filter
 
 
-def test_overlaps_and_covers_as_the_naive_ones(matched):
+def test_overlaps_as_the_naive_one(matched):
     for a, b in product(FILTERS, FILTERS):
         assert overlaps(a, b) is bool(matched[a] & matched[b]), (a, b)
-        assert covers(a, b) is not bool(matched[b] & ~matched[a]), (a, b)
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "overlap", "cover"),
+    ("a", "b", "overlap"),
     [
-        ("#", "$SYS/#", False, False),
-        ("+/x", "$SYS/x", False, False),
-        ("$SYS/#", "$SYS/+/x", True, True),
-        ("a/#", "a", True, True),
-        ("a/+", "a/#", True, False),
-        ("+/#", "#", True, True),
-        ("/+/#", "/#", True, True),
-        ("+", "/#", False, False),
-        ("a/+/c", "+/b/+", True, False),
-        ("a/b", "a/c", False, False),
+        ("#", "$SYS/#", False),
+        ("+/x", "$SYS/x", False),
+        ("$SYS/#", "$SYS/+/x", True),
+        ("a/#", "a", True),
+        ("a/+", "a/#", True),
+        ("+/#", "#", True),
+        ("/+/#", "/#", True),
+        ("+", "/#", False),
+        ("a/+/c", "+/b/+", True),
+        ("a/b", "a/c", False),
     ],
 )
-def test_overlaps_and_covers(a, b, overlap, cover):
+def test_overlaps(a, b, overlap):
     assert overlaps(a, b) is overlaps(b, a) is overlap
-    assert covers(a, b) is cover
 
 
-def test_overlaps_and_covers_at_any_depth():
+def test_overlaps_at_any_depth():
     assert overlaps(DEEP, "#")
-    assert covers("#", DEEP)
-    assert not covers(DEEP, "#")
 
 
 def test_subscription_tree():
