@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -97,43 +98,79 @@ class Bridge:
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(lambda name: describe(node.load(name), node.load))
+        #: Replaced as one by the loop's thread; the ROS thread follows at its next look.
         self._routes: list[_Route] = []
-        #: By what they carry; only the ROS thread adds and removes, once it runs.
-        self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
-        self._to_ros: dict[tuple[str, str], ToRos] = {}
-        #: The same by MQTT topic, for the loop's thread.
-        self._receivers: dict[str, list[ToRos]] = {}
+        self._followed: list[_Route] | None = None
         #: Topics that have a route by name, which goes before patterns.
         self._named: set[str] = set()
+        #: By what they carry. The first belongs to the ROS thread, the second to the loop's thread,
+        #: which replaces it as one and leaves to the ROS thread what is to be closed.
+        self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
+        self._to_ros: dict[tuple[str, str], ToRos] = {}
+        self._leaving: deque[ToRos] = deque()
+        #: Those to ROS by MQTT topic.
+        self._receivers: dict[str, list[ToRos]] = {}
         self._looks = 0
+        self.replace(routes)
+
+    def replace(self, routes: Iterable[RouteSettings]) -> None:
+        """Carry these routes from now on; one that was there before does not notice.
+
+        Raises ValueError for a pattern in a route to ROS; nothing has changed then.
+        """
+        known = {(route.settings, route.direction): route for route in self._routes}
+        wanted: list[_Route] = []
         for settings in routes:
-            self._add(settings)
+            pattern = settings.pattern()
+            if pattern is not None and settings.to != "mqtt":
+                raise ValueError(f"{settings.ros}: a pattern can only go to MQTT")
+            if settings.to != "mqtt":
+                route = _Route(settings, "to_ros", Counters())
+                wanted.append(known.get((settings, "to_ros"), route))
+            if settings.to != "ros":
+                route = _Route(settings, "to_mqtt", Counters(), pattern)
+                wanted.append(known.get((settings, "to_mqtt"), route))
+        self._receive_for([route for route in wanted if route.direction == "to_ros"])
+        self._named = {
+            route.settings.ros
+            for route in wanted
+            if route.direction == "to_mqtt" and route.pattern is None
+        }
+        self._routes = wanted
 
-    def _add(self, settings: RouteSettings) -> None:
-        pattern = settings.pattern()
-        if pattern is not None and settings.to != "mqtt":
-            raise ValueError(f"{settings.ros}: a pattern can only go to MQTT")
-        if settings.to != "mqtt":
-            route = _Route(settings, "to_ros", Counters())
-            self._routes.append(route)
-            self._add_to_ros(route)
-        if settings.to != "ros":
-            route = _Route(settings, "to_mqtt", Counters(), pattern)
-            self._routes.append(route)
-            if pattern is None:
-                self._named.add(settings.ros)
-                self._add_to_mqtt(route, settings.ros)
+    def _receive_for(self, routes: Sequence[_Route]) -> None:
+        flows: dict[tuple[str, str], ToRos] = {}
+        for route in routes:
+            settings = route.settings
+            flow = ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
+            key = flow.ros, flow.mqtt
+            before = self._to_ros.get(key)
+            if key in flows:
+                log.warning("%s has a route already; the later one is left out", flow)
+            elif before is not None and before.counters is route.counters:
+                flows[key] = before
+            else:
+                flows[key] = flow
+        self._leaving.extend(flow for key, flow in self._to_ros.items() if flows.get(key) != flow)
+        self._to_ros = flows
+        receivers: dict[str, list[ToRos]] = {}
+        for flow in flows.values():
+            receivers.setdefault(flow.mqtt, []).append(flow)
+        before_topics, self._receivers = self._receivers.keys(), receivers
+        self._subscribe(receivers.keys() - before_topics, before_topics - receivers.keys())
 
-    def _add_to_ros(self, route: _Route) -> None:
-        settings = route.settings
-        flow = ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
-        key = flow.ros, flow.mqtt
-        if key in self._to_ros:
-            log.warning("%s has a route already; the later one is left out", flow)
+    def _subscribe(self, topics: Iterable[str], no_longer: Iterable[str] = ()) -> None:
+        if self._session is None:
             return
-        self._to_ros[key] = flow
-        self._receivers.setdefault(flow.mqtt, []).append(flow)
-        self._pair(key)
+        for topic in topics:
+            # No Local stops the echo on a topic that is bridged both ways. A retained message may
+            # be an old command: it does not reach ROS. QoS 0 loses nothing here, as the link takes
+            # each message at once.
+            self._broker.subscribe(
+                self._session, Subscription(topic, 0, no_local=True, retain_handling=2)
+            )
+        for topic in no_longer:
+            self._broker.unsubscribe(self._session, topic)
 
     def _add_to_mqtt(self, route: _Route, ros: str) -> None:
         flow = ToMqtt(
@@ -141,7 +178,8 @@ class Bridge:
         )
         key = flow.ros, flow.mqtt
         if key in self._to_mqtt:
-            log.warning("%s has a route already; the later one is left out", flow)
+            text = "%s has a route already; the later one is left out"
+            self._tell(logging.WARNING, text, flow)
             return
         self._to_mqtt[key] = flow
         self._pair(key)
@@ -149,7 +187,7 @@ class Bridge:
     def _pair(self, key: tuple[str, str]) -> None:
         """Let the two flows of a topic that goes both ways know their echo."""
         there, back = self._to_mqtt.get(key), self._to_ros.get(key)
-        if there is not None and back is not None:
+        if there is not None and back is not None and (back.echo is None or there.echo is None):
             there.echo = back.echo = Echo()
 
     # The loop's thread
@@ -157,13 +195,7 @@ class Bridge:
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
         self._session = self._broker.attach(CLIENT_ID, _Link(self._receive))
-        for topic in self._receivers:
-            # No Local stops the echo on a topic that is bridged both ways. A retained message may
-            # be an old command: it does not reach ROS. QoS 0 loses nothing here, as the link takes
-            # each message at once.
-            self._broker.subscribe(
-                self._session, Subscription(topic, 0, no_local=True, retain_handling=2)
-            )
+        self._subscribe(self._receivers)
         self._announce(())
         self._node.start(self._look, self._failed)
 
@@ -264,12 +296,37 @@ class Bridge:
             self._tell(logging.INFO, "on ROS as %s", self._node.name)
         is_thorough = self._looks % THOROUGH_LOOK == 0
         self._looks += 1
+        has_changed = self._follow_routes()
         self._match_patterns()
-        has_changed = False
         for flow in self._flows():
             has_changed |= flow.look(self._node, is_thorough)
         if has_changed:
             self._post(self._announce, self._bridged())
+
+    def _follow_routes(self) -> bool:
+        """Begin and end flows as the routes have changed; True when what is bridged has changed."""
+        routes = self._routes
+        if routes is self._followed:
+            return False
+        self._followed = routes
+        has_changed = False
+        while self._leaving:
+            has_changed = True
+            self._leaving.popleft().close()
+        kept = {id(route.counters) for route in routes}
+        for key, flow in list(self._to_mqtt.items()):
+            if id(flow.counters) not in kept or (flow.is_matched and flow.ros in self._named):
+                has_changed = True
+                flow.close()
+                del self._to_mqtt[key]
+        there = {id(flow.counters) for flow in self._to_mqtt.values()}
+        for route in routes:
+            is_named = route.direction == "to_mqtt" and route.pattern is None
+            if is_named and id(route.counters) not in there:
+                self._add_to_mqtt(route, route.settings.ros)
+        for key in self._to_ros:
+            self._pair(key)
+        return has_changed
 
     def _match_patterns(self) -> None:
         """Begin flows for topics that have come, end those of topics that have gone."""

@@ -544,7 +544,94 @@ async def test_what_waits_at_the_stop_still_arrives(house):
 async def test_the_same_route_twice_is_told_and_left_out(house, caplog):
     house.start(both("/a", type=STRING), both("/a", type=STRING))
     assert len(house.node.subscriptions) == len(house.node.own_publishers) == 1
+    await house.settle()
     assert len([r for r in caplog.records if "already" in r.getMessage()]) == 2
+
+
+# Routes that change while they run
+
+
+async def test_routes_are_replaced_and_those_that_stay_do_not_notice(house):
+    bridge = house.start(to_mqtt("/stay"), to_mqtt("/go"), to_ros("/left", type=STRING))
+    stay = house.node.add_publisher("/stay", STRING)
+    go = house.node.add_publisher("/go", STRING)
+    new = house.node.add_publisher("/new", STRING)
+    subscription = next(s for s in house.node.subscriptions if s.topic == "/stay")
+    stay.publish(string("1"))
+    bridge.replace([to_mqtt("/stay"), to_mqtt("/new"), to_ros("/came", type=STRING)])
+    house.node.spin()
+    await house.settle()
+    assert subscription in house.node.subscriptions
+    for publisher in (stay, go, new):
+        publisher.publish(string("2"))
+    await house.settle()
+    assert house.client.payloads("r2d2/stay") == [b'{"data":"1"}', b'{"data":"2"}']
+    assert house.client.payloads("r2d2/go") == []
+    assert house.client.payloads("r2d2/new") == [b'{"data":"2"}']
+    assert [p.topic for p in house.node.own_publishers] == ["/came"]
+    assert {route["ros"] for route in house.routes()} == {"/stay", "/new", "/came"}
+    house.client.send("r2d2/left", b'{"data":"x"}')
+    house.client.send("r2d2/came", b'{"data":"y"}')
+    counts = {s.settings.ros: s.messages for s in bridge.status()}
+    assert counts == {"/stay": 2, "/new": 1, "/came": 1}
+    assert set(house.broker.sessions["_bridge"].subscriptions) == {"r2d2/came"}
+
+
+async def test_a_route_with_other_settings_takes_the_place_of_the_one_before(house):
+    bridge = house.start(to_mqtt("/a"))
+    publisher = house.node.add_publisher("/a", STRING)
+    house.node.spin()
+    bridge.replace([to_mqtt("/a", mqtt="elsewhere/a", encoding="text")])
+    house.node.spin()
+    house.client.subscribe("elsewhere/#")
+    publisher.publish(string("x"))
+    await house.settle()
+    assert len(house.node.subscriptions) == 1
+    assert house.client.payloads("r2d2/a") == []
+    assert house.client.payloads("elsewhere/a") == [b"x"]
+
+
+async def test_a_pattern_gives_way_to_a_name_and_takes_over_again(house):
+    bridge = house.start(to_mqtt("/cam/**"))
+    publisher = house.node.add_publisher("/cam/raw", STRING)
+    house.node.spin()
+    bridge.replace([to_mqtt("/cam/**"), to_mqtt("/cam/raw", mqtt="named")])
+    house.node.spin()
+    house.client.subscribe("named")
+    publisher.publish(string("1"))
+    await house.settle()
+    bridge.replace([to_mqtt("/cam/**")])
+    house.node.spin()
+    publisher.publish(string("2"))
+    await house.settle()
+    assert house.client.payloads("named") == [b'{"data":"1"}']
+    assert house.client.payloads("r2d2/cam/raw") == [b'{"data":"2"}']
+    bridge.replace([])
+    house.node.spin()
+    await house.settle()
+    assert house.node.subscriptions == []
+    assert house.routes() == []
+
+
+async def test_a_wrong_route_changes_nothing(house):
+    bridge = house.start(to_mqtt("/a"))
+    publisher = house.node.add_publisher("/a", STRING)
+    with pytest.raises(ValueError, match="pattern"):
+        bridge.replace([to_ros("/b/**")])
+    house.node.spin()
+    publisher.publish(string("x"))
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"x"}']
+
+
+async def test_an_echo_is_known_also_when_one_way_came_later(house):
+    bridge = house.start(to_mqtt("/a"))
+    house.node.add_publisher("/a", STRING)
+    bridge.replace([both("/a", type=STRING)])
+    house.node.spin()
+    house.client.send("r2d2/a", b'{"data":"x"}')
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"x"}']
 
 
 def test_a_closed_loop_is_no_error():
