@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import logging
 import math
-import os
-import resource
 import socket
 import ssl
-import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +16,13 @@ from typing import Literal, cast
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
+from appliance.sockets import allow_files, listen, listen_on_path
 from appliance.wire import FAREWELLS, Authenticate, ClientProtocol, Network
 
 log = logging.getLogger(__name__)
 
-#: Connections that wait to be accepted, as far as the system allows, and that are accepted in one
-#: go: a TLS handshake takes a millisecond, and other clients want their turn.
-BACKLOG = 4096
+#: Connections that are accepted in one go: a TLS handshake takes a millisecond, and other clients
+#: want their turn.
 ACCEPTED_A_TURN = 16
 
 #: Seconds until connections are accepted again after the system refused one.
@@ -108,7 +104,7 @@ class Listeners:
             OSError: an address cannot be listened on; nothing is left listening.
         """
         addresses: list[tuple[str, int]] = []
-        _allow_files(self.connections + OTHER_FILES)
+        allow_files(self.connections + OTHER_FILES)
         try:
             for listener in settings:
                 door = _Door(self, listener)
@@ -207,11 +203,11 @@ class _Door:
         self._loop = asyncio.get_running_loop()
         self._is_open = False
         if settings.path is not None:
-            self._socket = _listen_on_path(settings.path, settings.mode)
+            self._socket = listen_on_path(settings.path, settings.mode)
             self._inode = settings.path.stat().st_ino
             self.address = (f"unix:{settings.path}", 0)
         else:
-            self._socket = _listen(settings.host, settings.port)
+            self._socket = listen(settings.host, settings.port)
             self.address = (settings.host, self._socket.getsockname()[1])
 
     def open(self) -> None:
@@ -309,60 +305,6 @@ class _Addresses:
         self._many = max(ADDRESSES, 2 * len(self._known))
 
 
-def _listen(host: str, port: int) -> socket.socket:
-    """A listening socket; an empty host is every address, IPv6 ones too where there are any."""
-    everywhere = not host
-    dualstack = everywhere and socket.has_dualstack_ipv6()
-    family = socket.AF_INET6 if ":" in host or dualstack else socket.AF_INET
-    try:
-        sock = socket.create_server(
-            (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
-        )
-    except OSError as error:
-        raise _cannot_listen(f"{host or '*'}:{port}", error) from None
-    sock.setblocking(False)
-    return sock
-
-
-def _listen_on_path(path: Path, mode: int) -> socket.socket:
-    """A listening Unix socket, in place of one that nobody listens on any more."""
-    sock = socket.socket(socket.AF_UNIX)
-    try:
-        sock.setblocking(False)
-        _clear(path)
-        os.fchmod(sock.fileno(), mode)  # before it has a name: it is at no time open to more
-        sock.bind(str(path))
-        path.chmod(mode)  # what the process's umask has taken away
-        sock.listen(BACKLOG)
-    except OSError as error:
-        sock.close()
-        raise _cannot_listen(f"unix:{path}", error) from None
-    return sock
-
-
-def _clear(path: Path) -> None:
-    """Remove what an appliance that did not end well has left. OSError: it is something else."""
-    try:
-        if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise FileExistsError(errno.EEXIST, "there is a file that is no socket")
-        with socket.socket(socket.AF_UNIX) as trial:
-            trial.setblocking(False)
-            trial.connect(str(path))
-    except FileNotFoundError:
-        return
-    except ConnectionRefusedError:
-        path.unlink(missing_ok=True)
-        return
-    except BlockingIOError:  # so many wait there that one more does not fit
-        pass
-    raise OSError(errno.EADDRINUSE, "another process listens there")
-
-
-def _cannot_listen(where: str, error: OSError) -> OSError:
-    reason = error.strerror or str(error)
-    return OSError(error.errno, f"cannot listen on {where} (broker.listeners): {reason}")
-
-
 def _network(host: str) -> bytes:
     """What counts as one address: one of IPv4; of IPv6 a network of 64 bits, as one site has."""
     if ":" not in host:
@@ -371,19 +313,3 @@ def _network(host: str) -> bytes:
     if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
         return packed[12:]
     return packed[:8]
-
-
-def _allow_files(needed: int) -> None:
-    """Let the process open so many files, as far as the system allows."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    most = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-    if most < needed:
-        log.warning(
-            "broker.limits.connections needs %d open files, and the system allows %d: raise its "
-            "limit (ulimit -Hn, or LimitNOFILE= of the systemd unit) or lower the number",
-            needed,
-            most,
-        )

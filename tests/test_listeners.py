@@ -19,7 +19,7 @@ import uvloop
 import yaml
 from house import PATIENCE, Caller, House, make_contexts, until
 
-from appliance import config, listeners, wire
+from appliance import config, listeners, sockets, wire
 from appliance.app import App
 from appliance.broker.ports import Limits
 from appliance.listeners import ListenerSettings
@@ -717,15 +717,15 @@ def test_files_that_may_be_open(monkeypatch, caplog):
     limits = [(1024, 4096)]
     monkeypatch.setattr(resource, "getrlimit", lambda what: limits[-1])
     monkeypatch.setattr(resource, "setrlimit", lambda what, pair: limits.append(pair))
-    listeners._allow_files(1000)
+    sockets.allow_files(1000)
     assert limits == [(1024, 4096)]
-    listeners._allow_files(2000)
+    sockets.allow_files(2000)
     assert limits[-1] == (2000, 4096) and not caplog.text
-    listeners._allow_files(10_000)
+    sockets.allow_files(10_000)
     assert limits[-1] == (4096, 4096)
     assert "needs 10000 open files, and the system allows 4096" in caplog.text
     limits.append((1024, resource.RLIM_INFINITY))
-    listeners._allow_files(10_000)
+    sockets.allow_files(10_000)
     assert limits[-1] == (10_000, resource.RLIM_INFINITY)
 
 

@@ -199,7 +199,11 @@ def test_what_is_wrong_with_the_arguments_is_told(
 @needs_mosquitto
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_it_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
-    code = "from appliance import bench; raise SystemExit(bench.main(None, 60.0, None, False))"
+    # A shell without job control lets what it starts in the background ignore SIGINT.
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from appliance import bench; raise SystemExit(bench.main(None, 60.0, None, False))"
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         env={**os.environ, "TMPDIR": str(tmp_path)},
@@ -394,7 +398,7 @@ class Pretender:
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.target = Target(port=self.listener.getsockname()[1])
-        self.pause = 0.0  # before the next PUBLISH is sent back
+        self.pauses: list[float] = []  # each before one PUBLISH is sent back
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
         self._threads[0].start()
 
@@ -425,8 +429,7 @@ class Pretender:
                     if data[0] == 0x82:
                         connection.sendall(b"\x90\x03\0\1\0")
                     else:
-                        time.sleep(self.pause)
-                        self.pause = 0.0
+                        time.sleep(self.pauses.pop() if self.pauses else 0)
                         connection.sendall(data)
 
     def close(self) -> None:
@@ -450,7 +453,7 @@ def test_the_probe_sees_how_long_a_broker_stands_still(
     with growth.probing(pretender.server(tmp_path)) as probe:
         time.sleep(0.1)
         assert 0 < probe.ask()["longest"] < 0.4
-        pretender.pause = 0.5
+        pretender.pauses.append(0.5)
         time.sleep(1.5)
         answer = probe.ask()
         assert 0.5 <= answer["longest"] < 5

@@ -1,0 +1,86 @@
+"""Listening sockets, of TCP and of Unix, and how many files the process may have open."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import resource
+import socket
+import stat
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+#: Connections that wait to be accepted, as far as the system allows.
+BACKLOG = 4096
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; an empty host is every address, IPv6 ones too where there are any."""
+    everywhere = not host
+    dualstack = everywhere and socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if ":" in host or dualstack else socket.AF_INET
+    try:
+        sock = socket.create_server(
+            (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
+        )
+    except OSError as error:
+        raise _cannot_listen(f"{host or '*'}:{port}", error) from None
+    sock.setblocking(False)
+    return sock
+
+
+def listen_on_path(path: Path, mode: int) -> socket.socket:
+    """A listening Unix socket, in place of one that nobody listens on any more."""
+    sock = socket.socket(socket.AF_UNIX)
+    try:
+        sock.setblocking(False)
+        _clear(path)
+        os.fchmod(sock.fileno(), mode)  # before it has a name: it is at no time open to more
+        sock.bind(str(path))
+        path.chmod(mode)  # what the process's umask has taken away
+        sock.listen(BACKLOG)
+    except OSError as error:
+        sock.close()
+        raise _cannot_listen(f"unix:{path}", error) from None
+    return sock
+
+
+def _clear(path: Path) -> None:
+    """Remove what an appliance that did not end well has left. OSError: it is something else."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise FileExistsError(errno.EEXIST, "there is a file that is no socket")
+        with socket.socket(socket.AF_UNIX) as trial:
+            trial.setblocking(False)
+            trial.connect(str(path))
+    except FileNotFoundError:
+        return
+    except ConnectionRefusedError:
+        path.unlink(missing_ok=True)
+        return
+    except BlockingIOError:  # so many wait there that one more does not fit
+        pass
+    raise OSError(errno.EADDRINUSE, "another process listens there")
+
+
+def _cannot_listen(where: str, error: OSError) -> OSError:
+    reason = error.strerror or str(error)
+    return OSError(error.errno, f"cannot listen on {where} (broker.listeners): {reason}")
+
+
+def allow_files(needed: int) -> None:
+    """Let the process open so many files, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    most = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    if most < needed:
+        log.warning(
+            "broker.limits.connections needs %d open files, and the system allows %d: raise its "
+            "limit (ulimit -Hn, or LimitNOFILE= of the systemd unit) or lower the number",
+            needed,
+            most,
+        )

@@ -1,0 +1,93 @@
+"""Commands to a running appliance, over its Unix socket."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from appliance import control
+from appliance.control import Control, ControlError, NotRunningError, ask
+
+
+async def answer():
+    return {"n": 1}
+
+
+async def refuse():
+    raise ControlError("the file is wrong")
+
+
+@pytest.fixture(params=["short", "long"])
+async def path(request, tmp_path: Path):
+    place = tmp_path / ("x" * 120 if request.param == "long" else "s")
+    place.mkdir()
+    path = place / "control.sock"
+    served = Control(path, {"answer": answer, "refuse": refuse})
+    await served.start()
+    yield path
+    await served.stop()
+    await served.stop()
+    assert not path.exists()
+
+
+async def test_a_command_is_answered(path):
+    assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+async def test_what_cannot_be_done_is_told(path):
+    with pytest.raises(ControlError, match="the file is wrong"):
+        await asyncio.to_thread(ask, path, "refuse")
+    with pytest.raises(ControlError, match="unknown command; there are answer, refuse"):
+        await asyncio.to_thread(ask, path, "dance")
+    assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
+
+
+@pytest.mark.parametrize(
+    "request_line", [b"\n", b"{}\n", b"[]\n", b'{"command": 1}\n', b"\xff\n", b"x" * 70000 + b"\n"]
+)
+async def test_bad_requests_are_answered_and_harm_nothing(path, request_line):
+    def talk() -> bytes:
+        with control._short(path) as short, socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(short))
+            connection.sendall(request_line)
+            return connection.makefile("rb").readline()
+
+    assert "error" in json.loads(await asyncio.to_thread(talk))
+    assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
+
+
+async def test_who_says_nothing_is_not_waited_for_for_ever(path, monkeypatch):
+    monkeypatch.setattr(control, "REQUEST_TIMEOUT", 0.1)
+
+    def wait() -> bytes:
+        with control._short(path) as short, socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(short))
+            return connection.makefile("rb").readline()
+
+    assert b"no request" in await asyncio.to_thread(wait)
+
+
+async def test_a_second_appliance_does_not_take_the_place_of_the_first(path):
+    with pytest.raises(OSError, match="another process listens"):
+        await Control(path, {}).start()
+    assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
+
+
+async def test_none_is_running(tmp_path):
+    with pytest.raises(NotRunningError, match="no appliance is running"):
+        ask(tmp_path / "control.sock", "answer")
+    left = tmp_path / "left.sock"
+    with socket.socket(socket.AF_UNIX) as gone:
+        gone.bind(str(left))
+    with pytest.raises(NotRunningError):
+        ask(left, "answer")
+    served = Control(left, {"answer": answer})  # what one that was killed has left is no obstacle
+    await served.start()
+    assert await asyncio.to_thread(ask, left, "answer") == {"n": 1}
+    await served.stop()
