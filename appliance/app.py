@@ -23,7 +23,7 @@ from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import ClientCertificates, server_context
 from appliance.config import Listener, Settings, TopicRoute
-from appliance.listeners import Listeners, ListenerSettings
+from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
@@ -110,11 +110,7 @@ class App:
             frame.authenticate,
             # It would pass by plugins that refuse clients.
             access.exchange if not authenticating else lambda method: None,
-            connections=limits.connections,
-            connect_timeout=limits.connect_timeout,
-            connections_per_address=limits.connections_per_address,
-            connection_rate=limits.connection_rate,
-            publish_rate=limits.publish_rate,
+            _admission(settings),
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", _Deaf())
@@ -278,6 +274,17 @@ def _broker_limits(settings: Settings) -> Limits:
         session_expiry=round(limits.session_expiry),
         topic_alias=limits.topic_alias,
         keep_alive=round(limits.keep_alive),
+    )
+
+
+def _admission(settings: Settings) -> Admission:
+    limits = settings.broker.limits
+    return Admission(
+        limits.connections,
+        limits.connect_timeout,
+        limits.connections_per_address,
+        limits.connection_rate,
+        limits.publish_rate,
     )
 
 

@@ -50,6 +50,17 @@ OTHER_FILES = FAREWELLS + 256
 
 
 @dataclass(frozen=True, slots=True)
+class Admission:
+    """How many may come, and how fast: of `broker.limits` in appliance.yaml, infinity for none."""
+
+    connections: int
+    connect_timeout: float
+    connections_per_address: float = math.inf
+    connection_rate: float = math.inf
+    publish_rate: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
 class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
@@ -63,39 +74,80 @@ class ListenerSettings:
     path: Path | None = None
     mode: int = 0o660
 
+    @property
+    def place(self) -> tuple[str, int, Path | None]:
+        """What no two listeners can share."""
+        return self.host, self.port, self.path
+
 
 class Listeners:
-    """All listening sockets; `network` has the connections made to them.
-
-    The limits are those of `broker.limits` in appliance.yaml, infinity for none.
-    """
+    """All listening sockets; `network` has the connections made to them."""
 
     def __init__(
         self,
         broker: Broker,
         authenticate: Authenticate,
         exchange: Callable[[str], Exchange | None],
-        *,
-        connections: int,
-        connect_timeout: float,
-        connections_per_address: float = math.inf,
-        connection_rate: float = math.inf,
-        publish_rate: float = math.inf,
+        admission: Admission,
     ) -> None:
         self.broker = broker
-        self.connections = connections
+        self.admission = admission
         self.network = Network(
             broker,
             authenticate,
             exchange,
             self._ended,
-            connect_timeout=connect_timeout,
-            publish_rate=publish_rate,
+            connect_timeout=admission.connect_timeout,
+            publish_rate=admission.publish_rate,
         )
-        self._addresses = _Addresses(connections_per_address, connection_rate)
+        self._addresses = _Addresses(admission)
         self._doors: list[_Door] = []
         self._handshakes: set[ClientProtocol] = set()
         self._stall: asyncio.TimerHandle | None = None
+
+    @property
+    def addresses(self) -> list[tuple[str, int]]:
+        """Where is listened, with the port that the system chose where it was 0."""
+        return [door.address for door in self._doors]
+
+    def prepare(self, settings: list[ListenerSettings]) -> list[_Door]:
+        """Get ready to listen there, for `take`; where is listened already nothing changes yet.
+
+        Raises:
+            OSError: an address cannot be listened on; nothing has changed then.
+        """
+        known = {door.settings.place: door for door in self._doors}
+        doors: list[_Door] = []
+        try:
+            for listener in settings:
+                door = known.pop(listener.place, None) or _Door(self, listener)
+                doors.append(door)
+        except BaseException:
+            self.drop(doors)
+            raise
+        return doors
+
+    def drop(self, doors: list[_Door]) -> None:
+        """Not to be taken after all."""
+        for door in doors:
+            if door not in self._doors:
+                door.close()
+
+    def take(
+        self, doors: list[_Door], settings: list[ListenerSettings], admission: Admission
+    ) -> None:
+        """Listen there from now on, like this; connections that were made elsewhere stay."""
+        self.admission = admission
+        self._addresses.use(admission)
+        self.network.use(admission.connect_timeout, admission.publish_rate)
+        allow_files(admission.connections + OTHER_FILES)
+        before, self._doors = self._doors, doors
+        for door in before:
+            if door not in doors:
+                door.close()
+        for door, listener in zip(doors, settings, strict=True):
+            door.use(listener)
+            door.open()
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Listen; returns the addresses, with the port that the system chose where it was 0.
@@ -103,18 +155,8 @@ class Listeners:
         Raises:
             OSError: an address cannot be listened on; nothing is left listening.
         """
-        addresses: list[tuple[str, int]] = []
-        allow_files(self.connections + OTHER_FILES)
-        try:
-            for listener in settings:
-                door = _Door(self, listener)
-                self._doors.append(door)
-                addresses.append(door.address)
-                door.open()
-        except BaseException:
-            await self.stop()
-            raise
-        return addresses
+        self.take(self.prepare(settings), settings, self.admission)
+        return self.addresses
 
     def admit(self, connection: socket.socket, peer: object, listener: ListenerSettings) -> None:
         """Begin a new connection, or close it when there are as many as allowed."""
@@ -127,10 +169,9 @@ class Listeners:
         else:
             host, port = cast("tuple[str, int]", peer)[:2]
             address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        if len(self.network.open) >= self.connections:
-            refusal = (
-                f"{self.connections} connections, as many as allowed (broker.limits.connections)"
-            )
+        limit = self.admission.connections
+        if len(self.network.open) >= limit:
+            refusal = f"{limit} connections, as many as allowed (broker.limits.connections)"
         elif listener.path is None:
             refusal = self._addresses.admit(host, now)
         if refusal:
@@ -199,7 +240,7 @@ class _Door:
 
     def __init__(self, listeners: Listeners, settings: ListenerSettings) -> None:
         self._listeners = listeners
-        self._settings = settings
+        self.settings = settings
         self._loop = asyncio.get_running_loop()
         self._is_open = False
         if settings.path is not None:
@@ -209,6 +250,13 @@ class _Door:
         else:
             self._socket = listen(settings.host, settings.port)
             self.address = (settings.host, self._socket.getsockname()[1])
+
+    def use(self, settings: ListenerSettings) -> None:
+        """Let these settings hold for those who come from now on."""
+        if settings.path is not None and settings.mode != self.settings.mode:
+            with contextlib.suppress(OSError):  # it may be gone
+                settings.path.chmod(settings.mode)
+        self.settings = settings
 
     def open(self) -> None:
         """Accept what comes; does nothing when it is open, or closed for good."""
@@ -223,7 +271,7 @@ class _Door:
 
     def _accept(self) -> None:
         for _ in range(ACCEPTED_A_TURN):
-            if self._settings.context is not None and self._listeners.crowded:
+            if self.settings.context is not None and self._listeners.crowded:
                 self._shut()
                 self._listeners.wait_for_handshakes()
                 return
@@ -237,13 +285,13 @@ class _Door:
                 self._shut()
                 self._loop.call_later(ACCEPT_PAUSE, self.open)
                 return
-            self._listeners.admit(connection, peer, self._settings)
+            self._listeners.admit(connection, peer, self.settings)
 
     def close(self) -> None:
         """Listen no more."""
         self._shut()
         self._socket.close()
-        path = self._settings.path
+        path = self.settings.path
         if path is not None:
             with contextlib.suppress(OSError):  # it may be gone, or another's by now
                 if path.stat().st_ino == self._inode:
@@ -262,11 +310,15 @@ class _Neighbour:
 class _Addresses:
     """How many connections each address has, and how fast it opens new ones."""
 
-    def __init__(self, limit: float, rate: float) -> None:
-        self._limit = limit
-        self._rate = rate
+    def __init__(self, admission: Admission) -> None:
+        self.use(admission)
         self._known: dict[bytes, _Neighbour] = {}
         self._many = ADDRESSES
+
+    def use(self, admission: Admission) -> None:
+        """Let these limits hold from now on."""
+        self._limit = admission.connections_per_address
+        self._rate = admission.connection_rate
 
     def admit(self, host: str, now: float) -> str:
         """Count a new connection; or, uncounted, why it is not allowed."""

@@ -94,16 +94,7 @@ class Network:
         self.broker = broker
         self.authenticate = authenticate
         self.exchange = exchange
-        self.connect_timeout = connect_timeout
-        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
-        #: Messages of a client after which it is checked.
-        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
-        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
-        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
-        #: `Ledger.queued_bytes` from which on publishers are slowed.
-        self.short_of_memory = broker.limits.memory * 3 // 4
-        #: Bytes in the output of all clients from which on less is allowed to each of them.
-        self.much_output = broker.limits.memory // 4
+        self.use(connect_timeout, publish_rate)
         self.open: set[ClientProtocol] = set()
         #: What runs in the background for a connection: TLS handshakes and logins.
         self.tasks: set[asyncio.Task[None]] = set()
@@ -118,6 +109,19 @@ class Network:
         self._counting = False
         self._farewells: set[_Farewell] = set()
         self._all_closed: asyncio.Event | None = None
+
+    def use(self, connect_timeout: float, publish_rate: float) -> None:
+        """Let these limits hold from now on, and those that the broker has now."""
+        self.connect_timeout = connect_timeout
+        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
+        #: Messages of a client after which it is checked.
+        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
+        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
+        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
+        #: `Ledger.queued_bytes` from which on publishers are slowed.
+        self.short_of_memory = self.broker.limits.memory * 3 // 4
+        #: Bytes in the output of all clients from which on less is allowed to each of them.
+        self.much_output = self.broker.limits.memory // 4
 
     def is_busy(self) -> bool:
         """Whether as much was done in this round of the event loop as one round is for.
@@ -478,7 +482,7 @@ class ClientProtocol:
         """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
         if self._client.session is None:
             return MAXIMUM_CONTROL
-        return self._broker.limits.packet_size + MAXIMUM_CONTROL
+        return self._client.connection.maximum_packet_size + MAXIMUM_CONTROL
 
     def keep(self, size: int) -> None:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from appliance import certs
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Action, Decision, Identity, Limits, Refusal
-from appliance.listeners import Listeners, ListenerSettings
+from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode
@@ -59,9 +59,7 @@ class House:
             self.broker,
             self._ask,
             lambda method: None,
-            connections=connections,
-            connect_timeout=connect_timeout,
-            **limits,
+            Admission(connections, connect_timeout, **limits),
         )
         return self.listeners
 

@@ -42,7 +42,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Refusal
 from appliance.config import Settings, load
-from appliance.listeners import Listeners, ListenerSettings
+from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Will
 from appliance.mqtt.reason import ReasonCode
@@ -268,8 +268,7 @@ async def running(
         broker,
         frame.authenticate,
         files.exchange,
-        connections=100,
-        connect_timeout=PATIENCE,
+        Admission(100, PATIENCE),
     )
     rig = Rig(frame, broker, files)
     try:

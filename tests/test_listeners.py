@@ -22,7 +22,7 @@ from house import PATIENCE, Caller, House, make_contexts, until
 from appliance import config, listeners, sockets, wire
 from appliance.app import App
 from appliance.broker.ports import Limits
-from appliance.listeners import ListenerSettings
+from appliance.listeners import Admission, ListenerSettings
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -680,7 +680,7 @@ async def test_new_connections_from_one_address(house: House, caplog):
 
 
 def test_what_counts_as_one_address():
-    addresses = listeners._Addresses(1, 100)
+    addresses = listeners._Addresses(Admission(9, 9, 1, 100))
     assert not addresses.admit("192.0.2.1", 0)
     assert addresses.admit("192.0.2.1", 0)
     assert addresses.admit("::ffff:192.0.2.1", 0)  # the same, on a listener for both
@@ -695,7 +695,7 @@ def test_what_counts_as_one_address():
 
 
 def test_idle_addresses_are_forgotten():
-    addresses = listeners._Addresses(10, 10)
+    addresses = listeners._Addresses(Admission(9, 9, 10, 10))
     for number in range(100_000):
         host = f"2001:db8:{number >> 16:x}:{number & 0xFFFF:x}::1"
         assert not addresses.admit(host, number * 0.001)

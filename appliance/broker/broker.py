@@ -749,6 +749,17 @@ class Broker:
 
     # --- time and rules ------------------------------------------------------------------------
 
+    def use(self, limits: Limits, features: Features) -> None:
+        """Let other limits and features hold from now on.
+
+        Who holds more than they allow keeps it. What a client was told in its CONNACK stays true
+        while it is connected.
+        """
+        self.limits = limits
+        self.features = features
+        self.ledger.use(limits)
+        self.epoch += 1  # topics that were too long may not be so any more
+
     def rules_changed(self) -> None:
         """The access rules changed: nothing cached holds, and what waits is checked again."""
         self.epoch += 1

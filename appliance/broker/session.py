@@ -95,10 +95,15 @@ class Ledger:
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
 
     def __post_init__(self) -> None:
-        self.queue_bytes = self.limits.queue_bytes
+        self.use(self.limits)
+
+    def use(self, limits: Limits) -> None:
+        """Measure by these limits from now on."""
+        self.limits = limits
+        self.queue_bytes = limits.queue_bytes
         # An eighth is set apart, so that those who hold much do not starve those who hold little.
-        self.memory = self.limits.memory * 7 // 8
-        self.reserve = self.limits.memory // 8 // self.limits.connections
+        self.memory = limits.memory * 7 // 8
+        self.reserve = limits.memory // 8 // limits.connections
 
     def has_expired(self, message: Message) -> bool:
         """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
