@@ -131,6 +131,8 @@ class Broker:
         self.retained: TopicTree[Message] = TopicTree()
         self.retained_bytes = 0
         self.observer: Observer | None = None
+        #: Called with each session whose connection has ended, before its will is published.
+        self.departures: list[Callable[[Session], None]] = []
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
         #: Network clients with bytes to write.
@@ -234,18 +236,26 @@ class Broker:
         session.unchecked = True
         session.resend()
 
-    def attach(self, client_id: str, link: Link) -> Session:
-        """A session inside the appliance, with all rights and kept until `detach`."""
+    def attach(
+        self, client_id: str, link: Link, link_for: Callable[[Session], Link] | None = None
+    ) -> Session:
+        """A session inside the appliance, with all rights and kept until `detach`.
+
+        `link_for` gives the link for what a session publishes; retained messages of a new
+        subscription go to `link`.
+        """
         if client_id in self.sessions:
             raise ValueError(f"there is a session '{client_id}' already")
         session = Session(client_id, None, self.ledger)
         session.link = link
+        session.link_for = link_for
         self.sessions[client_id] = session
         return session
 
     def detach(self, session: Session) -> None:
         """End a session made by `attach`."""
         session.link = None
+        self._tell_departure(session)
         self._end(session)
 
     def disconnect(
@@ -261,6 +271,7 @@ class Broker:
             self._set_expiry(session, min(expiry, self.limits.session_expiry))
         if self.observer is not None:
             self.observer.disconnected(session)
+        self._tell_departure(session)
         if not publish_will:
             session.set_will(None)
         will = session.will
@@ -275,6 +286,10 @@ class Broker:
                 self._schedule(session.will_at, session)
             else:
                 self._publish_will(session)
+
+    def _tell_departure(self, session: Session) -> None:
+        for told in tuple(self.departures):
+            told(session)
 
     def _end(self, session: Session) -> None:
         """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
@@ -422,11 +437,12 @@ class Broker:
             session, subscription = match
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
                 continue
-            _, qos, as_published, ids = merged.get(session.client_id, (session, 0, False, None))
+            known = merged.get(session.client_id)
+            receiver, qos, as_published, ids = known or (session.hearing(origin), 0, False, None)
             if subscription.identifier:  # [MQTT-3.3.4-4]
                 ids = [*(ids or []), subscription.identifier]
             merged[session.client_id] = (
-                session,
+                receiver,
                 max(qos, subscription.qos),
                 as_published or subscription.retain_as_published,
                 ids,

@@ -155,6 +155,7 @@ class Session:
         "latest",
         "ledger",
         "link",
+        "link_for",
         "queue",
         "readable",
         "readable_epoch",
@@ -175,6 +176,8 @@ class Session:
         self.identity = identity
         self.ledger = ledger
         self.link: Link | None = None
+        #: For a session inside the appliance that wants to know who published what it receives.
+        self.link_for: Callable[[Session], Link] | None = None
         self.expiry = 0
         self.ends_at: float | None = None
         self.will: PendingWill | None = None
@@ -216,6 +219,14 @@ class Session:
         return self.expiry > 0
 
     # --- towards the client -------------------------------------------------------------------
+
+    def hearing(self, origin: Session) -> Session:
+        """Itself, as it receives what `origin` publishes."""
+        if self.link_for is None:
+            return self
+        session = Session(self.client_id, None, self.ledger)
+        session.link = self.link_for(origin)
+        return session
 
     @property
     def ready(self) -> bool:
@@ -646,6 +657,7 @@ class Session:
             waiting.clear()
         self.resends.clear()
         self.replays.clear()
+        self.routes.clear()  # whose receivers may know this session: nobody looks for such circles
 
     def close_link(self, reason: ReasonCode, message: str) -> None:
         """End the session's connection, if it has one."""

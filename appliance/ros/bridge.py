@@ -26,6 +26,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import describe
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, RouteSettings, ToMqtt, ToRos
+from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.mailbox import Counters, Mailbox
 from appliance.ros.node import RosNode
 
@@ -85,6 +86,7 @@ class Bridge:
         routes: Iterable[RouteSettings],
         loop: asyncio.AbstractEventLoop,
         robot: str,
+        calls: CallRoutes | None = None,
     ) -> None:
         """What is bridged is told on `{robot}/_appliance/routes`.
 
@@ -111,7 +113,14 @@ class Bridge:
         #: Those to ROS by MQTT topic.
         self._receivers: dict[str, list[ToRos]] = {}
         self._looks = 0
+        #: What of the topics was last announced.
+        self._announced: Sequence[Bridged] = ()
+        #: Services, actions and parameters.
+        self.calls = Calls(
+            node, broker, loop, self._converters, self._mailbox, self._post, self._announce_again
+        )
         self.replace(routes)
+        self.calls.replace(calls or CallRoutes())
 
     def replace(self, routes: Iterable[RouteSettings]) -> None:
         """Carry these routes from now on; one that was there before does not notice.
@@ -196,11 +205,13 @@ class Bridge:
         """Subscribe on MQTT, and join the bus in the background."""
         self._session = self._broker.attach(CLIENT_ID, _Link(self._receive))
         self._subscribe(self._receivers)
+        self.calls.start()
         self._announce(())
         self._node.start(self._look, self._failed)
 
     async def stop(self) -> None:
         """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session
         if session is None:
@@ -209,6 +220,7 @@ class Bridge:
             flow.lost()
         while self._deliver():
             pass
+        await self.calls.stop()
         self._announce(())
         self._session = None
         self._broker.detach(session)
@@ -261,10 +273,14 @@ class Bridge:
         return len(batch) == BATCH
 
     def _announce(self, bridged: Sequence[Bridged]) -> None:
+        self._announced = bridged
         if self._session is not None:
-            payload = orjson.dumps(bridged)
+            payload = orjson.dumps([*bridged, *self.calls.bridged()])
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
             self._broker.flush()
+
+    def _announce_again(self) -> None:
+        self._announce(self._announced)
 
     def _stopped(self, reason: str) -> None:
         self.problem = reason
@@ -300,6 +316,7 @@ class Bridge:
         self._match_patterns()
         for flow in self._flows():
             has_changed |= flow.look(self._node, is_thorough)
+        self.calls.look()
         if has_changed:
             self._post(self._announce, self._bridged())
 
@@ -349,6 +366,7 @@ class Bridge:
     def _failed(self, reason: str) -> None:
         for flow in self._flows():
             flow.lost()
+        self.calls.lost()
         self._post(self._stopped, reason)
         self._post(self._announce, ())
 

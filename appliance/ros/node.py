@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from appliance.ros.definitions import UnknownTypeError
 
@@ -82,11 +82,39 @@ class RosPublisher(Protocol):
         """End it; `publish` raises BusError from now on. On the ROS thread."""
 
 
+class RosClient(Protocol):
+    """A client of a service. Its methods are for the ROS thread."""
+
+    def is_ready(self) -> bool:
+        """Whether a server has been found; false again when the last one is gone."""
+
+    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
+        """Send a serialized request; `done` is called with the response, on the ROS thread.
+
+        That may be never: there is no time limit, and servers vanish. What is returned gives the
+        call up, after which `done` is not called. Raises BusError.
+        """
+
+    def destroy(self) -> None:
+        """End it; what is under way is not answered any more."""
+
+
+#: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
+Respond: TypeAlias = Callable[[bytes | None], None]
+
+
+class RosService(Protocol):
+    """A service that this node offers."""
+
+    def destroy(self) -> None:
+        """End it. On the ROS thread."""
+
+
 class RosNode(Protocol):
     """A node on the robot's bus, with a thread of its own: the ROS thread.
 
-    `start`, `stop` and `RosPublisher.publish` may be called from any thread, all else only from
-    inside the callbacks, which are called on the ROS thread.
+    `start`, `stop`, `call_soon` and `RosPublisher.publish` may be called from any thread, all else
+    only from inside the callbacks, which are called on the ROS thread.
     """
 
     #: The node's full name, such as `/appliance`.
@@ -103,8 +131,17 @@ class RosNode(Protocol):
     def stop(self) -> None:
         """Leave the bus and wait until the ROS thread has ended; may be called twice."""
 
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        """Call it on the ROS thread. Raises BusError when there is none."""
+
     def topics(self) -> dict[str, list[str]]:
         """The types of each topic that has an endpoint, this node's own included."""
+
+    def services(self) -> dict[str, list[str]]:
+        """The types of each service that has a server, this node's own included.
+
+        An action's services are among them: `/name/_action/send_goal` and so on.
+        """
 
     def count(self, topic: str) -> tuple[int, int]:
         """How many publishers and subscriptions there are, own ones included; the cheapest look."""
@@ -125,6 +162,18 @@ class RosNode(Protocol):
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
+
+    def create_client(self, service: str, type_name: str) -> RosClient:
+        """Make a client of `std_srvs/srv/Trigger`, or of a service that an action is made of:
+        `pkg/action/Name_SendGoal`, `pkg/action/Name_GetResult`.
+
+        Raises BusError, UnknownTypeError.
+        """
+
+    def create_service(
+        self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
+    ) -> RosService:
+        """Call `callback` with each serialized request. Raises BusError, UnknownTypeError."""
 
 
 # The twin
@@ -187,6 +236,57 @@ class FakePublisher:
         self.bus.own_publishers.remove(self)
 
 
+@dataclass(eq=False, slots=True)
+class FakeService:
+    """A service of another node (`handler` answers) or of a FakeNode."""
+
+    bus: FakeNode
+    name: str
+    type: str
+    handler: Callable[[bytes, Respond], None]
+
+    def remove(self) -> None:
+        """The other node ends it, or vanishes."""
+        self.bus.remote_services.remove(self)
+        self.bus.spin()
+
+    def destroy(self) -> None:
+        self.bus.own_services.remove(self)
+
+
+@dataclass(eq=False, slots=True)
+class FakeClient:
+    """A FakeNode's client of a service."""
+
+    bus: FakeNode
+    name: str
+    type: str
+
+    def _servers(self) -> list[FakeService]:
+        return [
+            service
+            for service in (*self.bus.remote_services, *self.bus.own_services)
+            if (service.name, service.type) == (self.name, self.type)
+        ]
+
+    def is_ready(self) -> bool:
+        return bool(self._servers())
+
+    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
+        waiting = [done]
+
+        def respond(response: bytes | None) -> None:
+            if waiting and response is not None and self in self.bus.clients:
+                waiting.pop()(response)
+
+        for server in self._servers()[:1]:
+            server.handler(request, respond)
+        return waiting.clear
+
+    def destroy(self) -> None:
+        self.bus.clients.remove(self)
+
+
 class FakeNode:
     """A RosNode on a bus of its own, without threads: everything happens in the caller's.
 
@@ -203,6 +303,9 @@ class FakeNode:
         self.remote_subscribers: list[FakePeer] = []
         self.subscriptions: list[FakeSubscription] = []
         self.own_publishers: list[FakePublisher] = []
+        self.remote_services: list[FakeService] = []
+        self.own_services: list[FakeService] = []
+        self.clients: list[FakeClient] = []
         self._poll: Callable[[], None] | None = None
         self._failed: Callable[[str], None] | None = None
 
@@ -231,6 +334,21 @@ class FakeNode:
         self.remote_subscribers.append(peer)
         self.spin()
         return peer
+
+    def add_service(
+        self, name: str, type_name: str, handler: Callable[[bytes, Respond], None]
+    ) -> FakeService:
+        """Another node offers a service."""
+        service = FakeService(self, name, type_name, handler)
+        self.remote_services.append(service)
+        self.spin()
+        return service
+
+    def ask(self, name: str, request: bytes, done: Callable[[bytes | None], None]) -> None:
+        """Another node calls a service of this one; nothing happens when there is none."""
+        for service in self.own_services:
+            if service.name == name:
+                service.handler(request, done)
 
     def spin(self) -> None:
         """Let the bridge look at the graph."""
@@ -271,8 +389,21 @@ class FakeNode:
     def stop(self) -> None:
         self.running = False
         self.subscriptions.clear()
+        self.clients.clear()
+        self.own_services.clear()
         for publisher in list(self.own_publishers):
             publisher.destroy()
+
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        if not self.running:
+            raise BusError("ROS is not ready")
+        callback()
+
+    def services(self) -> dict[str, list[str]]:
+        found: dict[str, set[str]] = {}
+        for service in (*self.remote_services, *self.own_services):
+            found.setdefault(service.name, set()).add(service.type)
+        return {name: sorted(types) for name, types in found.items()}
 
     def topics(self) -> dict[str, list[str]]:
         found: dict[str, set[str]] = {}
@@ -331,4 +462,16 @@ class FakeNode:
         self.load(type_name)
         own = FakePublisher(self, topic, Endpoint(self.name, type_name, qos))
         self.own_publishers.append(own)
+        return own
+
+    def create_client(self, service: str, type_name: str) -> FakeClient:
+        client = FakeClient(self, service, type_name)
+        self.clients.append(client)
+        return client
+
+    def create_service(
+        self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
+    ) -> FakeService:
+        own = FakeService(self, service, type_name, callback)
+        self.own_services.append(own)
         return own

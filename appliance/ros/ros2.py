@@ -13,8 +13,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from appliance.ros.definitions import import_message
-from appliance.ros.node import BusError, Durability, Endpoint, QosProfile, Reliability
+from appliance.ros.definitions import UnknownTypeError, import_message
+from appliance.ros.node import (
+    BusError,
+    Durability,
+    Endpoint,
+    QosProfile,
+    Reliability,
+    Respond,
+)
 
 log = logging.getLogger(__name__)
 
@@ -176,10 +183,19 @@ class Ros2Node:
             self._rclpy.try_shutdown(context=self._context)
         self._executor = self._node = self._context = None
 
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        executor = self._executor
+        if executor is None:
+            raise BusError("ROS is not ready")
+        executor.create_task(callback)
+
     # The graph
 
     def topics(self) -> dict[str, list[str]]:
         return dict(self._node.get_topic_names_and_types())
+
+    def services(self) -> dict[str, list[str]]:
+        return dict(self._node.get_service_names_and_types())
 
     def count(self, topic: str) -> tuple[int, int]:
         handle = self._node.handle  # the node's own methods would expand and check the name again
@@ -221,6 +237,19 @@ class Ros2Node:
             )
         return _Publisher(self._node, own)
 
+    # Services
+
+    def create_client(self, service: str, type_name: str) -> _Client:
+        service_class = import_service(type_name)
+        with _as_bus_error():
+            own = self._node.create_client(service_class, service)
+        return _Client(self._node, own, service_class)
+
+    def create_service(
+        self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
+    ) -> _Service:
+        return _Service(self._node, service, import_service(type_name), callback)
+
 
 class _Subscription:
     def __init__(self, node: Any, own: Any) -> None:
@@ -246,6 +275,94 @@ class _Publisher:
 
     def destroy(self) -> None:
         self._node.destroy_publisher(self._own)
+
+
+class _Client:
+    """rclpy takes and gives no serialized requests, so they are message objects on the way."""
+
+    def __init__(self, node: Any, own: Any, service_class: Any) -> None:
+        from rclpy.serialization import deserialize_message, serialize_message
+
+        self._node = node
+        self._own = own
+        self._request_class = service_class.Request
+        self._deserialize, self._serialize = deserialize_message, serialize_message
+        self._refusals = _errors()
+
+    def is_ready(self) -> bool:
+        return bool(self._own.service_is_ready())
+
+    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
+        try:
+            future = self._own.call_async(self._deserialize(request, self._request_class))
+        except self._refusals as error:
+            raise BusError(str(error)) from error
+
+        def finish(future: Any) -> None:
+            if future.cancelled() or self._own is None:
+                return
+            try:
+                response: bytes | BusError = self._serialize(future.result())
+            except Exception as error:  # what a future has may be any: it must not end the thread
+                response = BusError(str(error))
+            done(response)
+
+        def give_up() -> None:
+            if self._own is not None:
+                self._own.remove_pending_request(future)
+
+        future.add_done_callback(finish)
+        return give_up
+
+    def destroy(self) -> None:
+        own, self._own = self._own, None
+        self._node.destroy_client(own)
+
+
+class _Service:
+    def __init__(
+        self,
+        node: Any,
+        name: str,
+        service_class: Any,
+        callback: Callable[[bytes, Respond], None],
+    ) -> None:
+        from rclpy.serialization import deserialize_message, serialize_message
+
+        self._node = node
+        self._response_class = service_class.Response
+        self._callback = callback
+        self._deserialize, self._serialize = deserialize_message, serialize_message
+        with _as_bus_error():
+            self._own = node.create_service(service_class, name, lambda request, _: request)
+        # The executor sends what the callback returns. To answer later, or not at all, without
+        # a coroutine that the executor would keep for ever, its way out is taken over.
+        self._send = self._own.send_response
+        self._own.send_response = self._take
+
+    def _take(self, request: Any, header: Any) -> None:
+        def respond(response: bytes | None) -> None:
+            if response is not None and self._own is not None:
+                message = self._deserialize(response, self._response_class)
+                with _as_bus_error():
+                    self._send(message, header)
+
+        self._callback(self._serialize(request), respond)
+
+    def destroy(self) -> None:
+        own, self._own = self._own, None
+        self._node.destroy_service(own)
+
+
+def import_service(name: str) -> Any:
+    """The class of a service `std_srvs/srv/Trigger`, and of those that an action is made of,
+    `pkg/action/Name_SendGoal` and `pkg/action/Name_GetResult`. Raises UnknownTypeError.
+    """
+    request = import_message(f"{name}_Request")
+    service = getattr(sys.modules[request.__module__], name.rpartition("/")[2], None)
+    if service is None:
+        raise UnknownTypeError(f"no {name}: it is not a service")
+    return service
 
 
 def _errors() -> tuple[type[Exception], ...]:

@@ -1,0 +1,588 @@
+"""Actions: goals that MQTT clients send, and what becomes of them.
+
+An action is made of services and topics, and is bridged as these: `/act/_action/send_goal`,
+`cancel_goal` and `get_result`, `feedback` and `status`.
+
+| topic under `r2d2/act` | what |
+|---|---|
+| `_goal` | a call with the goal's fields; its answer is `{"goal_id": …}` once it is accepted |
+| `_cancel` | a call with `{"goal_id": …}` or `{"all": true}` |
+| `_feedback/{goal id}` | feedback of every goal, QoS 0: only the newest counts |
+| `_result/{goal id}` | `{"status": "succeeded", "result": {…}}`, retained for `keep_result` |
+| `_status` | all goals that the server knows of, retained |
+
+A result that never comes is `{"status": "unknown", "error": {…}}`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import contextlib
+import logging
+import secrets
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import orjson
+
+from appliance.broker.message import Message
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, Property
+from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.mailbox import Counters, Lane, Mailbox
+from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
+from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.requests import Key, Requests
+from appliance.ros.services import to_request
+
+log = logging.getLogger(__name__)
+
+SEND_GOAL = "/_action/send_goal"
+CANCEL = "action_msgs/srv/CancelGoal"
+STATUS = "action_msgs/msg/GoalStatusArray"
+
+#: By the numbers of action_msgs/msg/GoalStatus.
+STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
+
+#: By the numbers of action_msgs/srv/CancelGoal.
+_NOT_CANCELLED = {
+    1: ("rejected", "the action's server does not cancel it"),
+    2: ("unknown_goal", "the action's server knows of no such goal"),
+    3: ("unknown_goal", "the goal has ended already"),
+}
+
+#: Goals whose feedback waits for a busy broker, each with its newest.
+LANES = 256
+
+#: Results that one action keeps at a time; the oldest go first.
+RESULTS = 1000
+
+#: Seconds that a server which has just come has to say that it does not know a goal.
+CHECK_TIME = 5.0
+
+#: Seconds that servers have to take back goals when the appliance stops.
+LAST_WORD = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ActionSettings:
+    """An action, or a pattern of actions. A `{ros}` in `mqtt` stands for the ROS name.
+
+    `timeout` is for the acceptance of a goal and for its cancelling, `keep_result` is how long a
+    result is retained, both in seconds.
+    """
+
+    ros: str
+    mqtt: str
+    type: str | None = None
+    timeout: float = 5.0
+    keep_result: float = 60.0
+    cancel_on_disconnect: bool = False
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether `ros` stands for many actions, or (`!`) for those that are left out."""
+        return "*" in self.ros or self.ros.startswith("!")
+
+
+@dataclass(eq=False, slots=True)
+class _Goal:
+    """A goal under way that an MQTT client has sent."""
+
+    id: bytes
+    owner: Session
+    result: asyncio.Future[dict[str, Any]]
+    is_accepted: bool = False
+    is_orphan: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class _Tasks:
+    """Tasks that nobody waits for, kept until they end."""
+
+    running: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self.running.add(task)
+        task.add_done_callback(self.running.discard)
+
+    async def stop(self) -> None:
+        for task in self.running:
+            task.cancel()
+        await asyncio.gather(*self.running, return_exceptions=True)
+
+
+class ActionRoutes:
+    """The routes of actions; for the loop's thread, where it does not say otherwise."""
+
+    def __init__(
+        self,
+        board: Switchboard,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        loop: asyncio.AbstractEventLoop,
+        post: Callable[..., None],
+        mailbox: Mailbox,
+    ) -> None:
+        self._board = board
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._loop = loop
+        self._post = post
+        self._mailbox = mailbox
+        self._counters: dict[ActionSettings, CallCounters] = {}
+        self._actions: dict[str, Action] = {}
+        self._tasks = _Tasks()
+        #: Goals under way of each client, for the limit.
+        self.goals: Counter[Session] = Counter()
+
+    def replace(self, routes: Sequence[ActionSettings]) -> None:
+        """Have these routes from now on; one that was there before does not notice."""
+        self._counters = {
+            route: self._counters.get(route) or CallCounters()
+            for route in routes
+            if not route.ros.startswith("!")
+        }
+        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        self.follow()
+
+    def follow(self) -> None:
+        """Offer what is on the bus now."""
+        found = {
+            service.removesuffix(SEND_GOAL): min(types).removesuffix("_SendGoal")
+            for service, types in self._requests.services.items()
+            if service.endswith(SEND_GOAL)
+        }
+        wanted = {route.ros: route for route in reversed(self._counters) if not route.is_pattern}
+        for route in self._counters:
+            if route.is_pattern:
+                pattern = compile_pattern(route.ros)
+                of_type = compile_pattern(route.type) if route.type else None
+                for name, type_name in found.items():
+                    if (
+                        name not in wanted
+                        and pattern.fullmatch(name)
+                        and name not in self._excluded
+                        and (of_type is None or of_type.fullmatch(type_name))
+                    ):
+                        wanted[name] = route
+        for name, action in list(self._actions.items()):
+            if wanted.get(name) != action.route:
+                action.stop()
+                del self._actions[name]
+        for name, route in wanted.items():
+            if name not in self._actions:
+                self._actions[name] = Action(name, route, self._counters[route], self)
+            fixed = route.type if route.type is not None and "*" not in route.type else None
+            self._actions[name].type = fixed or found.get(name) or self._actions[name].type
+            self._actions[name].is_there = name in found
+
+    def keys(self) -> Iterable[Key]:
+        """The services that a client should be ready for."""
+        for action in self._actions.values():
+            yield from action.keys()
+
+    def departed(self, session: Session) -> None:
+        """A client's connection has ended."""
+        if session in self.goals:
+            for action in self._actions.values():
+                action.departed(session)
+
+    def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
+        """Each route, what it has counted, and the actions that it offers now."""
+        return [
+            (route, counters, [a.ros for a in self._actions.values() if a.route is route])
+            for route, counters in self._counters.items()
+        ]
+
+    def bridged(self) -> list[dict[str, str]]:
+        """Entries for `{robot}/_appliance/routes`."""
+        return [
+            {
+                "ros": action.ros,
+                "mqtt": action.base,
+                "type": action.type or "",
+                "direction": "action",
+                "encoding": "json",
+            }
+            for action in self._actions.values()
+            if action.is_there
+        ]
+
+    async def cancel_orphans(self) -> None:
+        """The appliance stops, and with it every client's way to its goals: cancel those that
+        are not to go on without them."""
+        cancels = [
+            action._cancel_quietly(goal.id, "the appliance stops")
+            for action in self._actions.values()
+            if action.route.cancel_on_disconnect
+            for goal in action._goals.values()
+            if goal.is_accepted
+        ]
+        if cancels:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(asyncio.gather(*cancels), LAST_WORD)
+
+    async def stop(self) -> None:
+        """The bus has been left: nothing is offered any more."""
+        for action in self._actions.values():
+            action.forget()
+        self._actions.clear()
+        await self._tasks.stop()
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Follow the actions' topics."""
+        for action in list(self._actions.values()):
+            action.look(self._node)
+
+    def lost(self) -> None:
+        """The bus is gone, and with it all subscriptions."""
+        for action in list(self._actions.values()):
+            action.lost()
+
+
+class Action:
+    """One action that MQTT clients may use."""
+
+    def __init__(
+        self, ros: str, route: ActionSettings, counters: CallCounters, routes: ActionRoutes
+    ) -> None:
+        self.ros = ros
+        self.route = route
+        self.base = route.mqtt.replace("{ros}", ros)
+        self.type: str | None = None
+        self.is_there = False
+        self._counters = counters
+        self._routes = routes
+        self._board = routes._board
+        self._requests = routes._requests
+        self._converters = routes._converters
+        self._goals: dict[bytes, _Goal] = {}
+        self._kept: deque[str] = deque()
+        # The ROS thread's.
+        self._subscriptions: list[RosSubscription] = []
+        self._subscribed: str | None = None
+        self._is_over = False
+        self._servers = 0
+        self._counted = Counters()
+        self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
+        self._status_lane = Lane(1, self._counted)
+        for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel)):
+            topic = f"{self.base}/{verb}"
+            self._board.offer(Offer(topic, f"{ros} {verb[1:]}", route.timeout, counters, handle))
+        log.info("%s can be called at %s/_goal", ros, self.base)
+
+    def keys(self) -> Iterable[Key]:
+        if self.type is not None:
+            yield f"{self.ros}{SEND_GOAL}", f"{self.type}_SendGoal"
+            yield f"{self.ros}/_action/get_result", f"{self.type}_GetResult"
+        yield f"{self.ros}/_action/cancel_goal", CANCEL
+
+    # Goals
+
+    async def _on_goal(self, call: Call) -> Answer:
+        type_name = self.type
+        if type_name is None or not self.is_there:
+            raise CallError("unavailable", f"there is no action {self.ros} on the bus")
+        request_type = f"{type_name}_SendGoal_Request"
+        # The goal alone is checked first, so that an error names its fields as the client does.
+        to_request(self._converters, f"{type_name}_Goal", call.payload)
+        self._check_room(call.caller)
+        id_ = secrets.token_bytes(16)
+        fields = orjson.loads(call.payload or b"{}")
+        request = self._converters.get(request_type).from_dict(
+            {"goal_id": {"uuid": id_}, "goal": fields}
+        )
+        goal = _Goal(id_, call.caller, asyncio.get_running_loop().create_future())
+        self._goals[id_] = goal
+        self._routes.goals[call.caller] += 1
+        try:
+            response = await self._requests.ask(
+                f"{self.ros}{SEND_GOAL}", f"{type_name}_SendGoal", request
+            )
+            said = self._converters.get(f"{type_name}_SendGoal_Response").to_dict(response)
+            if not said["accepted"]:
+                raise CallError("rejected", f"{self.ros} does not accept the goal")
+        except asyncio.CancelledError:
+            # It may be accepted yet, and nobody would know of it.
+            self._forget(goal)
+            self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
+            raise
+        except BaseException:
+            self._forget(goal)
+            raise
+        goal.is_accepted = True
+        self._routes._tasks.begin(self._follow_goal(goal, type_name))
+        if goal.is_orphan:
+            self._cancel_orphan(goal)
+        return Answer(orjson.dumps({"goal_id": id_.hex(), "stamp": said["stamp"]}))
+
+    def _check_room(self, caller: Session) -> None:
+        limits = self._board.limits
+        goals = self._routes.goals
+        if goals[caller] >= limits.client:
+            raise CallError(
+                "too_many", f"{limits.client} goals of this client are under way, as many as may be"
+            )
+        if goals.total() >= limits.total:
+            raise CallError("too_many", f"{limits.total} goals are under way, as many as may be")
+
+    def _forget(self, goal: _Goal) -> None:
+        if self._goals.pop(goal.id, None) is not None:
+            goals = self._routes.goals
+            goals[goal.owner] -= 1
+            if not goals[goal.owner]:
+                del goals[goal.owner]
+
+    async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
+        """Wait for the result, as long as it takes, and publish it."""
+        asking = asyncio.ensure_future(self._ask_result(goal, type_name))
+        try:
+            await asyncio.wait({asking, goal.result}, return_when=asyncio.FIRST_COMPLETED)
+            result = goal.result.result() if goal.result.done() else asking.result()
+        except CallError as error:
+            self._counters.errors[error.code] += 1
+            self._counters.last_error = f"{error.code}: {error}"
+            log.warning("goal %s of %s has no result: %s", goal.id.hex(), self.ros, error)
+            problem = {"code": error.code, "message": str(error)}
+            result = {"status": "unknown", "error": problem}
+        finally:
+            asking.cancel()
+            self._forget(goal)
+        self._publish_result(goal.id, result, type_name)
+
+    async def _ask_result(self, goal: _Goal, type_name: str) -> dict[str, Any]:
+        converter = self._converters.get(f"{type_name}_GetResult_Request")
+        response = await self._requests.ask(
+            f"{self.ros}/_action/get_result",
+            f"{type_name}_GetResult",
+            converter.from_dict({"goal_id": {"uuid": goal.id}}),
+        )
+        said = self._converters.get(f"{type_name}_GetResult_Response").to_dict(response)
+        status = STATES[said["status"]] if 0 <= said["status"] < len(STATES) else "unknown"
+        if status == "unknown":
+            text = f"the server of {self.ros} has come anew and does not know the goal"
+            raise CallError("vanished", text)
+        return {"status": status, "result": said["result"]}
+
+    def _publish_result(self, id_: bytes, result: dict[str, Any], type_name: str) -> None:
+        topic = f"{self.base}/_result/{id_.hex()}"
+        is_ok = result["status"] == "succeeded"
+        about = [("status", "ok" if is_ok else "error"), ("ros-type", f"{type_name}_Result")]
+        keep = self.route.keep_result
+        message = Message(
+            topic,
+            orjson.dumps(result),
+            1,
+            keep > 0,
+            {Property.CONTENT_TYPE: JSON, Property.USER_PROPERTY: about},
+            self._board.now() + keep if keep > 0 else None,
+        )
+        self._board.publish(message)
+        if keep > 0:
+            self._kept.append(topic)
+            if len(self._kept) > RESULTS:
+                self._board.publish(Message(self._kept.popleft(), b"", 0, True))
+
+    def server_came(self) -> None:
+        """Another server has come: it may have taken the place of one that was ended."""
+        type_name = self.type
+        if type_name is None:
+            return
+        for goal in self._goals.values():
+            if goal.is_accepted:
+                self._routes._tasks.begin(self._check(goal, type_name))
+
+    async def _check(self, goal: _Goal, type_name: str) -> None:
+        # A server that works on the goal says nothing until it is done.
+        try:
+            await asyncio.wait_for(self._ask_result(goal, type_name), CHECK_TIME)
+        except asyncio.TimeoutError:
+            return
+        except CallError as error:
+            if error.code == "vanished" and not goal.result.done():
+                goal.result.set_exception(error)
+
+    # Cancelling
+
+    async def _on_cancel(self, call: Call) -> Answer:
+        id_ = _which_goal(call.payload)
+        if not self.is_there:
+            raise CallError("unavailable", f"there is no action {self.ros} on the bus")
+        return Answer(orjson.dumps({"goals_canceling": await self._cancel(id_)}))
+
+    async def _cancel(self, id_: bytes) -> list[str]:
+        """Cancel a goal, 16 zeros for all; returns the ids of those that are cancelling."""
+        request = self._converters.get(f"{CANCEL}_Request").from_dict(
+            {"goal_info": {"goal_id": {"uuid": id_}}}
+        )
+        response = await self._requests.ask(f"{self.ros}/_action/cancel_goal", CANCEL, request)
+        said = self._converters.get(f"{CANCEL}_Response").to_dict(response)
+        canceling = [_id(info["goal_id"]).hex() for info in said["goals_canceling"]]
+        if said["return_code"] in _NOT_CANCELLED:
+            code, text = _NOT_CANCELLED[said["return_code"]]
+            raise CallError(code, text)  # type: ignore[arg-type]
+        if not canceling and any(id_):
+            # rclpy's server says nothing worse of a goal that it refuses to cancel.
+            raise CallError("rejected", "the action's server does not cancel it")
+        return canceling
+
+    async def _cancel_quietly(self, id_: bytes, why: str) -> None:
+        try:
+            await asyncio.wait_for(self._cancel(id_), self.route.timeout)
+        except CallError as error:
+            if error.code != "unknown_goal":
+                log.warning("goal %s of %s is not cancelled: %s", id_.hex(), self.ros, error)
+        except asyncio.TimeoutError:
+            log.warning("goal %s of %s is not cancelled: no answer", id_.hex(), self.ros)
+        else:
+            log.info("goal %s of %s is cancelled: %s", id_.hex(), self.ros, why)
+
+    def departed(self, session: Session) -> None:
+        """The client has gone."""
+        if not self.route.cancel_on_disconnect:
+            return
+        for goal in self._goals.values():
+            if goal.owner is session and not goal.is_orphan:
+                goal.is_orphan = True
+                if goal.is_accepted:
+                    self._cancel_orphan(goal)
+
+    def _cancel_orphan(self, goal: _Goal) -> None:
+        why = f"{goal.owner} has gone"
+        self._routes._tasks.begin(self._cancel_quietly(goal.id, why))
+
+    def stop(self) -> None:
+        """The route was removed. Goals go on, and their results are published."""
+        for verb in ("_goal", "_cancel"):
+            self._board.withdraw(f"{self.base}/{verb}")
+        self.forget()
+        self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
+        try:
+            self._routes._node.call_soon(self._close)
+        except BusError:
+            self._is_over = True
+
+    def forget(self) -> None:
+        """What is shown of the bus is not so any more."""
+        self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
+
+    # The ROS thread
+
+    def look(self, node: RosNode) -> None:
+        """Subscribe when the type is known; see whether servers have come."""
+        type_name = self.type
+        if self._is_over or type_name is None:
+            return
+        servers = node.count(f"{self.ros}/_action/status")[0]
+        if servers > self._servers and self._subscribed is not None:
+            self._routes._post(self.server_came)
+        self._servers = servers
+        if type_name == self._subscribed:
+            return
+        self._close_subscriptions()
+        self._subscribed = type_name
+        latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
+        status, feedback = f"{self.ros}/_action/status", f"{self.ros}/_action/feedback"
+        try:
+            own = node.subscribe_raw(status, STATUS, latched, self._on_status)
+            self._subscriptions.append(own)
+            feedback_type = f"{type_name}_FeedbackMessage"
+            on_feedback = partial(self._on_feedback, feedback_type)
+            own = node.subscribe_raw(feedback, feedback_type, QosProfile(), on_feedback)
+            self._subscriptions.append(own)
+        except (BusError, UnknownTypeError) as error:
+            self._counters.last_error = str(error)
+            self._routes._post(log.error, "%s has no feedback: %s", self.ros, error)
+
+    def _close(self) -> None:
+        self._is_over = True
+        self._close_subscriptions()
+
+    def _close_subscriptions(self) -> None:
+        for own in self._subscriptions:
+            own.destroy()
+        self._subscriptions.clear()
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the subscriptions."""
+        self._subscriptions.clear()
+        self._subscribed = None
+        self._servers = 0
+        self._routes._post(self.forget)
+
+    def _on_status(self, cdr: bytes) -> None:
+        try:
+            said = self._converters.get(STATUS).to_dict(cdr)
+        except ConversionError as error:
+            self._counters.last_error = str(error)
+            return
+        goals = [
+            {
+                "goal_id": _id(one["goal_info"]["goal_id"]).hex(),
+                "status": STATES[one["status"]] if 0 <= one["status"] < len(STATES) else "unknown",
+                "stamp": one["goal_info"]["stamp"],
+            }
+            for one in said["status_list"]
+        ]
+        self._put(self._status_lane, f"{self.base}/_status", goals, STATUS, retain=True)
+
+    def _on_feedback(self, type_name: str, cdr: bytes) -> None:
+        try:
+            said = self._converters.get(type_name).to_dict(cdr)
+        except ConversionError as error:
+            self._counters.last_error = str(error)
+            return
+        id_ = _id(said["goal_id"])
+        lane = self._lanes.pop(id_, None) or Lane(1, self._counted)
+        self._lanes[id_] = lane
+        if len(self._lanes) > LANES:
+            self._lanes.popitem(last=False)
+        topic = f"{self.base}/_feedback/{id_.hex()}"
+        self._put(lane, topic, said["feedback"], type_name.replace("_FeedbackMessage", "_Feedback"))
+
+    def _put(
+        self, lane: Lane, topic: str, value: object, type_name: str, *, retain: bool = False
+    ) -> None:
+        properties: Properties = {
+            Property.CONTENT_TYPE: JSON,
+            Property.USER_PROPERTY: [("ros-type", type_name)],
+        }
+        message = Message(topic, orjson.dumps(value), int(retain), retain, properties)
+        self._routes._mailbox.put(lane, message)
+
+
+def _id(uuid: dict[str, str]) -> bytes:
+    return base64.b64decode(uuid["uuid"])
+
+
+def _which_goal(payload: bytes) -> bytes:
+    """The goal that a call of `_cancel` means, 16 zeros for all. Raises CallError."""
+    wanted = 'say which goal: {"goal_id": "…"}, the 32 hex digits of its id, or {"all": true}'
+    try:
+        value = orjson.loads(payload)
+    except orjson.JSONDecodeError as error:
+        raise CallError("bad_request", f"not JSON: {error}") from None
+    if value == {"all": True}:
+        return bytes(16)
+    if not isinstance(value, dict) or set(value) != {"goal_id"}:
+        raise CallError("bad_request", wanted)
+    try:
+        id_ = binascii.unhexlify(value["goal_id"].replace("-", ""))
+    except (binascii.Error, AttributeError, ValueError):
+        raise CallError("bad_request", f"goal_id: {wanted}") from None
+    if len(id_) != 16 or not any(id_):
+        raise CallError("bad_request", f"goal_id: {wanted}")
+    return id_

@@ -1,0 +1,410 @@
+"""Calls: what MQTT clients ask of the bridge, and how they are answered.
+
+A call is a message to a call topic such as `r2d2/reset/_call`. Where its answer goes is said by
+
+- the Response Topic of MQTT 5; the Correlation Data goes back with the answer; or
+- a token of the caller's choice as one more level, `r2d2/reset/_call/42`, which is how 3.1.1 does
+  it: the answer is on `r2d2/reset/_reply/{client id}/42`.
+
+The appliance publishes the answer, and may publish anywhere; so it does not let itself be used. A
+Response Topic is one that the caller could have published to itself, or one below its own
+`_reply/{client id}`, which it must be allowed to receive. What cannot be answered, for the want of
+a way back or because the caller may not use it, is not carried out: the error is on
+`r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
+
+Everything here is for the event loop's thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import orjson
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Property, encode_string, quote
+from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+
+log = logging.getLogger(__name__)
+
+CLIENT_ID = "_calls"
+
+#: What can go wrong with a call; the message beside it has the particulars.
+ErrorCode: TypeAlias = Literal[
+    "bad_request",  # the payload, or the message, is not what the call takes
+    "no_response_topic",  # there is no way to answer
+    "not_authorized",  # the caller may not have the answer there, or not ask for that
+    "too_many",  # the caller, or all together, have too many calls under way
+    "unavailable",  # there is no such service, action or node on the bus now
+    "vanished",  # there was, and it went away before it answered
+    "timeout",  # no answer within the route's time
+    "rejected",  # the node said no
+    "unknown_goal",  # the action's server knows of no such goal, or it has ended
+    "unknown_type",  # the type is not installed here
+    "ros_error",  # ROS itself refused, or is not there
+    "stopping",  # the appliance stops, or the route was removed
+]
+
+JSON = "application/json"
+
+#: Seconds between two lines in the log about the same route's errors.
+REPORT_INTERVAL = 60.0
+
+
+class CallError(Exception):
+    """A call that fails: the code for programs, and the message for people."""
+
+    def __init__(self, code: ErrorCode, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to a call: its payload, and the ROS type that this is of, if any."""
+
+    payload: bytes
+    type: str | None = None
+    content_type: str = JSON
+
+
+@dataclass(frozen=True, slots=True)
+class CallLimits:
+    """Calls and goals under way: of one client, and of all together."""
+
+    client: int = 20
+    total: int = 500
+
+
+@dataclass(eq=False, slots=True)
+class CallCounters:
+    """What a route counts from its start; `errors` are by code."""
+
+    calls: int = 0
+    answers: int = 0
+    under_way: int = 0
+    errors: Counter[str] = field(default_factory=Counter)
+    last_error: str | None = None
+
+
+@dataclass(eq=False, slots=True)
+class Call:
+    """One call that can be answered.
+
+    `topic` is without the token. `reply` is the answer as far as it is known beforehand: its topic,
+    QoS and Correlation Data.
+    """
+
+    caller: Session
+    payload: bytes
+    topic: str
+    reply: Message
+    is_late: bool = False
+    task: asyncio.Task[None] | None = None
+
+
+Handle: TypeAlias = Callable[[Call], Awaitable[Answer]]
+
+
+@dataclass(eq=False, slots=True)
+class Offer:
+    """What can be called under a topic: `handle` gives the answer or raises CallError.
+
+    `name` is what the log calls it. `timeout` is in seconds.
+    """
+
+    topic: str
+    name: str
+    timeout: float
+    counters: CallCounters
+    handle: Handle
+    calls: set[Call] = field(default_factory=set)
+
+
+Receive: TypeAlias = Callable[[Session, Message], None]
+
+
+class Ear:
+    """The link for what one session publishes: it takes everything at once."""
+
+    writable = True
+
+    def __init__(self, switchboard: Switchboard, origin: Session | None) -> None:
+        self._switchboard = switchboard
+        self._origin = origin
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """A message to one of the topics that were asked for."""
+        if self._origin is not None and subscription_ids:
+            self._switchboard.receive(self._origin, message, subscription_ids[0])
+
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """It takes messages, not packets."""
+        return False
+
+    def pubrel(self, packet_id: int) -> None:
+        """Its subscriptions are of QoS 0."""
+
+    def later(self) -> None:
+        """It asks for no retained messages, so that there is nothing to go on with."""
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """There is no connection to close."""
+
+
+class Switchboard:
+    """Takes calls from MQTT, has them handled, and answers each of them once."""
+
+    def __init__(
+        self, broker: Broker, loop: asyncio.AbstractEventLoop, limits: CallLimits | None = None
+    ) -> None:
+        self.limits = limits or CallLimits()
+        self._broker = broker
+        self._loop = loop
+        self._session: Session | None = None
+        #: Who gets what comes, by the identifier of the subscription it came through.
+        self._receivers: dict[int, Receive] = {}
+        self._identifiers: dict[str, int] = {}
+        self._last_identifier = 0
+        self._offers: dict[str, Offer] = {}
+        self._under_way: Counter[Session] = Counter()
+        self._calls: set[Call] = set()
+        self._report_at: dict[str, float] = {}
+
+    def start(self) -> None:
+        """Let calls come in."""
+        self._session = self._broker.attach(
+            CLIENT_ID, Ear(self, None), lambda origin: Ear(self, origin)
+        )
+        for topic_filter in self._identifiers:
+            self._subscribe(topic_filter)
+
+    async def stop(self) -> None:
+        """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
+        for topic in list(self._offers):
+            self.withdraw(topic)
+        tasks = [call.task for call in self._calls if call.task is not None]
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.sleep(0)  # the answers go out
+        session, self._session = self._session, None
+        if session is not None:
+            self._broker.detach(session)
+
+    # Topics
+
+    def listen(self, topic_filter: str, receive: Receive) -> None:
+        """Hand what clients publish there to `receive`, with the session that published it."""
+        self._last_identifier += 1
+        self._identifiers[topic_filter] = self._last_identifier
+        self._receivers[self._last_identifier] = receive
+        self._subscribe(topic_filter)
+
+    def _subscribe(self, topic_filter: str) -> None:
+        if self._session is not None:
+            # QoS 0 loses nothing here, as the link takes each message at once. A retained message
+            # may be an old call: it is not carried out again.
+            identifier = self._identifiers[topic_filter]
+            subscription = Subscription(
+                topic_filter, 0, no_local=True, retain_handling=2, identifier=identifier
+            )
+            self._broker.subscribe(self._session, subscription)
+
+    def ignore(self, topic_filter: str) -> None:
+        """Listen there no longer."""
+        del self._receivers[self._identifiers.pop(topic_filter)]
+        if self._session is not None:
+            self._broker.unsubscribe(self._session, topic_filter)
+
+    def offer(self, offer: Offer) -> None:
+        """Let `offer.topic`, which may have a `+` in it, be called."""
+        self._offers[offer.topic] = offer
+        self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
+        self.listen(
+            f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
+        )
+
+    def withdraw(self, topic: str) -> None:
+        """Offer it no longer; what is under way is answered with `stopping`."""
+        offer = self._offers.pop(topic)
+        self.ignore(topic)
+        self.ignore(f"{topic}/+")
+        for call in offer.calls:
+            if call.task is not None:
+                call.task.cancel()
+
+    def receive(self, origin: Session, message: Message, identifier: int) -> None:
+        """A message came through the subscription with that identifier."""
+        receive = self._receivers.get(identifier)
+        if receive is not None:
+            receive(origin, message)
+
+    def publish(self, message: Message) -> ReasonCode:
+        """Publish as the appliance; 0x10 when nobody has subscribed."""
+        if self._session is None:
+            return ReasonCode.NO_MATCHING_SUBSCRIBERS
+        code = self._broker.publish(message, self._session)
+        self._broker.flush()
+        return code
+
+    def now(self) -> float:
+        """Seconds of the broker's clock."""
+        return self._broker.now
+
+    # Calls
+
+    def _take(self, offer: Offer, caller: Session, message: Message, has_token: bool) -> None:
+        offer.counters.calls += 1
+        topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
+        own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
+        fallback = Message(own, b"", 1)
+        try:
+            reply = self._way_back(caller, message, own, token)
+        except CallError as error:
+            may_tell = not set("/+#\0") & set(caller.client_id)
+            self._fail(offer, caller, fallback if may_tell else None, error)
+            return
+        call = Call(caller, message.payload, topic, reply)
+        try:
+            self._admit(caller, message)
+        except CallError as error:
+            self._fail(offer, caller, reply, error)
+            return
+        self._under_way[caller] += 1
+        offer.counters.under_way += 1
+        self._calls.add(call)
+        offer.calls.add(call)
+        call.task = self._loop.create_task(self._run(offer, call))
+        call.task.add_done_callback(lambda _: self._forget(offer, call))
+
+    def _way_back(self, caller: Session, message: Message, own: str, token: str) -> Message:
+        """An empty answer with its topic and correlation. Raises CallError."""
+        properties = message.properties or {}
+        topic = properties.get(Property.RESPONSE_TOPIC)
+        correlation = properties.get(Property.CORRELATION_DATA)
+        if not isinstance(topic, str):
+            if not token:
+                raise CallError(
+                    "no_response_topic",
+                    "there is no Response Topic, nor, for 3.1.1, a token as the topic's last "
+                    f"level: publish to {message.topic}/TOKEN, and subscribe to {own}/TOKEN",
+                )
+            if set("/+#\0") & set(caller.client_id):
+                raise CallError(
+                    "no_response_topic",
+                    f"the client id {quote(caller.client_id)} cannot be a level of a topic",
+                )
+            topic = f"{own}/{token}"
+        if topic == own or topic.startswith(f"{own}/"):
+            if not self._broker.may_receive(caller, topic):
+                raise CallError("not_authorized", f"the caller may not read {quote(topic)}")
+        else:
+            self._check_may_publish(caller, topic)
+        sent_back = {Property.CORRELATION_DATA: correlation} if correlation is not None else None
+        return Message(topic, b"", max(1, message.qos), properties=sent_back)
+
+    def _check_may_publish(self, caller: Session, topic: str) -> None:
+        try:
+            route = self._broker.route(caller, encode_string(topic))
+        except ProtocolError as error:
+            raise CallError("bad_request", f"the Response Topic is not valid: {error}") from None
+        if not route.allowed:
+            raise CallError(
+                "not_authorized",
+                f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
+            )
+
+    def _admit(self, caller: Session, message: Message) -> None:
+        if message.retain:
+            raise CallError("bad_request", "a call must not be retained: it would be kept")
+        limits = self.limits
+        if self._under_way[caller] >= limits.client:
+            raise CallError(
+                "too_many", f"{limits.client} calls of this client are under way, as many as may be"
+            )
+        if len(self._calls) >= limits.total:
+            raise CallError("too_many", f"{limits.total} calls are under way, as many as may be")
+
+    async def _run(self, offer: Offer, call: Call) -> None:
+        def expire() -> None:
+            call.is_late = True
+            if call.task is not None:
+                call.task.cancel()
+
+        timer = self._loop.call_later(offer.timeout, expire)
+        try:
+            answer = await offer.handle(call)
+        except CallError as error:
+            self._fail(offer, call.caller, call.reply, error)
+        except asyncio.CancelledError:
+            text = f"no answer from {offer.name} within {offer.timeout:g} s"
+            end = CallError("timeout", text) if call.is_late else _stopping()
+            self._fail(offer, call.caller, call.reply, end)
+        except Exception as problem:  # a fault in here must not leave the caller without an answer
+            log.exception("a call of %s failed", offer.name)
+            self._fail(offer, call.caller, call.reply, CallError("ros_error", repr(problem)))
+        else:
+            offer.counters.answers += 1
+            about = [("status", "ok")]
+            if answer.type is not None:
+                about.append(("ros-type", answer.type))
+            self._answer(call.reply, answer.payload, answer.content_type, about)
+        finally:
+            timer.cancel()
+
+    def _forget(self, offer: Offer, call: Call) -> None:
+        if call.task is not None and call.task.cancelled():  # before it had begun
+            self._fail(offer, call.caller, call.reply, _stopping())
+        offer.counters.under_way -= 1
+        offer.calls.discard(call)
+        self._calls.discard(call)
+        self._under_way[call.caller] -= 1
+        if not self._under_way[call.caller]:
+            del self._under_way[call.caller]
+
+    def _fail(self, offer: Offer, caller: Session, reply: Message | None, error: CallError) -> None:
+        counters = offer.counters
+        counters.errors[error.code] += 1
+        counters.last_error = f"{error.code}: {error}"
+        now = self._loop.time()
+        if now >= self._report_at.get(offer.topic, 0.0):
+            self._report_at[offer.topic] = now + REPORT_INTERVAL
+            count = sum(counters.errors.values())
+            text = "a call of %s by %s failed (%d so far): %s: %s"
+            log.warning(text, offer.name, caller, count, error.code, error)
+        if reply is not None:
+            # In a turn of its own: the caller's chunk is still being worked on.
+            payload = error_payload(error)
+            self._loop.call_soon(self._answer, reply, payload, JSON, [("status", "error")])
+
+    def _answer(
+        self, reply: Message, payload: bytes, content_type: str, about: list[tuple[str, str]]
+    ) -> None:
+        properties = dict(reply.properties or {})
+        properties[Property.CONTENT_TYPE] = content_type
+        properties[Property.USER_PROPERTY] = about
+        self.publish(Message(reply.topic, payload, reply.qos, properties=properties))
+
+
+def error_payload(error: CallError) -> bytes:
+    """An error as every answer has it: `{"error": {"code": …, "message": …}}`."""
+    return orjson.dumps({"error": {"code": error.code, "message": str(error)}})
+
+
+def _stopping() -> CallError:
+    return CallError("stopping", "the appliance stops, or this is not offered any more")

@@ -1,0 +1,152 @@
+"""What of the ROS graph is asked and answered instead of sent: services, actions, parameters.
+
+Beside the bridge's topics, on the same node and the same two threads. What belongs to the ROS
+thread is in the methods `look` and `lost`, all else is for the event loop's thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from appliance.broker.broker import Broker
+from appliance.ros.actions import ActionRoutes, ActionSettings
+from appliance.ros.calls import CallCounters, CallLimits, Switchboard
+from appliance.ros.convert import Converters
+from appliance.ros.mailbox import Mailbox
+from appliance.ros.node import RosNode
+from appliance.ros.parameters import ParameterRoutes, ParameterSettings
+from appliance.ros.requests import Requests
+from appliance.ros.services import ServiceRoutes, ServiceSettings
+
+__all__ = [
+    "ActionSettings",
+    "CallLimits",
+    "CallRoutes",
+    "CallStatus",
+    "Calls",
+    "ParameterSettings",
+    "ServiceSettings",
+]
+
+AnySettings: TypeAlias = ServiceSettings | ActionSettings | ParameterSettings
+
+
+@dataclass(frozen=True, slots=True)
+class CallRoutes:
+    """Every route that is called, and how many calls may be under way."""
+
+    services: tuple[ServiceSettings, ...] = ()
+    actions: tuple[ActionSettings, ...] = ()
+    parameters: tuple[ParameterSettings, ...] = ()
+    limits: CallLimits = field(default_factory=CallLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class CallStatus:
+    """A route, the names on the bus that it is for now, and what it has counted."""
+
+    settings: AnySettings
+    names: tuple[str, ...]
+    counters: CallCounters
+
+
+class Calls:
+    """All that is called, in one place: `look` follows the graph, `replace` the configuration."""
+
+    def __init__(
+        self,
+        node: RosNode,
+        broker: Broker,
+        loop: asyncio.AbstractEventLoop,
+        converters: Converters,
+        mailbox: Mailbox,
+        post: Callable[..., None],
+        announce: Callable[[], None],
+    ) -> None:
+        """`post` calls on the loop's thread; `announce` is called there when what `bridged` gives
+        may have changed."""
+        self._broker = broker
+        self._announce = announce
+        self._routes = CallRoutes()
+        self.board = Switchboard(broker, loop)
+        self._requests = Requests(node, loop, post, self._follow)
+        self._services = ServiceRoutes(self.board, self._requests, converters, node, loop, post)
+        self._actions = ActionRoutes(
+            self.board, self._requests, converters, node, loop, post, mailbox
+        )
+        self._parameters = ParameterRoutes(self.board, self._requests, converters, node, loop, post)
+
+    def replace(self, routes: CallRoutes) -> None:
+        """Have these routes from now on; one that was there before does not notice."""
+        self._routes = routes
+        self.board.limits = routes.limits
+        self._services.replace(routes.services)
+        self._actions.replace(routes.actions)
+        self._parameters.replace(routes.parameters)
+        self._keep_ready()
+
+    def _follow(self) -> None:
+        self._services.follow()
+        self._actions.follow()
+        self._parameters.follow()
+        self._keep_ready()
+        self._announce()
+
+    def _keep_ready(self) -> None:
+        self._requests.keep_ready((*self._services.keys(), *self._actions.keys()))
+
+    def start(self) -> None:
+        """Let calls come in."""
+        self.board.start()
+        self._broker.departures.append(self._actions.departed)
+
+    async def leave(self) -> None:
+        """The bus is about to be left."""
+        await self._actions.cancel_orphans()
+
+    async def stop(self) -> None:
+        """Answer what is under way, take back what was shown; may be called twice."""
+        if self._actions.departed in self._broker.departures:
+            self._broker.departures.remove(self._actions.departed)
+        await self._actions.stop()
+        await self._parameters.stop()
+        self._services.stop()
+        await self.board.stop()
+
+    def status(self) -> list[CallStatus]:
+        """Every route's state and counters."""
+        found: list[tuple[AnySettings, CallCounters, list[str]]] = [
+            *self._services.status(),
+            *self._actions.status(),
+            *self._parameters.status(),
+        ]
+        return [CallStatus(route, tuple(names), counters) for route, counters, names in found]
+
+    def bridged(self) -> list[dict[str, str]]:
+        """Entries for `{robot}/_appliance/routes`."""
+        return [
+            *self._services.bridged(),
+            *self._actions.bridged(),
+            *self._parameters.bridged(),
+        ]
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Follow what has come and gone on the graph."""
+        routes = self._routes
+        if routes.services or routes.actions or routes.parameters:
+            self._requests.look()
+        self._services.look()
+        self._actions.look()
+        self._parameters.look()
+
+    def lost(self) -> None:
+        """The bus is gone, and with it all that was set up."""
+        self._requests.lost()
+        self._services.lost()
+        self._actions.lost()
+        self._parameters.lost()

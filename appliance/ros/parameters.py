@@ -1,0 +1,451 @@
+"""Parameters of other nodes: their values as retained topics, and calls that set them.
+
+`r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
+`/parameter_events`; byte arrays are base64. `…/_param/speed/set` sets it, `…/_param/_set` several
+of the node at once or none of them: `{"speed": 0.5, "mode": "slow"}`. The type is the one that the
+node has declared, so that `1` will do for a double. When the node goes, so do its values.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import orjson
+import pybase64
+
+from appliance.broker.message import Message
+from appliance.mqtt.codec import Properties, Property
+from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
+from appliance.ros.patterns import Names
+from appliance.ros.requests import Requests
+
+log = logging.getLogger(__name__)
+
+EVENTS = "/parameter_events"
+EVENT = "rcl_interfaces/msg/ParameterEvent"
+GET = "/get_parameters"
+
+#: Events that wait for the loop's thread; with more, all nodes are read anew.
+WAITING_EVENTS = 1000
+
+#: Seconds until a node is asked again that did not tell its parameters.
+RETRY = 2.0
+
+#: The longest that a node may take to tell them, in seconds.
+PATIENCE = 5.0
+
+#: Parameters that are asked for at a time.
+CHUNK = 200
+
+#: By the numbers of rcl_interfaces/msg/ParameterType: the field of a value, and its name.
+_FIELDS = (
+    ("", "not set"),
+    ("bool_value", "a bool"),
+    ("integer_value", "an integer"),
+    ("double_value", "a double"),
+    ("string_value", "a string"),
+    ("byte_array_value", "an array of bytes"),
+    ("bool_array_value", "an array of bools"),
+    ("integer_array_value", "an array of integers"),
+    ("double_array_value", "an array of doubles"),
+    ("string_array_value", "an array of strings"),
+)
+_NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING, _BYTES = range(6)
+_BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSettings:
+    """Parameters by patterns: of the nodes `node`, those called `name`.
+
+    `mqtt` is the topic above a node's values; a `{node}` in it stands for the node's full name.
+    `timeout` is for setting, in seconds. With `!` before `node` they are left out.
+    """
+
+    node: str
+    name: str
+    mqtt: str
+    timeout: float = 5.0
+
+
+@dataclass(eq=False, slots=True)
+class _Node:
+    """A node whose parameters are shown: by name, what is retained."""
+
+    name: str
+    base: str
+    route: ParameterSettings
+    wanted: Names
+    shown: dict[str, bytes] = field(default_factory=dict)
+    is_loading: bool = False
+    is_stale: bool = True
+    is_gone: bool = False
+
+
+class ParameterRoutes:
+    """The routes of parameters; for the loop's thread, where it does not say otherwise."""
+
+    def __init__(
+        self,
+        board: Switchboard,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        loop: asyncio.AbstractEventLoop,
+        post: Callable[..., None],
+    ) -> None:
+        self._board = board
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._loop = loop
+        self._post = post
+        self._counters: dict[ParameterSettings, CallCounters] = {}
+        self._routes: Sequence[ParameterSettings] = ()
+        self._nodes: dict[str, _Node] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._is_stopped = False
+        # Both threads'.
+        self._events: deque[bytes] = deque()
+        self._is_awake = False
+        # The ROS thread's.
+        self._subscription: RosSubscription | None = None
+        self._is_refused = False
+
+    def replace(self, routes: Sequence[ParameterSettings]) -> None:
+        """Have these routes from now on."""
+        if list(routes) == list(self._routes):
+            return
+        self._routes = routes
+        self._counters = {
+            route: self._counters.get(route) or CallCounters()
+            for route in routes
+            if not route.node.startswith("!")
+        }
+        for node in list(self._nodes.values()):  # which patterns a value is of has to be asked anew
+            self._leave(node)
+        self.follow()
+
+    def follow(self) -> None:
+        """Show the nodes that are on the bus now."""
+        there = {
+            service.removesuffix(GET)
+            for service, types in self._requests.services.items()
+            if service.endswith(GET) and "rcl_interfaces/srv/GetParameters" in types
+        }
+        for node in list(self._nodes.values()):
+            if node.name not in there:
+                self._leave(node)
+        for name in sorted(there - self._nodes.keys()):
+            self._join(name)
+
+    def _join(self, name: str) -> None:
+        mine = [route for route in self._counters if name in Names([route.node])]
+        if not mine or name == self._node.name:
+            return
+        excluded = [
+            f"!{route.name}"
+            for route in self._routes
+            if route.node.startswith("!") and name in Names([route.node[1:]])
+        ]
+        wanted = Names([*(route.name for route in mine), *excluded])
+        route = mine[0]
+        node = _Node(name, route.mqtt.replace("{node}", name), route, wanted)
+        self._nodes[name] = node
+
+        async def set_one(call: Call) -> Answer:
+            parameter = call.topic.split("/")[-2]
+            return await self._set(node, {parameter: _json(call.payload)}, at_once=False)
+
+        async def set_all(call: Call) -> Answer:
+            values = _json(call.payload)
+            if not isinstance(values, dict) or not values:
+                raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
+            return await self._set(node, values, at_once=True)
+
+        counters = self._counters[route]
+        for topic, handle in (("+/set", set_one), ("_set", set_all)):
+            what = f"{name}'s parameters"
+            self._board.offer(Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle))
+        self._load(node)
+
+    def _leave(self, node: _Node) -> None:
+        del self._nodes[node.name]
+        node.is_gone = True
+        for topic in ("+/set", "_set"):
+            self._board.withdraw(f"{node.base}/{topic}")
+        for parameter in node.shown:
+            self._board.publish(Message(f"{node.base}/{parameter}", b"", 0, True))
+        node.shown.clear()
+
+    def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
+        """Each route, what it has counted, and the nodes that it shows now."""
+        return [
+            (route, counters, [name for name in self._nodes if name in Names([route.node])])
+            for route, counters in self._counters.items()
+        ]
+
+    def bridged(self) -> list[dict[str, str]]:
+        """Entries for `{robot}/_appliance/routes`."""
+        return [
+            {
+                "ros": node.name,
+                "mqtt": node.base,
+                "type": "rcl_interfaces/msg/ParameterValue",
+                "direction": "parameters",
+                "encoding": "json",
+            }
+            for node in self._nodes.values()
+        ]
+
+    async def stop(self) -> None:
+        """The bus has been left: no value is true any more."""
+        self._is_stopped = True
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for node in list(self._nodes.values()):
+            self._leave(node)
+
+    # Values
+
+    async def _ask(self, node: _Node, verb: str, kind: str, fields: object) -> dict[str, Any]:
+        type_name = f"rcl_interfaces/srv/{kind}"
+        try:
+            request = self._converters.get(f"{type_name}_Request").from_dict(fields)
+            response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
+            return self._converters.get(f"{type_name}_Response").to_dict(response)
+        except UnknownTypeError as error:
+            raise CallError("unknown_type", str(error)) from None
+
+    def _load(self, node: _Node) -> None:
+        """Read a node's parameters, in the background, until nothing has changed meanwhile."""
+        node.is_stale = True
+        if not node.is_loading and not self._is_stopped:
+            node.is_loading = True
+            self._begin(self._read(node))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _read(self, node: _Node) -> None:
+        has_failed = False
+        while node.is_stale and not node.is_gone:
+            node.is_stale = False
+            try:
+                values = await asyncio.wait_for(self._get_all(node), PATIENCE)
+            except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if not has_failed:
+                    why = error if str(error) else "no answer"
+                    log.warning("the parameters of %s cannot be read: %s", node.name, why)
+                has_failed = node.is_stale = True
+                await asyncio.sleep(RETRY)
+                continue
+            if not node.is_stale and not node.is_gone:
+                for name in node.shown.keys() - values.keys():
+                    self._show(node, name, None)
+                for name, value in values.items():
+                    self._show(node, name, value)
+                log.info("%d parameters of %s are at %s", len(values), node.name, node.base)
+        node.is_loading = False
+
+    async def _get_all(self, node: _Node) -> dict[str, Any]:
+        listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
+        names = [name for name in listed["result"]["names"] if name in node.wanted]
+        values: dict[str, Any] = {}
+        for start in range(0, len(names), CHUNK):
+            chunk = names[start : start + CHUNK]
+            got = await self._get(node, chunk)
+            if len(got) != len(chunk):
+                # One that the node cannot give leaves all of them out.
+                single = [await self._get(node, [name]) for name in chunk]
+                chunk = [name for name, one in zip(chunk, single, strict=True) if len(one) == 1]
+                got = [one[0] for one in single if len(one) == 1]
+            values.update(zip(chunk, got, strict=True))
+        return values
+
+    async def _get(self, node: _Node, names: list[str]) -> list[Any]:
+        said = await self._ask(node, "get_parameters", "GetParameters", {"names": names})
+        values: list[Any] = said["values"]
+        return values
+
+    def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
+        """Publish a parameter as it is now; None for one that is no more."""
+        if set("+#\0") & set(name) or name not in node.wanted:
+            return
+        payload = b"" if value is None else _to_json(value)
+        if payload == node.shown.get(name, b""):
+            return
+        if payload:
+            node.shown[name] = payload
+        else:
+            del node.shown[name]
+        properties: Properties = {Property.CONTENT_TYPE: JSON}
+        self._board.publish(Message(f"{node.base}/{name}", payload, 1, True, properties))
+
+    def _take_events(self) -> None:
+        self._is_awake = False
+        events = self._events
+        if len(events) >= WAITING_EVENTS:
+            events.clear()
+            for node in self._nodes.values():
+                self._load(node)
+            return
+        while events:
+            try:
+                said = self._converters.get(EVENT).to_dict(events.popleft())
+            except (ConversionError, UnknownTypeError) as error:
+                log.warning("%s: a message cannot be read: %s", EVENTS, error)
+                continue
+            known = self._nodes.get(said["node"])
+            if known is None:
+                continue
+            if known.is_loading:
+                known.is_stale = True  # what is being read may be older, or newer
+                continue
+            for one in (*said["new_parameters"], *said["changed_parameters"]):
+                self._show(known, one["name"], one["value"])
+            for one in said["deleted_parameters"]:
+                self._show(known, one["name"], None)
+
+    # Setting
+
+    async def _set(self, node: _Node, values: dict[str, Any], *, at_once: bool) -> Answer:
+        for name in values:
+            if name not in node.wanted:
+                text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
+                raise CallError("not_authorized", text)
+        names = list(values)
+        said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
+        descriptors = {one["name"]: one for one in said["descriptors"]}
+        parameters = [
+            {"name": name, "value": to_value(name, value, descriptors.get(name, {}))}
+            for name, value in values.items()
+        ]
+        verb, kind = "set_parameters", "SetParameters"
+        if at_once:
+            verb, kind = "set_parameters_atomically", "SetParametersAtomically"
+        try:
+            said = await self._ask(node, verb, kind, {"parameters": parameters})
+        except ConversionError as error:
+            raise CallError("bad_request", f"{', '.join(names)}: {error.problem}") from None
+        result = said["result"] if at_once else (said["results"] or [{}])[0]
+        if not result.get("successful"):
+            reason = result.get("reason") or "it gives no reason"
+            raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
+        return Answer(orjson.dumps({"successful": True, "reason": result["reason"]}))
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Follow the changes of all nodes' parameters while there are routes."""
+        if self._routes and self._subscription is None and not self._is_refused:
+            try:
+                self._subscription = self._node.subscribe_raw(
+                    EVENTS, EVENT, QosProfile(depth=1000), self._on_event
+                )
+            except (BusError, UnknownTypeError) as error:
+                self._is_refused = True
+                self._post(log.error, "%s is not followed: %s", EVENTS, error)
+        elif not self._routes and self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+
+    def _on_event(self, cdr: bytes) -> None:
+        if len(self._events) < WAITING_EVENTS:
+            self._events.append(cdr)
+        if not self._is_awake:
+            self._is_awake = True
+            self._post(self._take_events)
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the subscription."""
+        self._subscription = None
+
+
+def _json(payload: bytes) -> Any:
+    try:
+        return orjson.loads(payload)
+    except orjson.JSONDecodeError as error:
+        raise CallError("bad_request", f"not JSON: {error}") from None
+
+
+def _to_json(value: Mapping[str, Any]) -> bytes:
+    """The JSON of a ParameterValue; empty when the parameter is not set."""
+    kind = value["type"]
+    return orjson.dumps(value[_FIELDS[kind][0]]) if 0 < kind < len(_FIELDS) else b""
+
+
+def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
+    """The ParameterValue of a JSON value, of the type that the node has declared.
+
+    A parameter that may have any type, or that is not declared, takes its type from the value.
+    Raises CallError: bad_request, rejected for what is read-only.
+    """
+    if descriptor.get("read_only"):
+        raise CallError("rejected", f"{name} is read-only")
+    kind = descriptor.get("type", _NOT_SET)
+    if kind == _NOT_SET or descriptor.get("dynamic_typing") or kind >= len(_FIELDS):
+        kind = _type_of(name, value)
+    field_name, expected = _FIELDS[kind]
+    if kind == _BYTES:
+        value = _to_bytes(name, value)
+    elif kind in (_BOOLS, _INTEGERS, _DOUBLES, _STRINGS):
+        if not isinstance(value, list) or not all(_is(kind - 5, item) for item in value):
+            raise _unlike(name, expected, value)
+        value = [float(item) for item in value] if kind == _DOUBLES else value
+    elif not _is(kind, value):
+        raise _unlike(name, expected, value)
+    elif kind == _DOUBLE:
+        value = float(value)
+    return {"type": kind, field_name: value}
+
+
+def _is(kind: int, value: Any) -> bool:
+    """Whether a JSON value will do for a parameter of that type, which is not an array."""
+    if kind in (_BOOL, _STRING):
+        return isinstance(value, bool if kind == _BOOL else str)
+    if isinstance(value, bool):
+        return False
+    if kind == _INTEGER:
+        return isinstance(value, int) and -(2**63) <= value < 2**63
+    return isinstance(value, (int, float))
+
+
+def _to_bytes(name: str, value: Any) -> bytes:
+    try:
+        if isinstance(value, str):
+            return pybase64.b64decode(value, validate=True)
+        if isinstance(value, list):
+            return bytes(value)
+    except (TypeError, ValueError):
+        pass
+    raise _unlike(name, "an array of bytes, as base64 or a list", value)
+
+
+def _type_of(name: str, value: Any) -> int:
+    for kind in (_BOOL, _INTEGER, _DOUBLE, _STRING):
+        if _is(kind, value):
+            return kind
+        if isinstance(value, list) and value and all(_is(kind, item) for item in value):
+            return kind + 5
+    raise CallError("bad_request", f"{name}: no parameter can have the value {_short(value)}")
+
+
+def _unlike(name: str, expected: str, value: Any) -> CallError:
+    return CallError("bad_request", f"{name}: expected {expected}, got {_short(value)}")
+
+
+def _short(value: Any) -> str:
+    text = orjson.dumps(value).decode()
+    return text if len(text) <= 60 else f"{text[:60]}…"

@@ -1,0 +1,470 @@
+"""Services both ways.
+
+`to: ros`: an MQTT client calls a ROS service, at `r2d2/reset/_call`; see calls.py for its answer.
+
+`to: mqtt`: a ROS service that an MQTT client answers. Each request is a message to
+`r2d2/name/_request/{token}`, with `r2d2/name/_response/{token}` as its Response Topic and the token
+as its Correlation Data: a 3.1.1 client takes the token from the topic. The first message there is
+the response; one with the user property `status: error`, or `{"error": …}`, says that there is
+none. ROS has no way to tell its client of a failure: the client gets the route's `on_error`, or
+nothing and runs into its own time limit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import secrets
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import orjson
+
+from appliance.broker.message import Message
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Property
+from appliance.mqtt.reason import ReasonCode
+from appliance.ros.calls import (
+    JSON,
+    REPORT_INTERVAL,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    Offer,
+    Switchboard,
+)
+from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.node import BusError, Respond, RosNode, RosService
+from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.requests import Key, Requests
+
+log = logging.getLogger(__name__)
+
+#: What every node offers; they are called only where a route names them.
+_OF_EVERY_NODE = re.compile(r"(rcl_interfaces|type_description_interfaces)/srv/.*")
+
+Post = Callable[..., None]
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSettings:
+    """A service, or a pattern of services, that go `to` ROS or to MQTT (then `type` is needed).
+
+    A `{ros}` in `mqtt` stands for the ROS name. `timeout` is in seconds. A pattern with a `type`,
+    in which `*` is a part of the name, takes only services of that type. `on_error` is the JSON of
+    the response that a ROS client gets when MQTT gave none.
+    """
+
+    ros: str
+    mqtt: str
+    to: Literal["ros", "mqtt"] = "ros"
+    type: str | None = None
+    timeout: float = 5.0
+    encoding: Literal["json", "cdr"] = "json"
+    on_error: str | None = None
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether `ros` stands for many services, or (`!`) for those that are left out."""
+        return "*" in self.ros or self.ros.startswith("!")
+
+    def base(self, ros: str) -> str:
+        """The MQTT topic above all that belong to this service."""
+        return self.mqtt.replace("{ros}", ros)
+
+
+def to_request(
+    converters: Converters, type_name: str, payload: bytes, encoding: str = "json"
+) -> bytes:
+    """The serialized message of a payload; an empty one has every field's default.
+
+    Raises CallError: bad_request, which names the field; unknown_type.
+    """
+    try:
+        converter = converters.get(type_name)
+        if encoding == "cdr":
+            converter.to_dict(payload)  # nodes end over a message that cannot be read
+            return payload
+        return converter.from_json(payload or b"{}")
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
+    except UnknownTypeError as error:
+        raise CallError("unknown_type", str(error)) from None
+
+
+class ServiceRoutes:
+    """The routes of services; for the loop's thread, where it does not say otherwise."""
+
+    def __init__(
+        self,
+        board: Switchboard,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        loop: asyncio.AbstractEventLoop,
+        post: Post,
+    ) -> None:
+        self._board = board
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._loop = loop
+        self._post = post
+        self._counters: dict[ServiceSettings, CallCounters] = {}
+        #: What is offered to MQTT, by the service's name; what to ROS, by the route.
+        self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
+        self._provided: dict[ServiceSettings, Provided] = {}
+        #: The type that a service last had.
+        self._types: dict[str, str] = {}
+
+    def replace(self, routes: Sequence[ServiceSettings]) -> None:
+        """Have these routes from now on; one that was there before does not notice."""
+        self._counters = {
+            route: self._counters.get(route) or CallCounters()
+            for route in routes
+            if not route.ros.startswith("!")
+        }
+        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        wanted = [route for route in self._counters if route.to == "mqtt"]
+        for route, provided in list(self._provided.items()):
+            if route not in wanted:
+                provided.stop()
+                del self._provided[route]
+        for route in wanted:
+            if route not in self._provided:
+                self._provided[route] = Provided(
+                    route,
+                    self._counters[route],
+                    self._board,
+                    self._converters,
+                    self._node,
+                    self._loop,
+                    self._post,
+                )
+        self.follow()
+
+    def follow(self) -> None:
+        """Offer what is on the bus now."""
+        for name, types in self._requests.services.items():
+            if self._types.get(name) not in types:
+                self._types[name] = min(types)
+        wanted = self._wanted()
+        for name, (route, offer) in list(self._offered.items()):
+            if wanted.get(name) != route:
+                self._board.withdraw(offer.topic)
+                del self._offered[name]
+        for name, route in wanted.items():
+            if name not in self._offered:
+                self._offer(name, route)
+        self._types = {
+            name: found
+            for name, found in self._types.items()
+            if name in self._requests.services or name in self._offered
+        }
+
+    def _wanted(self) -> dict[str, ServiceSettings]:
+        """The services that MQTT may call, and the route of each; names go before patterns."""
+        own = {route.ros for route in self._provided}
+        routes = [route for route in self._counters if route.to == "ros"]
+        wanted = {route.ros: route for route in reversed(routes) if not route.is_pattern}
+        for route in routes:
+            if not route.is_pattern:
+                continue
+            pattern = compile_pattern(route.ros)
+            of_type = compile_pattern(route.type) if route.type else None
+            takes_all = "*" in route.ros.rpartition("/")[2]
+            for name, types in self._requests.services.items():
+                if (
+                    name not in wanted
+                    and name not in own
+                    and pattern.fullmatch(name)
+                    and name not in self._excluded
+                    and (of_type is None or any(map(of_type.fullmatch, types)))
+                    and not (of_type is None and takes_all and _OF_EVERY_NODE.fullmatch(min(types)))
+                ):
+                    wanted[name] = route
+        return wanted
+
+    def _offer(self, name: str, route: ServiceSettings) -> None:
+        topic = f"{route.base(name)}/_call"
+        offer = Offer(
+            topic, name, route.timeout, self._counters[route], partial(self._handle, name, route)
+        )
+        self._offered[name] = route, offer
+        self._board.offer(offer)
+        log.info("%s can be called at %s", name, topic)
+
+    def _type(self, name: str, route: ServiceSettings) -> str | None:
+        fixed = route.type if route.type is not None and "*" not in route.type else None
+        return fixed or self._types.get(name)
+
+    async def _handle(self, name: str, route: ServiceSettings, call: Call) -> Answer:
+        type_name = self._type(name, route)
+        if type_name is None:
+            raise CallError("unavailable", f"there is no {name} on the bus")
+        request = to_request(self._converters, f"{type_name}_Request", call.payload, route.encoding)
+        response = await self._requests.ask(name, type_name, request)
+        response_type = f"{type_name}_Response"
+        if route.encoding == "cdr":
+            return Answer(response, response_type, "application/cdr")
+        return Answer(self._converters.get(response_type).to_json(response), response_type)
+
+    def keys(self) -> Iterable[Key]:
+        """The services that a client should be ready for."""
+        for name, (route, _) in self._offered.items():
+            type_name = self._type(name, route)
+            if type_name is not None:
+                yield name, type_name
+
+    def status(self) -> list[tuple[ServiceSettings, CallCounters, list[str]]]:
+        """Each route, what it has counted, and the services that it offers now."""
+        return [
+            (
+                route,
+                counters,
+                [name for name, (of, _) in self._offered.items() if of is route]
+                + ([route.ros] if route in self._provided else []),
+            )
+            for route, counters in self._counters.items()
+        ]
+
+    def bridged(self) -> list[dict[str, str]]:
+        """Entries for `{robot}/_appliance/routes`."""
+        entries = [
+            _entry("service", name, offer.topic, self._type(name, route), route)
+            for name, (route, offer) in self._offered.items()
+            if name in self._requests.services
+        ]
+        return entries + [
+            _entry("provided", route.ros, f"{route.base(route.ros)}/_request", route.type, route)
+            for route in self._provided
+        ]
+
+    def stop(self) -> None:
+        """The bus has been left: nothing is offered any more."""
+        for provided in self._provided.values():
+            provided.stop()
+        self._provided.clear()
+        self._offered.clear()
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Offer the services that ROS may call, once there is a bus."""
+        for provided in list(self._provided.values()):
+            provided.look()
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the services."""
+        for provided in list(self._provided.values()):
+            provided.lost()
+
+
+def _entry(
+    direction: str, ros: str, mqtt: str, type_name: str | None, route: ServiceSettings
+) -> dict[str, str]:
+    return {
+        "ros": ros,
+        "mqtt": mqtt,
+        "type": type_name or "",
+        "direction": direction,
+        "encoding": route.encoding,
+    }
+
+
+@dataclass(eq=False, slots=True)
+class _Asked:
+    """A request from ROS that MQTT has not answered yet."""
+
+    respond: Respond
+    timer: asyncio.TimerHandle
+
+
+class Provided:
+    """One ROS service that MQTT clients answer."""
+
+    def __init__(
+        self,
+        route: ServiceSettings,
+        counters: CallCounters,
+        board: Switchboard,
+        converters: Converters,
+        node: RosNode,
+        loop: asyncio.AbstractEventLoop,
+        post: Post,
+    ) -> None:
+        assert route.type is not None
+        self._route = route
+        self._counters = counters
+        self._board = board
+        self._converters = converters
+        self._node = node
+        self._loop = loop
+        self._post = post
+        self._base = route.base(route.ros)
+        self._request_type = f"{route.type}_Request"
+        self._response_type = f"{route.type}_Response"
+        self._asked: dict[str, _Asked] = {}
+        self._report_at = 0.0
+        self._board.listen(f"{self._base}/_response/+", self._on_response)
+        # The ROS thread's.
+        self._service: RosService | None = None
+        self._is_tried = False
+        self._is_over = False
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Offer the service as soon as there is a bus."""
+        if self._is_tried or self._is_over:
+            return
+        self._is_tried = True
+        route = self._route
+        assert route.type is not None
+        try:
+            self._service = self._node.create_service(route.ros, route.type, self._on_request)
+        except (BusError, UnknownTypeError) as error:
+            self._post(log.error, "%s is not offered: %s", route.ros, error)
+            self._counters.last_error = str(error)
+            return
+        self._post(log.info, "%s is offered, and answered at %s", route.ros, self._base)
+
+    def _on_request(self, cdr: bytes, respond: Respond) -> None:
+        try:
+            if self._route.encoding == "json":
+                cdr = self._converters.get(self._request_type).to_json(cdr)
+        except (ConversionError, UnknownTypeError) as error:
+            self._post(self._fail, respond, f"a request cannot be converted: {error}")
+            return
+        self._post(self._ask, cdr, respond)
+
+    def _close(self) -> None:
+        self._is_over = True
+        if self._service is not None:
+            self._service.destroy()
+            self._service = None
+
+    # The loop's thread
+
+    def _ask(self, payload: bytes, respond: Respond) -> None:
+        route = self._route
+        self._counters.calls += 1
+        if len(self._asked) >= self._board.limits.total:
+            self._fail(respond, f"too_many: {len(self._asked)} requests are under way")
+            return
+        token = secrets.token_hex(8)
+        is_json = route.encoding == "json"
+        message = Message(
+            f"{self._base}/_request/{token}",
+            payload,
+            1,
+            properties={
+                Property.CONTENT_TYPE: JSON if is_json else "application/cdr",
+                Property.RESPONSE_TOPIC: f"{self._base}/_response/{token}",
+                Property.CORRELATION_DATA: token.encode(),
+                Property.USER_PROPERTY: [("ros-type", self._request_type)],
+            },
+            expires_at=self._board.now() + route.timeout,
+        )
+        late = f"timeout: no MQTT client answered within {route.timeout:g} s"
+        timer = self._loop.call_later(route.timeout, self._give_up, token, late)
+        self._asked[token] = _Asked(respond, timer)
+        self._counters.under_way += 1
+        if self._board.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
+            self._give_up(
+                token, f"unavailable: no MQTT client subscribes to {self._base}/_request/+"
+            )
+
+    def _on_response(self, origin: Session, message: Message) -> None:
+        asked = self._forget(message.topic.rpartition("/")[2])
+        if asked is None:
+            log.debug("%s: a response to nothing under way", self._route.ros)
+            return
+        told = (message.properties or {}).get(Property.USER_PROPERTY)
+        if isinstance(told, list) and ("status", "error") in told:
+            self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
+            return
+        try:
+            cdr = to_request(
+                self._converters, self._response_type, message.payload, self._route.encoding
+            )
+        except CallError as error:
+            is_error = _is_error(message.payload)
+            what = f"rejected: {message.payload[:200]!r}" if is_error else f"bad response: {error}"
+            self._fail(asked.respond, what)
+            return
+        self._counters.answers += 1
+        self._respond(asked.respond, cdr)
+
+    def _forget(self, token: str) -> _Asked | None:
+        asked = self._asked.pop(token, None)
+        if asked is not None:
+            asked.timer.cancel()
+            self._counters.under_way -= 1
+        return asked
+
+    def _give_up(self, token: str, problem: str) -> None:
+        asked = self._forget(token)
+        if asked is not None:
+            self._fail(asked.respond, problem)
+
+    def _fail(self, respond: Respond, problem: str) -> None:
+        """Nobody gave a response: ROS gets the one that the route has for that, if any."""
+        code = problem.partition(":")[0]
+        self._counters.errors[code] += 1
+        self._counters.last_error = problem
+        now = self._loop.time()
+        if now >= self._report_at:
+            self._report_at = now + REPORT_INTERVAL
+            count = sum(self._counters.errors.values())
+            log.warning("a call of %s failed (%d so far): %s", self._route.ros, count, problem)
+        cdr = None
+        if self._route.on_error is not None:
+            try:
+                cdr = self._converters.get(self._response_type).from_json(
+                    self._route.on_error.encode()
+                )
+            except (ConversionError, UnknownTypeError) as error:
+                log.warning("on_error of %s cannot be used: %s", self._route.ros, error)
+        self._respond(respond, cdr)
+
+    def _respond(self, respond: Respond, cdr: bytes | None) -> None:
+        def send() -> None:
+            try:
+                respond(cdr)
+            except BusError as error:
+                self._post(log.warning, "%s: no response could be sent: %s", self._route.ros, error)
+
+        try:
+            self._node.call_soon(send)
+        except BusError:
+            log.debug("%s: the bus has gone", self._route.ros)
+
+    def stop(self) -> None:
+        """Offer it no longer; what is under way gets no response."""
+        self._board.ignore(f"{self._base}/_response/+")
+        for asked in self._asked.values():
+            asked.timer.cancel()
+        self._counters.under_way -= len(self._asked)
+        self._asked.clear()
+        try:
+            self._node.call_soon(self._close)
+        except BusError:
+            self._is_over = True
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the service; on the ROS thread."""
+        self._service = None
+
+
+def _is_error(payload: bytes) -> bool:
+    try:
+        value = orjson.loads(payload)
+    except orjson.JSONDecodeError:
+        return False
+    return isinstance(value, dict) and isinstance(value.get("error"), dict)
