@@ -1,0 +1,483 @@
+"""Calls and services on a FakeNode and the real broker."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import weakref
+
+import pytest
+
+pytest.importorskip("std_srvs.srv")
+from call_house import AllTypes, House, call_routes, service, until
+
+from appliance.mqtt.codec import Property
+from appliance.ros.bridge import Bridge
+from appliance.ros.calls import CallLimits
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import load_description
+from appliance.ros.node import FakeNode
+
+SET_BOOL, TRIGGER = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
+CONVERTERS = Converters(load_description)
+
+
+def cdr(type_name, value):
+    return CONVERTERS.get(type_name).from_dict(value)
+
+
+def value(type_name, data):
+    return CONVERTERS.get(type_name).to_dict(data)
+
+
+@pytest.fixture
+async def house():
+    house = House(FakeNode(types=AllTypes()))
+    yield house
+    await house.stop()
+    assert house.node.clients == house.node.own_services == []
+
+
+class Switch:
+    """A SetBool service; with `holds` the answers wait."""
+
+    def __init__(self, house, name="/switch"):
+        self.asked = []
+        self.waiting = []
+        self.holds = False
+        self.service = house.node.add_service(name, SET_BOOL, self.on_request)
+
+    def on_request(self, request, respond):
+        data = value(f"{SET_BOOL}_Request", request)["data"]
+        self.asked.append(data)
+        self.waiting.append((respond, data))
+        if not self.holds:
+            self.answer()
+
+    def answer(self):
+        for respond, data in self.waiting:
+            answer = {"success": data, "message": "on" if data else "off"}
+            respond(cdr(f"{SET_BOOL}_Response", answer))
+        self.waiting.clear()
+
+
+CALL = "r2d2/switch/_call"
+
+
+async def test_a_call_of_each_version(house):
+    house.start(service("/switch"))
+    Switch(house)
+    client = house.client("alice")
+    status, answer = await client.call(CALL, {"data": True})
+    assert (status, answer) == ("ok", {"success": True, "message": "on"})
+    (message,) = client.on("answers/alice")
+    assert message.qos == 1 and not message.retain
+    assert message.properties == {
+        Property.CORRELATION_DATA: b"alice 1",
+        Property.CONTENT_TYPE: "application/json",
+        Property.USER_PROPERTY: [("status", "ok"), ("ros-type", f"{SET_BOOL}_Response")],
+    }
+    assert await client.call_311(CALL, {"data": True}) == {"success": True, "message": "on"}
+    # An empty payload has every field's default.
+    assert await client.call_311(CALL) == {"success": False, "message": "off"}
+    counters = house.counters()
+    assert (counters.calls, counters.answers, counters.under_way) == (3, 3, 0)
+    assert not counters.errors
+
+
+async def test_many_calls_at_once_get_each_its_own_answer(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    switch.holds = True
+    clients = [house.client(f"c{i}") for i in range(10)]
+    calls = [
+        asyncio.ensure_future(client.call(CALL, {"data": bool(i % 2)}))
+        for client in clients
+        for i in range(10)
+    ]
+    await until(lambda: len(switch.asked) == 100, "the requests")
+    assert house.counters().under_way == 100
+    switch.waiting.reverse()
+    switch.answer()
+    answers = await asyncio.gather(*calls)
+    assert [answer["success"] for _, answer in answers] == [bool(i % 2) for i in range(10)] * 10
+
+
+async def test_raw_cdr(house):
+    house.start(service("/switch", encoding="cdr"))
+    Switch(house)
+    client = house.client("alice")
+    client.send(CALL, cdr(f"{SET_BOOL}_Request", {"data": True}), response_topic="answers/alice")
+    client.send(CALL, b"\0\1\0\0", response_topic="answers/alice")
+    await until(lambda: len(client.on("answers/alice")) == 2, "the answers")
+    answers = {
+        message.properties[Property.CONTENT_TYPE]: message.payload
+        for message in client.on("answers/alice")
+    }
+    assert value(f"{SET_BOOL}_Response", answers["application/cdr"])["message"] == "on"
+    assert json.loads(answers["application/json"])["error"]["code"] == "bad_request"
+
+
+async def test_a_service_that_is_absent(house):
+    house.start(service("/switch"), service("/typed", type=SET_BOOL))
+    client = house.client("alice")
+    expected = ("unavailable", "there is no /switch on the bus")
+    assert await client.error(CALL, {"data": True}) == expected
+    assert await client.error("r2d2/typed/_call", {"data": True}) == (
+        "unavailable",
+        "there is no /typed on the bus",
+    )
+    answer = await client.call_311(CALL, {"data": True})
+    assert answer["error"] == {"code": expected[0], "message": expected[1]}
+    Switch(house)
+    await asyncio.sleep(0)
+    for _ in range(3):
+        house.node.spin()
+    await asyncio.sleep(0)
+    assert (await client.call(CALL))[0] == "ok"
+
+
+async def test_a_service_that_vanishes_during_the_call(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    switch.holds = True
+    client = house.client("alice")
+    calling = asyncio.ensure_future(client.error(CALL, {"data": True}))
+    await until(lambda: switch.asked, "the request")
+    switch.service.remove()
+    assert await calling == ("vanished", "/switch went away before it answered")
+
+
+async def test_no_answer_within_the_routes_time(house):
+    house.start(service("/switch", timeout=0.05))
+    switch = Switch(house)
+    switch.holds = True
+    client = house.client("alice")
+    assert await client.error(CALL) == ("timeout", "no answer from /switch within 0.05 s")
+    switch.answer()  # too late: it is not told a second time
+    await asyncio.sleep(0.02)
+    assert len(client.on("answers/alice")) == 1
+    assert house.counters().under_way == 0
+    assert house.counters().errors == {"timeout": 1}
+
+
+@pytest.mark.parametrize(
+    ("payload", "problem"),
+    [
+        (b'{"data": 1}', "data: expected true or false, got 1"),
+        (b'{"date": true}', "date: unknown field; did you mean 'data'?"),
+        (b"{", "not JSON"),
+        (b"\xff\x00", "not JSON"),
+    ],
+)
+async def test_a_payload_that_is_wrong_names_the_field(house, payload, problem):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    code, message = await house.client("alice").error(CALL, payload)
+    assert code == "bad_request"
+    assert problem in message
+    assert switch.asked == []
+
+
+async def test_a_type_that_is_not_installed(house):
+    house.start(service("/switch"))
+    house.node.add_service("/switch", "no_pkg/srv/Thing", lambda request, respond: None)
+    for _ in range(3):
+        house.node.spin()
+    code, message = await house.client("alice").error(CALL)
+    assert code == "unknown_type"
+    assert "no_pkg" in message
+
+
+async def test_calls_are_bounded_a_client_and_in_all(house):
+    house.start()
+    house.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5)))
+    switch = Switch(house)
+    switch.holds = True
+    house.node.spin()
+    clients = [house.client(name) for name in "abcd"]
+    calls = [asyncio.ensure_future(c.call(CALL)) for c in clients[:2] for _ in range(2)]
+    await until(lambda: len(switch.asked) == 4, "the requests")
+    assert await clients[0].error(CALL) == (
+        "too_many",
+        "2 calls of this client are under way, as many as may be",
+    )
+    calls.append(asyncio.ensure_future(clients[2].call(CALL)))
+    await until(lambda: len(switch.asked) == 5, "the fifth")
+    assert await clients[3].error(CALL) == (
+        "too_many",
+        "5 calls are under way, as many as may be",
+    )
+    switch.answer()
+    assert {status for status, _ in await asyncio.gather(*calls)} == {"ok"}
+    switch.holds = False
+    assert (await clients[0].call(CALL))[0] == "ok"  # all of their places are free again
+
+
+async def test_a_call_without_a_way_back_is_not_carried_out(house, caplog):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    client = house.client("alice", "r2d2/switch/_reply/alice/#")
+    client.send(CALL, {"data": True})
+    await until(lambda: client.on("r2d2/switch/_reply/alice"), "the error")
+    (answer,) = client.payloads("r2d2/switch/_reply/alice")
+    assert answer["error"]["code"] == "no_response_topic"
+    assert "r2d2/switch/_call/TOKEN" in answer["error"]["message"]
+    assert switch.asked == []
+    assert "no_response_topic" in caplog.text
+    # A client id that cannot be in a topic: MQTT 5's way is left to it.
+    strange = house.client("a/b")
+    strange.send(f"{CALL}/1", {"data": True})
+    await asyncio.sleep(0.01)
+    assert switch.asked == []
+    assert house.counters().errors == {"no_response_topic": 2}
+    assert (await strange.call(CALL, {"data": True}, "answers/a/b"))[0] == "ok"
+
+
+async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    house.rules.deny("mallory", "publish", "r2d2/cmd_vel")
+    mallory = house.client("mallory", "r2d2/#")
+    victim = house.client("victim", "r2d2/cmd_vel", "$SYS/#")
+    for topic in ("r2d2/cmd_vel", "$SYS/broker/version"):
+        mallory.send(CALL, {"data": True}, response_topic=topic)
+    await until(lambda: len(mallory.on("r2d2/switch/_reply/mallory")) == 2, "the refusals")
+    codes = {a["error"]["code"] for a in mallory.payloads("r2d2/switch/_reply/mallory")}
+    assert codes == {"not_authorized"}
+    assert switch.asked == [] and victim.received == []
+    # Where it may publish it could have written itself.
+    assert (await mallory.call(CALL, response_topic="r2d2/elsewhere"))[0] == "ok"
+
+
+async def test_the_replies_below_its_own_name_need_the_right_to_read_them(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    house.rules.deny("alice", "publish", "r2d2/switch/_reply")
+    house.rules.deny("bob", "receive", "r2d2/switch/_reply")
+    alice = house.client("alice", "r2d2/switch/_reply/alice/#")
+    status, _ = await alice.call(CALL, response_topic="r2d2/switch/_reply/alice/mine")
+    assert status == "ok"
+    # Another's is not its own, though it begins alike.
+    alice.send(CALL, response_topic="r2d2/switch/_reply/alice2/x")
+    await until(lambda: alice.on("r2d2/switch/_reply/alice"), "the refusal")
+    before = len(switch.asked)
+    house.client("bob").send(f"{CALL}/1")
+    await until(lambda: house.counters().errors["not_authorized"] == 2, "the second refusal")
+    assert len(switch.asked) == before
+
+
+async def test_an_answer_is_no_call(house):
+    """A Response Topic that is a call topic, or a route's to ROS, does not go round."""
+    house.start(service("/switch"))
+    switch = Switch(house)
+    house.client("alice").send(CALL, {"data": True}, response_topic=CALL)
+    await until(lambda: house.counters().answers, "the answer")
+    await asyncio.sleep(0.02)
+    assert switch.asked == [True]
+
+
+async def test_a_retained_call_is_not_carried_out(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    client = house.client("alice")
+    client.send(CALL, {"data": True}, retain=True, response_topic="answers/alice")
+    await until(lambda: client.on("answers/alice"), "the error")
+    assert client.payloads("answers/alice")[0]["error"]["code"] == "bad_request"
+    assert switch.asked == []
+
+
+async def test_patterns_follow_the_bus(house):
+    house.start(
+        service("/arm/*", type="std_srvs/srv/*"), service("/**"), service("!/arm/secret")
+    )
+    node = house.node
+    Switch(house, "/arm/grip")
+    other = Switch(house, "/other")
+    Switch(house, "/arm/secret")
+    Switch(house, "/_hidden")
+    node.add_service("/node/set_parameters", "rcl_interfaces/srv/SetParameters", None)
+    for _ in range(3):
+        node.spin()
+    await asyncio.sleep(0)
+    first, second = house.bridge.calls.status()
+    assert first.names == ("/arm/grip",)
+    assert second.names == ("/other",)
+    client = house.client("alice")
+    assert (await client.call("r2d2/arm/grip/_call"))[0] == "ok"
+    routes = house.retained("r2d2/_appliance/routes")
+    assert {
+        "ros": "/other",
+        "mqtt": "r2d2/other/_call",
+        "type": SET_BOOL,
+        "direction": "service",
+        "encoding": "json",
+    } in routes
+    other.service.remove()
+    for _ in range(3):
+        node.spin()
+    await asyncio.sleep(0)
+    assert house.bridge.calls.status()[1].names == ()
+    assert [r["ros"] for r in house.retained("r2d2/_appliance/routes")] == ["/arm/grip"]
+
+
+async def test_routes_come_and_go_while_calls_are_under_way(house):
+    stays = service("/switch")
+    house.start(stays, service("/other"))
+    switch, other = Switch(house), Switch(house, "/other")
+    switch.holds = other.holds = True
+    client = house.client("alice")
+    staying = asyncio.ensure_future(client.call(CALL))
+    leaving = asyncio.ensure_future(client.error("r2d2/other/_call"))
+    await until(lambda: switch.asked and other.asked, "the requests")
+    house.bridge.calls.replace(call_routes(stays, service("/new")))
+    assert (await leaving)[0] == "stopping"
+    switch.answer()
+    assert (await staying)[0] == "ok"
+    Switch(house, "/new")
+    for _ in range(3):
+        house.node.spin()
+    await asyncio.sleep(0)
+    assert (await client.call("r2d2/new/_call"))[0] == "ok"
+    assert house.counters().calls == 1
+
+
+async def test_what_is_under_way_is_told_when_the_appliance_stops_or_ros_ends(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    switch.holds = True
+    client = house.client("alice")
+    calling = asyncio.ensure_future(client.error(CALL))
+    await until(lambda: switch.asked, "the request")
+    house.node.fail("the node ended")
+    assert await calling == ("ros_error", "the connection to ROS ended")
+    assert (await client.error(CALL))[0] in ("unavailable", "ros_error")
+    house.node.running = True
+    for _ in range(3):
+        house.node.spin()
+    await asyncio.sleep(0)
+    calling = asyncio.ensure_future(client.error(CALL))
+    await until(lambda: len(switch.asked) == 2, "the request")
+    await house.bridge.stop()
+    assert (await calling)[0] == "stopping"
+
+
+async def test_a_client_that_has_gone_leaves_nothing_behind(house):
+    house.start(service("/switch"))
+    Switch(house)
+    client = house.client("alice")
+    await client.call(CALL)
+    for token in range(20):
+        client.send(f"{CALL}/{token}")
+    await until(lambda: house.counters().answers == 21, "the answers")
+    session = weakref.ref(client.session)
+    client.leave()
+    del client
+    gc.disable()  # nobody looks for circles among what is old
+    try:
+        await asyncio.sleep(0.01)
+        assert session() is None
+    finally:
+        gc.enable()
+
+
+# ROS to MQTT
+
+
+PROVIDED = service("/ask", to="mqtt", type=SET_BOOL, timeout=0.2)
+
+
+class Asker:
+    """A ROS client of /ask."""
+
+    def __init__(self, house):
+        self.house = house
+        self.responses = []
+
+    def ask(self, data=True):
+        def done(response):
+            response = None if response is None else value(f"{SET_BOOL}_Response", response)
+            self.responses.append(response)
+
+        self.house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": data}), done)
+
+
+async def test_a_ros_service_that_mqtt_answers(house):
+    house.start(PROVIDED)
+    asker = Asker(house)
+    client = house.client("alice", "r2d2/ask/_request/+")
+    asker.ask()
+    await until(lambda: client.received, "the request")
+    (request,) = client.received
+    token = request.topic.rpartition("/")[2]
+    assert json.loads(request.payload) == {"data": True}
+    assert request.properties[Property.RESPONSE_TOPIC] == f"r2d2/ask/_response/{token}"
+    assert request.properties[Property.CORRELATION_DATA] == token.encode()
+    assert request.expires_at is not None
+    client.send(f"r2d2/ask/_response/{token}", {"success": True, "message": "hi"})
+    client.send(f"r2d2/ask/_response/{token}", {"success": False})  # the second is nobody's
+    await until(lambda: asker.responses, "the response")
+    await asyncio.sleep(0.01)
+    assert asker.responses == [{"success": True, "message": "hi"}]
+    counters = house.counters()
+    assert (counters.calls, counters.answers, counters.under_way) == (1, 1, 0)
+
+
+async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(house):
+    on_error = '{"success": false, "message": "nobody"}'
+    house.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.05, on_error=on_error))
+    asker = Asker(house)
+    nobody = {"success": False, "message": "nobody"}
+    asker.ask()  # nobody has subscribed: at once
+    await until(lambda: asker.responses == [nobody], "the first", 1)
+    client = house.client("alice", "r2d2/ask/_request/+")
+    asker.ask()  # no response
+    await until(lambda: asker.responses == [nobody] * 2, "the second")
+    for number, (payload, properties) in enumerate(
+        [
+            (b'{"success": 7}', {}),
+            (b"{", {}),
+            (b'{"error": {"code": "x", "message": "y"}}', {}),
+            (b"no", {"user_property": [("status", "error")]}),
+        ],
+        3,
+    ):
+        asker.ask()
+        await until(lambda n=number: len(client.received) == n - 1, "the request")
+        topic = client.received[-1].properties[Property.RESPONSE_TOPIC]
+        client.send(topic, payload, **properties)
+        await until(lambda n=number: asker.responses == [nobody] * n, payload)
+    assert house.counters().errors == {
+        "unavailable": 1,
+        "timeout": 1,
+        "bad response": 2,
+        "rejected": 2,
+    }
+
+
+async def test_without_on_error_ros_gets_nothing(house):
+    house.start(PROVIDED)
+    asker = Asker(house)
+    asker.ask()
+    await until(lambda: house.counters().errors, "the failure")
+    await asyncio.sleep(0.01)
+    assert asker.responses == [None]
+
+
+async def test_an_offered_service_goes_with_its_route(house):
+    house.start(PROVIDED)
+    assert [s.name for s in house.node.own_services] == ["/ask"]
+    house.bridge.calls.replace(call_routes())
+    assert house.node.own_services == []
+    house.bridge.calls.replace(call_routes(PROVIDED))
+    house.node.spin()
+    assert [s.name for s in house.node.own_services] == ["/ask"]
+
+
+async def test_bridges_without_calls_ask_nothing_of_the_graph(house):
+    house.node.services = None  # would raise
+    bridge = house.start()
+    assert isinstance(bridge, Bridge)
+    for _ in range(4):
+        house.node.spin()
