@@ -79,6 +79,7 @@ class App:
             None if ruling and not acl.exists() else acl,
             settings.robot,
             broker_settings.anonymous,
+            failed_logins=broker_settings.limits.failed_logins,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
@@ -109,7 +110,7 @@ class App:
             broker,
             frame.authenticate,
             # It would pass by plugins that refuse clients.
-            access.exchange if not authenticating else lambda method: None,
+            access.exchange if not authenticating else lambda method, address: None,
             connections=limits.connections,
             connect_timeout=limits.connect_timeout,
             connections_per_address=limits.connections_per_address,

@@ -353,6 +353,7 @@ class Limits(_Section):
     connections: Count = 1000
     connections_per_address: Count = 250
     connection_rate: Count = 100
+    failed_logins: Count = 30
     packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
     memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
     queue_messages: Count = 1000

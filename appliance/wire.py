@@ -85,7 +85,7 @@ class Network:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str], Exchange | None],
+        exchange: Callable[[str, str], Exchange | None],
         ended: Callable[[ClientProtocol], None],
         *,
         connect_timeout: float,
@@ -591,7 +591,7 @@ class ClientProtocol(Upper):
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
-        return self._network.exchange(method)
+        return self._network.exchange(method, self.address)
 
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""

@@ -58,7 +58,7 @@ class House:
         self.listeners = Listeners(
             self.broker,
             self._ask,
-            lambda method: None,
+            lambda method, address: None,
             connections=connections,
             connect_timeout=connect_timeout,
             **limits,
