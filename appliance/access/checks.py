@@ -115,4 +115,6 @@ def _stand_back() -> None:
     # On Linux a thread has a priority of its own, and needs no rights to lower it. Where there is
     # none, hashing shares the processor like everything else.
     with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        thread = threading.get_native_id()
+        priority = os.getpriority(os.PRIO_PROCESS, thread) + NICE
+        os.setpriority(os.PRIO_PROCESS, thread, min(priority, 19))
