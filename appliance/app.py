@@ -10,13 +10,15 @@ import logging
 import os
 import signal
 import ssl
+from dataclasses import asdict
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, FileAccess
+from appliance.access import AccessFileError, Changes, FileAccess
 from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
+from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Features, Limits
@@ -50,6 +52,7 @@ class App:
         self.settings = settings
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
+        self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
 
@@ -58,6 +61,7 @@ class App:
 
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
+            AuditError: the audit log cannot be written.
             PluginSettingsError: one of broker.plugins cannot be loaded.
             OSError: a port cannot be listened on.
         """
@@ -86,6 +90,12 @@ class App:
         self.broker = broker = Broker(
             access, MemoryStore(), _broker_limits(settings), _features(settings)
         )
+        audit = broker_settings.audit
+        if audit.path is not None:
+            self.audit = broker.journal = Audit(audit.path, audit.size, audit.keep)
+            self._stack.callback(self.audit.close)
+            self.audit.began()
+            self._stack.callback(self.audit.ended)
         broker.tick(loop.time())
 
         async def listen() -> None:
@@ -218,19 +228,26 @@ class App:
 
     def reload(self) -> None:
         """Take over the users and ACL files as they are now; a wrong one changes nothing."""
-        users = set(self._access.users())
         try:
-            self._access.reload()
+            changes = self._access.reload()
         except AccessFileError as error:
             log.error("not reloaded, what was in force stays so: %s", error)
+            if self.audit is not None:
+                self.audit.changed("nothing: the files cannot be used", error=str(error))
             return
-        removed = users - set(self._access.users())  # others are known to plugins
+        self._take_over(changes)
+
+    def _take_over(self, changes: Changes) -> None:
+        """Let connected clients have the rights that they have now, and no others."""
+        removed = set(changes.users_removed)  # others are known to plugins
         for session in list(self.broker.sessions.values()):
             if session.identity and session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
         self.broker.rules_changed()
         self.broker.flush()
         log.info("users and access rules reloaded")
+        if self.audit is not None:
+            self.audit.changed("users and access rules", **asdict(changes))
 
     def request_stop(self) -> None:
         """Let `run` end."""

@@ -170,6 +170,10 @@ def _parse_path(value: object, info: ValidationInfo) -> Path:
     return (base / value).absolute()
 
 
+def _parse_optional_path(value: object, info: ValidationInfo) -> Path | None:
+    return None if value is None else _parse_path(value, info)
+
+
 def _parse_qos(value: object) -> int | None:
     if value is None or value == "auto":
         return None
@@ -292,6 +296,7 @@ Mode = Annotated[
 ]
 # Defaults of paths are validated as well: that is what makes them relative to the file.
 FilePath = Annotated[Path, PlainValidator(_parse_path), Field(validate_default=True)]
+OptionalPath = Annotated[Path | None, PlainValidator(_parse_optional_path)]
 Qos = Annotated[int | None, PlainValidator(_parse_qos), PlainSerializer(_or_auto, when_used="json")]
 Retain = Annotated[
     bool | None, PlainValidator(_parse_retain), PlainSerializer(_or_auto, when_used="json")
@@ -374,6 +379,14 @@ class Limits(_Section):
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
 
 
+class AuditLog(_Section):
+    """Where is written who connected, was refused and changed what; None for nowhere."""
+
+    path: OptionalPath = None
+    size: Annotated[Size, Field(ge=1 << 10)] = 10 << 20
+    keep: Annotated[int, Field(ge=1, le=1000)] = 5
+
+
 class Broker(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
@@ -389,6 +402,7 @@ class Broker(_Section):
     anonymous: bool = False
     tls: Tls = _section()
     limits: Limits = _section()
+    audit: AuditLog = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None

@@ -142,6 +142,8 @@ class Listeners:
             connection.close()
             counters.connections_refused += 1
             self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            if self.broker.journal is not None:
+                self.broker.journal.refused(address, refusal)
             return
         protocol = ClientProtocol(self.network, address, host)
         self.network.open.add(protocol)

@@ -7,6 +7,7 @@ import hmac
 import logging
 import os
 import secrets
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -54,6 +55,59 @@ _COME_AGAIN: Final = Refusal(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What both files say, read and checked as a whole, and not in force yet."""
+
+    users_path: Path | None
+    acl_path: Path | None
+    robot: str
+    anonymous: bool
+    passwords: Passwords
+    acl: Acl | None
+
+    @classmethod
+    def read(cls, users: Path | None, acl: Path | None, robot: str, anonymous: bool) -> Rules:
+        """Reads both files; AccessFileError names all that is wrong with either."""
+        passwords, rules = Passwords(Path()), None
+        problems: list[Problem] = []
+        if users is not None:
+            try:
+                passwords = Passwords.load(users)
+            except AccessFileError as error:
+                problems += error.problems
+        if acl is not None:
+            try:
+                rules = Acl.load(acl, robot)
+            except AccessFileError as error:
+                problems += error.problems
+        if problems:
+            raise AccessFileError(problems)
+        return cls(users, acl, robot, anonymous, passwords, rules)
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What is different after a reload; users by their names, sorted."""
+
+    users_added: list[str]
+    users_removed: list[str]
+    passwords_changed: list[str]
+    rules_changed: bool
+
+    @classmethod
+    def between(cls, before: Rules, after: Rules) -> Changes:
+        """What makes `after` another than `before`."""
+        old, new = before.passwords, after.passwords
+        known, now = set(old.users()), set(new.users())
+        return cls(
+            sorted(now - known),
+            sorted(known - now),
+            sorted(name for name in known & now if old.hash_of(name) != new.hash_of(name)),
+            (before.acl.rules if before.acl else None) != (after.acl.rules if after.acl else None),
+        )
+
+
 class FileAccess:
     """The `Access` port on a users file and an ACL file; all methods are the event loop's.
 
@@ -84,11 +138,8 @@ class FileAccess:
         do everything, as in mosquitto.
         """
         self.epoch = 0
-        self._users_path = users
-        self._acl_path = acl
-        self._robot = robot
-        self._anonymous = anonymous
-        self._passwords, self._acl = self._load()
+        self._in_force = rules = Rules.read(users, acl, robot, anonymous)
+        self._passwords, self._acl = rules.passwords, rules.acl
         if acl is None:
             _log.warning("no ACL file: whoever is let in may read and write every topic")
         self._key = secrets.token_bytes(32)
@@ -105,9 +156,17 @@ class FileAccess:
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._checks: Checks[str | None] = Checks(workers, max_waiting)
 
-    def reload(self) -> None:
+    def reload(self) -> Changes:
         """Reads both files again. AccessFileError leaves what was in force in force."""
-        self._passwords, self._acl = self._load()
+        before = self._in_force
+        return self.adopt(
+            Rules.read(before.users_path, before.acl_path, before.robot, before.anonymous)
+        )
+
+    def adopt(self, rules: Rules) -> Changes:
+        """Puts into force what was read; returns what is different now. It does not fail."""
+        before, self._in_force = self._in_force, rules
+        self._passwords, self._acl = rules.passwords, rules.acl
         self._checking.clear()  # They are about the old hashes, and are not joined any more.
         self._wrong.clear()
         self._remembered = {
@@ -116,6 +175,7 @@ class FileAccess:
             if stored == self._passwords.hash_of(username)
         }
         self.epoch += 1
+        return Changes.between(before, rules)
 
     def close(self) -> None:
         """Stops the threads; logins that wait are refused. May be called twice."""
@@ -133,7 +193,7 @@ class FileAccess:
         each of its steps, a reload between them included. amqtt's plugins are not asked: they
         judge a user name and a password, and here is no password to show them.
         """
-        if method != METHOD or self._users_path is None:
+        if method != METHOD or self._in_force.users_path is None:
             return None
         guesses = self.guesses
         return ScramExchange(
@@ -153,7 +213,7 @@ class FileAccess:
     ) -> Identity | Refusal:
         """Who the client is, or why it is refused. From where it comes counts for guesses only."""
         if username is None:
-            if self._anonymous:
+            if self._in_force.anonymous:
                 return Identity(None, client_id)
             return Refusal(ReasonCode.NOT_AUTHORIZED, "no user name, and anonymous is off")
         if password is None:
@@ -258,20 +318,3 @@ class FileAccess:
     def _login(self, username: str, password: bytes) -> bytes:
         name = username.encode()
         return hmac.digest(self._key, len(name).to_bytes(4, "big") + name + password, "sha256")
-
-    def _load(self) -> tuple[Passwords, Acl | None]:
-        passwords, acl = Passwords(Path()), None
-        problems: list[Problem] = []
-        if self._users_path is not None:
-            try:
-                passwords = Passwords.load(self._users_path)
-            except AccessFileError as error:
-                problems += error.problems
-        if self._acl_path is not None:
-            try:
-                acl = Acl.load(self._acl_path, self._robot)
-            except AccessFileError as error:
-                problems += error.problems
-        if problems:
-            raise AccessFileError(problems)
-        return passwords, acl
