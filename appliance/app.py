@@ -17,14 +17,14 @@ import psutil
 import uvloop
 
 from appliance.access import AccessFileError, Changes, FileAccess
-from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
+from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
 from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import ClientCertificates, server_context
-from appliance.config import Listener, Settings, TopicRoute
+from appliance.config import Listener, Settings, TopicRoute, secrets_in
 from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
@@ -84,6 +84,7 @@ class App:
             settings.robot,
             broker_settings.anonymous,
             failed_logins=broker_settings.limits.failed_logins,
+            patience=0.6 * broker_settings.limits.connect_timeout,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
@@ -111,10 +112,18 @@ class App:
             limits.connections,
             broker_settings.plugins,
         )
+        answers = broker_settings.plugin_answers
         # In less than the listeners' time limit, so that a client is told when plugins hang.
-        plugin_timeout = 0.8 * limits.connect_timeout
         frame = ApplianceBroker(
-            broker, access, config, listen, lambda: listeners.stop(), plugin_timeout
+            broker,
+            access,
+            config,
+            listen,
+            lambda: listeners.stop(),
+            min(answers.timeout, 0.8 * limits.connect_timeout),
+            answers=Answers(answers.keep, answers.keep_refusals, answers.size),
+            secrets=secrets_in(broker_settings.plugins),
+            patience=0.2 * limits.connect_timeout,
         )
         listeners = Listeners(
             broker,

@@ -379,6 +379,15 @@ class Limits(_Section):
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
 
 
+class PluginAnswers(_Section):
+    """How long plugins may take, and for how long and how many of their answers hold."""
+
+    timeout: Annotated[Duration, Field(gt=0)] = 5.0
+    keep: Annotated[Duration, Field(ge=0)] = 10.0
+    keep_refusals: Annotated[Duration, Field(ge=0)] = 2.0
+    size: Count = 4096
+
+
 class AuditLog(_Section):
     """Where is written who connected, was refused and changed what; None for nowhere."""
 
@@ -410,6 +419,7 @@ class Broker(_Section):
     plugins: Annotated[
         dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)
     ] = {}
+    plugin_answers: PluginAnswers = _section()
 
 
 class RouteDefaults(_Section):
@@ -641,6 +651,22 @@ def mask(path: KeyPath, value: Any) -> Any:
     if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
         return MASK
     return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
+    """All that `mask` hides in a value, to be kept out of what others say about it."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from secrets_in(inner, (*path, key))
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from secrets_in(inner, path)
+    elif path and isinstance(path[-1], str) and _SECRET_KEY.search(path[-1]):
+        if value:
+            yield str(value)
+    elif isinstance(value, str):
+        for match in _URL_PASSWORD.finditer(value):
+            yield match[0].partition(":")[2]
 
 
 def describe(settings: Settings) -> dict[str, Any]:

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 _MAX_WAITING: Final = 64
 
 # Seconds that a login may wait for its turn after others from its address failed: less than clients
-# wait, and than broker.limits.connect_timeout by default.
+# wait.
 _PATIENCE: Final = 6.0
 
 # Failed logins that are known to be wrong, some 150 bytes each, and those that were sent away
@@ -131,11 +131,13 @@ class FileAccess:
         anonymous: bool = False,
         max_waiting: int = _MAX_WAITING,
         failed_logins: int = FAILED_LOGINS,
+        patience: float = _PATIENCE,
     ) -> None:
         """Reads both files; AccessFileError names all that is wrong with either.
 
         Without a users file nobody has a password here. Without an ACL file whoever came in may
-        do everything, as in mosquitto.
+        do everything, as in mosquitto. `failed_logins` in a minute cost an address or a user
+        nothing; who would have to wait longer than `patience`, in seconds, is to come again.
         """
         self.epoch = 0
         self._in_force = rules = Rules.read(users, acl, robot, anonymous)
@@ -151,6 +153,7 @@ class FileAccess:
         #: By address and login: what is found about it by the users file that is named.
         self._checking: dict[tuple[bytes, bytes], asyncio.Task[str | Refusal | None]] = {}
         self._closed = False
+        self._patience = patience
         self.guesses = Guesses(failed_logins)
         # One of two cores stays with the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
@@ -256,7 +259,7 @@ class FileAccess:
     def _turn(self, address: str, login: bytes) -> float | None:
         """In how many seconds the login is looked at; None when that is too long."""
         again = "again" if login in self._turned_away else ""
-        turn = self.guesses.turn(address, again, _PATIENCE)
+        turn = self.guesses.turn(address, again, self._patience)
         if turn is None:
             self._turned_away.add(login)
         return turn
