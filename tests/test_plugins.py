@@ -287,6 +287,8 @@ async def test_a_password_is_in_no_error(
 def test_secrets_are_taken_out_in_every_form() -> None:
     text = "url=http://h/?p=p%C3%A4ss+w%2Frd, 'p\\xe4ss', \"päss w/rd\""
     assert redacted(text, ["päss w/rd"]).count("*" * 8) == 2
+    for written in ("p%C3%A4ss w/rd", "p%c3%a4ss+w%2Frd", "p\\u00e4ss%20w/rd", "p\\xe4ss w/rd"):
+        assert redacted(f"a {written} b", ["päss w/rd"]) == "a ******** b"
     assert "abc" not in redacted("it said: abc", ["abc"])
     plugins = {"x.Y": {"secret_key": SECRET, "connection": f"sqlite://me:{SECRET}@h", "port": 1}}
     assert set(secrets_in(plugins)) == {SECRET}

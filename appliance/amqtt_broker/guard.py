@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import re
 import traceback
 from collections.abc import Coroutine, Iterable
 from typing import Any, TypeVar
-from urllib.parse import quote, quote_plus
 
 log = logging.getLogger(__name__)
 
@@ -70,18 +70,23 @@ class Guard:
 def redacted(text: str, secrets: Iterable[str]) -> str:
     """The text without the secrets, also as they stand in an address, in JSON or in a `repr`.
 
-    Of one that is too short to be told from other text, nothing is left but that it was there.
+    With one that is too short to be told from other text nothing is left.
     """
-    for secret in sorted(set(secrets), key=len, reverse=True):
-        forms = {secret, quote(secret), quote(secret, ""), quote_plus(secret)}
-        forms |= {json.dumps(secret)[1:-1], repr(secret)[1:-1]}
-        if len(secret) < _SHORT_SECRET:
-            if any(form in text for form in forms):
-                return "(not shown: a password is in it)"
-            continue
-        for form in sorted(forms, key=len, reverse=True):
-            text = text.replace(form, "********")
+    for secret in sorted(filter(None, set(secrets)), key=len, reverse=True):
+        form = re.compile("".join(map(_form, secret)), re.IGNORECASE)
+        if len(secret) < _SHORT_SECRET and form.search(text):
+            return "(not shown: it may hold a secret)"
+        text = form.sub("********", text)
     return text
+
+
+def _form(char: str) -> str:
+    """What a character may have become on its way into a message; each in its own way."""
+    encoded = "".join(f"%{byte:02x}" for byte in char.encode("utf-8", "surrogatepass"))
+    forms = {char, encoded, json.dumps(char)[1:-1], repr(char)[1:-1], ascii(char)[1:-1]}
+    if char == " ":
+        forms.add("+")
+    return f"(?:{'|'.join(map(re.escape, sorted(forms, key=len, reverse=True)))})"
 
 
 def name(plugin: object) -> str:
