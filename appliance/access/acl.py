@@ -19,6 +19,20 @@ from .problems import AccessFileError, Problem, read_text
 _BLANK: Final = " \t\n\v\f\r"
 _KEYWORDS: Final = ("topic", "pattern", "user", "include")
 
+# Bounds of what one file of rules, and all that it includes, can be: beyond these it is a mistake,
+# such as a log that was named in its place. A rule takes some 500 bytes of memory.
+_MAX_SIZE: Final = 4 * 1024 * 1024
+_MAX_RULES: Final = 100_000
+_MAX_DEPTH: Final = 16
+
+# Mistakes that are told of: nobody reads more of them.
+_MAX_PROBLEMS: Final = 100
+
+_TOO_MANY: Final = (
+    f"more than {_MAX_RULES} rules, those of files counted for each user that they are included "
+    "for; use patterns with %u for what is the same for all"
+)
+
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
 
 # Rules of which it is quicker to look at each than to search for the right ones.
@@ -64,7 +78,8 @@ class Rule:
     """One `topic` or `pattern` line.
 
     `file` is named as seen from the directory of the ACL file, `text` is the line with `{robot}`
-    replaced, and `user` is None in a pattern and in a rule for anonymous clients.
+    replaced, and `user` is None in a pattern and in a rule for anonymous clients. `via` are the
+    lines that include its file, the outermost first.
     """
 
     file: str
@@ -74,6 +89,7 @@ class Rule:
     filter: str
     user: str | None = None
     pattern: bool = False
+    via: tuple[str, ...] = ()
 
     @property
     def denies(self) -> bool:
@@ -206,6 +222,8 @@ class Explanation:
             answer = "allowed" if verdict.allowed else "refused"
             verb = _VERBS[verdict.action].partition(" ")[0]
             lines.append(f"  {verb:<9}  {answer}  {verdict.reason}")
+            if verdict.rule is not None and verdict.rule.via:
+                lines.append(f"             included by  {', then '.join(verdict.rule.via)}")
             for rule, why in verdict.passed_over:
                 lines.append(f"             passed over  {rule}  ({why})")
         return "\n".join(lines)
@@ -404,75 +422,157 @@ class _LineError(ValueError):
         self.column = column
 
 
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A line that says something: a rule, the user that the next ones are for, or a file."""
+
+    number: int
+    keyword: str
+    rest: str
+    #: Where `rest` begins, from 0.
+    column: int
+    permission: Permission = Permission.DENY
+    filter: str = ""
+    text: str = ""
+
+
 class _Reader:
     """Reads an ACL file and those that it includes: all rules, and all that is wrong."""
 
     def __init__(self, directory: Path, robot: str) -> None:
         """File names of rules are as seen from `directory`."""
-        self.rules: list[Rule] = []
         self.problems: list[Problem] = []
         self._directory = directory
         self._robot = robot
-        self._read: set[Path] = set()
+        self._told: set[Problem] = set()
+        self._lines: dict[Path, list[_Line | Problem]] = {}
+        #: By file, line and user, so that nothing counts twice however often it is included.
+        self._rules: dict[tuple[Path, int, str | None], Rule] = {}
+        self._read: set[tuple[Path, str | None]] = set()
 
-    def read(self, path: Path, including: tuple[Path, ...] = ()) -> None:
-        """Reads the file at `path`; `including` are those that led to it.
+    @property
+    def rules(self) -> list[Rule]:
+        """The rules in the order in which they were found."""
+        return list(self._rules.values())
 
-        A file begins without a user, wherever it is included, and the one that includes it goes
-        on with the user that it had. So a file always means the same, and is read once.
+    def read(
+        self,
+        path: Path,
+        user: str | None = None,
+        including: tuple[Path, ...] = (),
+        via: tuple[str, ...] = (),
+    ) -> None:
+        """Reads the file at `path`, for `user` up to its own first `user` line.
+
+        That is how a file of rules is a group: each user that it is included for has its rules.
+        The file that includes it goes on with the user that it had. `including` are the files that
+        led here, and `via` the lines.
         """
-        try:
-            text = read_text(path, "make it, or name another in appliance.yaml")
-        except AccessFileError as error:
-            self.problems += error.problems
+        file = path.resolve()
+        if (file, user) in self._read:
             return
-        self._read.add(path.resolve())
+        self._read.add((file, user))
+        name = self._name(path)
+        for line in self._parse(path, file):
+            if isinstance(line, Problem):
+                self._complain(line)
+                continue
+            try:
+                if line.keyword == "user":
+                    user = line.rest
+                elif line.keyword == "include":
+                    where = f"{name}:{line.number}"
+                    self._include(path, line, user, (*including, path), (*via, where))
+                else:
+                    self._add(file, name, line, user, via)
+            except _LineError as mistake:
+                self._complain(Problem(path, line.number, mistake.column + 1, str(mistake)))
+
+    def _name(self, path: Path) -> str:
         below = path.is_relative_to(self._directory)
-        name = str(path.relative_to(self._directory) if below else path)
-        user: str | None = None
+        return str(path.relative_to(self._directory) if below else path)
+
+    def _complain(self, problem: Problem) -> None:
+        # A group's file is gone through for each of its users.
+        if problem not in self._told and len(self._told) < _MAX_PROBLEMS:
+            self._told.add(problem)
+            self.problems.append(problem)
+
+    def _add(
+        self, file: Path, name: str, line: _Line, user: str | None, via: tuple[str, ...]
+    ) -> None:
+        pattern = line.keyword == "pattern"
+        key = file, line.number, None if pattern else user
+        if key in self._rules:
+            return
+        if len(self._rules) >= _MAX_RULES:
+            if not any(problem.message == _TOO_MANY for problem in self.problems):
+                raise _LineError(0, _TOO_MANY)
+            return
+        self._rules[key] = Rule(
+            name,
+            line.number,
+            line.text,
+            line.permission,
+            line.filter,
+            None if pattern else user,
+            pattern,
+            via,
+        )
+
+    def _include(
+        self,
+        path: Path,
+        line: _Line,
+        user: str | None,
+        including: tuple[Path, ...],
+        via: tuple[str, ...],
+    ) -> None:
+        included = path.parent / line.rest
+        if not included.is_file():
+            raise _LineError(line.column, f"there is no file {included} to include")
+        if included.resolve() in (file.resolve() for file in including):
+            way = " → ".join(file.name for file in (*including, included))
+            raise _LineError(line.column, f"a file must not include itself: {way}")
+        if len(including) > _MAX_DEPTH:
+            way = " → ".join(file.name for file in (*including, included))
+            raise _LineError(line.column, f"files include each other too deep: {way}")
+        self.read(included, user, including, via)
+
+    def _parse(self, path: Path, file: Path) -> list[_Line | Problem]:
+        """The lines of a file, looked at once, however often it is included."""
+        if file in self._lines:
+            return self._lines[file]
+        lines = self._lines[file] = []
+        try:
+            text = read_text(path, "make it, or name another in appliance.yaml", _MAX_SIZE)
+        except AccessFileError as error:
+            lines += error.problems
+            return lines
         for number, raw in enumerate(text.split("\n"), 1):
             line = raw.rstrip(_BLANK)
             if not line or line[0] == "#":
                 continue
             try:
-                column = _skip(line, 0)
-                keyword = line[column:].partition(" ")[0]
-                _check_keyword(keyword, column)
-                start = _skip(line, column + len(keyword))
-                rest = line[start:].lstrip(_BLANK)
-                if not rest:
-                    what = {"user": "a user name", "include": "a file"}.get(keyword, "a filter")
-                    raise _LineError(start, f"{what} is missing after {keyword!r}")
-                if keyword == "user":
-                    user = rest
-                elif keyword == "include":
-                    self._include(path, rest, (*including, path), start)
-                else:
-                    permission, filter = self._clause(line, start, keyword == "pattern")
-                    self.rules.append(
-                        Rule(
-                            name,
-                            number,
-                            line.strip(" ").replace("{robot}", self._robot),
-                            permission,
-                            filter,
-                            user if keyword == "topic" else None,
-                            keyword == "pattern",
-                        )
-                    )
+                lines.append(self._parse_line(number, line))
             except _LineError as mistake:
-                self.problems.append(Problem(path, number, mistake.column + 1, str(mistake)))
+                lines.append(Problem(path, number, mistake.column + 1, str(mistake)))
+        return lines
 
-    def _include(self, path: Path, target: str, including: tuple[Path, ...], column: int) -> None:
-        included = path.parent / target
-        if not included.is_file():
-            raise _LineError(column, f"there is no file {included} to include")
-        found = included.resolve()
-        if found in (file.resolve() for file in including):
-            way = " → ".join(file.name for file in (*including, included))
-            raise _LineError(column, f"a file must not include itself: {way}")
-        if found not in self._read:
-            self.read(included, including)
+    def _parse_line(self, number: int, line: str) -> _Line:
+        column = _skip(line, 0)
+        keyword = line[column:].partition(" ")[0]
+        _check_keyword(keyword, column)
+        start = _skip(line, column + len(keyword))
+        rest = line[start:].lstrip(_BLANK)
+        if not rest:
+            what = {"user": "a user name", "include": "a file"}.get(keyword, "a filter")
+            raise _LineError(start, f"{what} is missing after {keyword!r}")
+        if keyword in ("user", "include"):
+            return _Line(number, keyword, rest, start)
+        permission, filter = self._clause(line, start, keyword == "pattern")
+        text = line.strip(" ").replace("{robot}", self._robot)
+        return _Line(number, keyword, rest, start, permission, filter, text)
 
     def _clause(self, line: str, start: int, pattern: bool) -> tuple[Permission, str]:
         """What follows `topic` or `pattern` from column `start` on: [access] filter."""
