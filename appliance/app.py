@@ -24,7 +24,14 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import ClientCertificates, server_context
-from appliance.config import Listener, Settings, TopicRoute, secrets_in
+from appliance.config import (
+    OPEN_WITH_SECRETS,
+    Listener,
+    Settings,
+    TopicRoute,
+    is_open_with_secrets,
+    secrets_in,
+)
 from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
@@ -76,6 +83,8 @@ class App:
         settings = self.settings
         broker_settings = settings.broker
         users, acl = broker_settings.users, broker_settings.acl
+        if is_open_with_secrets(settings):
+            log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         # A file may be missing where plugins do its work, and only there.
         authenticating, ruling = plugin_kinds(broker_settings.plugins)
         self._access = access = FileAccess(

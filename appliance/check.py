@@ -14,7 +14,7 @@ from cryptography.exceptions import InvalidSignature
 
 from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
-from appliance.config import Settings
+from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,8 @@ def _names(certificate: x509.Certificate) -> str:
 
 
 def _plugins(settings: Settings) -> Iterator[Finding]:
+    if is_open_with_secrets(settings):
+        yield Finding("warning", str(settings.file), OPEN_WITH_SECRETS)
     for name in settings.broker.plugins:
         module = name.rpartition(".")[0]
         try:

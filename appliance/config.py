@@ -47,6 +47,11 @@ _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|ap
 _URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
 MASK = "********"
 
+OPEN_WITH_SECRETS = (
+    "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
+    "take them from environment variables, ${NAME}"
+)
+
 
 # Errors
 
@@ -667,6 +672,20 @@ def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
     elif isinstance(value, str):
         for match in _URL_PASSWORD.finditer(value):
             yield match[0].partition(":")[2]
+
+
+def is_open_with_secrets(settings: Settings) -> bool:
+    """Whether every user of this computer can read secrets in the file of these settings."""
+    if settings.file is None:
+        return False
+    try:
+        if not settings.file.stat().st_mode & 0o004:
+            return False
+        text = settings.file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    # What an environment variable has put there is not in the file.
+    return any(secret in text for secret in secrets_in(settings.broker.plugins))
 
 
 def describe(settings: Settings) -> dict[str, Any]:

@@ -29,8 +29,8 @@ from appliance.access import (
     check_password,
     check_username,
 )
-from appliance.access import acl as acl_module
 from appliance.access import passwords as passwords_module
+from appliance.access import rules as rules_module
 from appliance.broker.ports import Action, Identity
 from appliance.mqtt.reason import ReasonCode
 from appliance.mqtt.topics import matches
@@ -605,7 +605,7 @@ def test_files_that_are_too_large_too_many_and_too_deep(
         file.truncate(1 << 40)
     with pytest.raises(AccessFileError, match=r"huge\.conf: larger than 4 MiB"):
         acl_of(tmp_path, "include huge.conf\n")
-    monkeypatch.setattr(acl_module, "_MAX_RULES", 1000)
+    monkeypatch.setattr(rules_module, "_MAX_RULES", 1000)
     write(tmp_path / "group.conf", "topic read x\n" * 100)
     users = "".join(f"user u{n}\ninclude group.conf\n" for n in range(50))
     with pytest.raises(AccessFileError, match=r"group\.conf:1:1: more than") as caught:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from appliance.broker.ports import Refusal
 
-from .acl import Acl, Explanation, Permission, Rule, Verdict
+from .acl import Acl, Explanation, Verdict
 from .files import Changes, FileAccess, Rules
 from .passwords import Passwords, check_password, check_username
 from .problems import AccessFileError, Problem
+from .rules import Permission, Rule
 
 __all__ = [
     "AccessFileError",
