@@ -10,19 +10,28 @@ import logging
 import os
 import signal
 import ssl
+from dataclasses import asdict
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, FileAccess
-from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
+from appliance.access import AccessFileError, Changes, FileAccess
+from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
+from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import ClientCertificates, server_context
-from appliance.config import Listener, Settings, TopicRoute
+from appliance.config import (
+    OPEN_WITH_SECRETS,
+    Listener,
+    Settings,
+    TopicRoute,
+    is_open_with_secrets,
+    secrets_in,
+)
 from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
@@ -50,6 +59,7 @@ class App:
         self.settings = settings
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
+        self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
 
@@ -58,6 +68,7 @@ class App:
 
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
+            AuditError: the audit log cannot be written.
             PluginSettingsError: one of broker.plugins cannot be loaded.
             OSError: a port cannot be listened on.
         """
@@ -72,6 +83,8 @@ class App:
         settings = self.settings
         broker_settings = settings.broker
         users, acl = broker_settings.users, broker_settings.acl
+        if is_open_with_secrets(settings):
+            log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         # A file may be missing where plugins do its work, and only there.
         authenticating, ruling = plugin_kinds(broker_settings.plugins)
         self._access = access = FileAccess(
@@ -79,12 +92,20 @@ class App:
             None if ruling and not acl.exists() else acl,
             settings.robot,
             broker_settings.anonymous,
+            failed_logins=broker_settings.limits.failed_logins,
+            patience=0.6 * broker_settings.limits.connect_timeout,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
         self.broker = broker = Broker(
             access, MemoryStore(), _broker_limits(settings), _features(settings)
         )
+        audit = broker_settings.audit
+        if audit.path is not None:
+            self.audit = broker.journal = Audit(audit.path, audit.size, audit.keep)
+            self._stack.callback(self.audit.close)
+            self.audit.began()
+            self._stack.callback(self.audit.ended)
         broker.tick(loop.time())
 
         async def listen() -> None:
@@ -100,16 +121,24 @@ class App:
             limits.connections,
             broker_settings.plugins,
         )
+        answers = broker_settings.plugin_answers
         # In less than the listeners' time limit, so that a client is told when plugins hang.
-        plugin_timeout = 0.8 * limits.connect_timeout
         frame = ApplianceBroker(
-            broker, access, config, listen, lambda: listeners.stop(), plugin_timeout
+            broker,
+            access,
+            config,
+            listen,
+            lambda: listeners.stop(),
+            min(answers.timeout, 0.8 * limits.connect_timeout),
+            answers=Answers(answers.keep, answers.keep_refusals, answers.size),
+            secrets=secrets_in(broker_settings.plugins),
+            patience=0.2 * limits.connect_timeout,
         )
         listeners = Listeners(
             broker,
             frame.authenticate,
             # It would pass by plugins that refuse clients.
-            access.exchange if not authenticating else lambda method: None,
+            access.exchange if not authenticating else lambda method, address: None,
             _admission(settings),
         )
         self._stack.push_async_callback(listeners.stop)
@@ -213,19 +242,26 @@ class App:
 
     def reload(self) -> None:
         """Take over the users and ACL files as they are now; a wrong one changes nothing."""
-        users = set(self._access.users())
         try:
-            self._access.reload()
+            changes = self._access.reload()
         except AccessFileError as error:
             log.error("not reloaded, what was in force stays so: %s", error)
+            if self.audit is not None:
+                self.audit.changed("nothing: the files cannot be used", error=str(error))
             return
-        removed = users - set(self._access.users())  # others are known to plugins
+        self._take_over(changes)
+
+    def _take_over(self, changes: Changes) -> None:
+        """Let connected clients have the rights that they have now, and no others."""
+        removed = set(changes.users_removed)  # others are known to plugins
         for session in list(self.broker.sessions.values()):
             if session.identity and session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
         self.broker.rules_changed()
         self.broker.flush()
         log.info("users and access rules reloaded")
+        if self.audit is not None:
+            self.audit.changed("users and access rules", **asdict(changes))
 
     def request_stop(self) -> None:
         """Let `run` end."""

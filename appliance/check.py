@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from cryptography.exceptions import InvalidSignature
 
 from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
-from appliance.config import Settings
+from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Finding:
 def check(settings: Settings) -> Iterator[Finding]:
     """Everything there is to say about what these settings name, the good news included."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _plugins, _bridge]
+    parts = [_listeners, _access, _audit, _plugins, _bridge]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:
@@ -94,6 +95,22 @@ def _access(settings: Settings) -> Iterator[Finding]:
             yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
 
 
+def _audit(settings: Settings) -> Iterator[Finding]:
+    path = settings.broker.audit.path
+    if path is None:
+        return
+    directory = path.parent
+    if path.exists() and not path.is_file():
+        yield Finding("error", "broker.audit.path", f"{path} is not a regular file")
+    elif not directory.is_dir() or not os.access(directory, os.W_OK):
+        text = f"{directory} is no directory that can be written; the appliance's user must own it"
+        yield Finding("error", "broker.audit.path", text)
+    elif path.exists() and path.stat().st_mode & 0o077:
+        yield Finding("warning", str(path), "others than its owner can read it; chmod 600")
+    else:
+        yield Finding("ok", str(path), "the audit log: who connected, was refused, changed what")
+
+
 def _certificates(settings: Settings) -> Iterator[Finding]:
     tls = settings.broker.tls
     try:
@@ -122,6 +139,8 @@ def _names(certificate: x509.Certificate) -> str:
 
 
 def _plugins(settings: Settings) -> Iterator[Finding]:
+    if is_open_with_secrets(settings):
+        yield Finding("warning", str(settings.file), OPEN_WITH_SECRETS)
     for name in settings.broker.plugins:
         module = name.rpartition(".")[0]
         try:

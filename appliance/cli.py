@@ -143,11 +143,12 @@ def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
     from appliance.access import AccessFileError
     from appliance.amqtt_broker import PluginSettingsError
+    from appliance.audit import AuditError
     from appliance.certs import CertificateError
 
     try:
         yield
-    except (AccessFileError, CertificateError, PluginSettingsError) as error:
+    except (AccessFileError, AuditError, CertificateError, PluginSettingsError) as error:
         raise CommandError(str(error)) from None
 
 
@@ -226,13 +227,15 @@ def user_add(
     ] = False,
 ) -> None:
     """Add a user; the password is asked for unless an option says where it comes from."""
-    with _users(config, new=True) as users:
+    settings = _load(config)
+    with _users(settings, new=True) as users:
         if name in users.users():
             raise CommandError(
                 f"there is a user {name!r} already; `appliance user passwd` changes it"
             )
         _set_password(users, name, password_file, generate, scram)
     typer.echo(f"user {name} added to {_shown(users.path)}")
+    _note(settings, "user added", name)
 
 
 @user_app.command("passwd")
@@ -251,29 +254,33 @@ def user_passwd(
     ] = None,
 ) -> None:
     """Change a user's password."""
-    with _users(config) as users:
+    settings = _load(config)
+    with _users(settings) as users:
         if name not in users.users():
             raise CommandError(_no_user(name, users))
         _set_password(users, name, password_file, generate, scram)
     typer.echo(f"password of user {name} changed")
+    _note(settings, "password changed", name)
 
 
 @user_app.command("remove")
 def user_remove(name: str, config: ConfigOption = None) -> None:
     """Remove a user."""
-    with _users(config) as users:
+    settings = _load(config)
+    with _users(settings) as users:
         try:
             users.remove(name)
         except KeyError:
             raise CommandError(_no_user(name, users)) from None
         users.save()
     typer.echo(f"user {name} removed")
+    _note(settings, "user removed", name)
 
 
 @user_app.command("list")
 def user_list(config: ConfigOption = None) -> None:
     """Print the users' names, one a line, and how each one's password is kept."""
-    with _users(config) as users:
+    with _users(_load(config)) as users:
         names = users.users()
         width = max(map(len, names), default=0)
         for name in names:
@@ -281,9 +288,8 @@ def user_list(config: ConfigOption = None) -> None:
 
 
 @contextmanager
-def _users(config: Path | None, *, new: bool = False) -> Iterator[Passwords]:
+def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
     """The users file; what is wrong with it, or with writing it, is a CommandError."""
-    settings = _load(config)
     from appliance.access import AccessFileError, Passwords
 
     path = settings.broker.users
@@ -292,6 +298,18 @@ def _users(config: Path | None, *, new: bool = False) -> Iterator[Passwords]:
         yield users
     except AccessFileError as error:
         raise CommandError(str(error)) from None
+
+
+def _note(settings: Settings, what: str, user: str) -> None:
+    """Have a change in the audit log, if there is one; it is done whether that works or not."""
+    from appliance.audit import note
+
+    path = settings.broker.audit.path
+    try:
+        note(path, what, user=user)
+    except OSError as error:
+        message = f"appliance: {path}: this is not in the audit log ({error.strerror})"
+        typer.secho(message, fg="yellow", err=True)
 
 
 def _no_user(name: str, users: Passwords) -> str:

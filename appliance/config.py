@@ -47,6 +47,11 @@ _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|ap
 _URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
 MASK = "********"
 
+OPEN_WITH_SECRETS = (
+    "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
+    "take them from environment variables, ${NAME}"
+)
+
 
 # Errors
 
@@ -168,6 +173,10 @@ def _parse_path(value: object, info: ValidationInfo) -> Path:
         raise ValueError("must be a path")
     base: Path = (info.context or {}).get("directory", Path())
     return (base / value).absolute()
+
+
+def _parse_optional_path(value: object, info: ValidationInfo) -> Path | None:
+    return None if value is None else _parse_path(value, info)
 
 
 def _parse_qos(value: object) -> int | None:
@@ -292,6 +301,7 @@ Mode = Annotated[
 ]
 # Defaults of paths are validated as well: that is what makes them relative to the file.
 FilePath = Annotated[Path, PlainValidator(_parse_path), Field(validate_default=True)]
+OptionalPath = Annotated[Path | None, PlainValidator(_parse_optional_path)]
 Qos = Annotated[int | None, PlainValidator(_parse_qos), PlainSerializer(_or_auto, when_used="json")]
 Retain = Annotated[
     bool | None, PlainValidator(_parse_retain), PlainSerializer(_or_auto, when_used="json")
@@ -353,6 +363,7 @@ class Limits(_Section):
     connections: Count = 1000
     connections_per_address: Count = 250
     connection_rate: Count = 100
+    failed_logins: Count = 30
     packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
     memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
     queue_messages: Count = 1000
@@ -373,6 +384,23 @@ class Limits(_Section):
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
 
 
+class PluginAnswers(_Section):
+    """How long plugins may take, and for how long and how many of their answers hold."""
+
+    timeout: Annotated[Duration, Field(gt=0)] = 5.0
+    keep: Annotated[Duration, Field(ge=0)] = 10.0
+    keep_refusals: Annotated[Duration, Field(ge=0)] = 2.0
+    size: Count = 4096
+
+
+class AuditLog(_Section):
+    """Where is written who connected, was refused and changed what; None for nowhere."""
+
+    path: OptionalPath = None
+    size: Annotated[Size, Field(ge=1 << 10)] = 10 << 20
+    keep: Annotated[int, Field(ge=1, le=1000)] = 5
+
+
 class Broker(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
@@ -388,6 +416,7 @@ class Broker(_Section):
     anonymous: bool = False
     tls: Tls = _section()
     limits: Limits = _section()
+    audit: AuditLog = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None
@@ -395,6 +424,7 @@ class Broker(_Section):
     plugins: Annotated[
         dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)
     ] = {}
+    plugin_answers: PluginAnswers = _section()
 
 
 class RouteDefaults(_Section):
@@ -626,6 +656,36 @@ def mask(path: KeyPath, value: Any) -> Any:
     if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
         return MASK
     return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
+    """All that `mask` hides in a value, to be kept out of what others say about it."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from secrets_in(inner, (*path, key))
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from secrets_in(inner, path)
+    elif path and isinstance(path[-1], str) and _SECRET_KEY.search(path[-1]):
+        if value:
+            yield str(value)
+    elif isinstance(value, str):
+        for match in _URL_PASSWORD.finditer(value):
+            yield match[0].partition(":")[2]
+
+
+def is_open_with_secrets(settings: Settings) -> bool:
+    """Whether every user of this computer can read secrets in the file of these settings."""
+    if settings.file is None:
+        return False
+    try:
+        if not settings.file.stat().st_mode & 0o004:
+            return False
+        text = settings.file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    # What an environment variable has put there is not in the file.
+    return any(secret in text for secret in secrets_in(settings.broker.plugins))
 
 
 def describe(settings: Settings) -> dict[str, Any]:

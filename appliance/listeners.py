@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+from appliance.addresses import network
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
@@ -87,7 +88,7 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str], Exchange | None],
+        exchange: Callable[[str, str], Exchange | None],
         admission: Admission,
     ) -> None:
         self.broker = broker
@@ -178,6 +179,8 @@ class Listeners:
             connection.close()
             counters.connections_refused += 1
             self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            if self.broker.journal is not None:
+                self.broker.journal.refused(address, refusal)
             return
         protocol = ClientProtocol(self.network, address, host)
         self.network.open.add(protocol)
@@ -322,12 +325,12 @@ class _Addresses:
 
     def admit(self, host: str, now: float) -> str:
         """Count a new connection; or, uncounted, why it is not allowed."""
-        network = _network(host)
-        neighbour = self._known.get(network)
+        where = network(host)
+        neighbour = self._known.get(where)
         if neighbour is None:
             if len(self._known) >= self._many:
                 self._forget_idle(now)
-            neighbour = self._known[network] = _Neighbour()
+            neighbour = self._known[where] = _Neighbour()
         if neighbour.connections >= self._limit:
             return (
                 f"its address has {neighbour.connections} connections "
@@ -345,23 +348,13 @@ class _Addresses:
 
     def leave(self, host: str) -> None:
         """A connection from there ended."""
-        self._known[_network(host)].connections -= 1
+        self._known[network(host)].connections -= 1
 
     def _forget_idle(self, now: float) -> None:
         self._known = {
-            network: neighbour
-            for network, neighbour in self._known.items()
+            where: neighbour
+            for where, neighbour in self._known.items()
             if neighbour.connections or neighbour.paid_at > now
         }
         # Each is looked at once for every two that come: the work stays in proportion.
         self._many = max(ADDRESSES, 2 * len(self._known))
-
-
-def _network(host: str) -> bytes:
-    """What counts as one address: one of IPv4; of IPv6 a network of 64 bits, as one site has."""
-    if ":" not in host:
-        return socket.inet_aton(host)
-    packed = socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
-    if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
-        return packed[12:]
-    return packed[:8]

@@ -8,13 +8,13 @@ import os
 import socket
 import ssl
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import TypeAlias, cast
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from typing import Any, TypeAlias, cast
 
 from appliance import tls
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -85,7 +85,7 @@ class Network:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str], Exchange | None],
+        exchange: Callable[[str, str], Exchange | None],
         ended: Callable[[ClientProtocol], None],
         *,
         connect_timeout: float,
@@ -312,6 +312,8 @@ class ClientProtocol:
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
         self._broker.complaints.tell(now, (self.host, what), "%s", message)
+        if self._broker.journal is not None:
+            self._broker.journal.refused(self.address, f"{what}: {why}")
 
     def eof_received(self) -> None:
         """The client sends no more; the transport closes."""
@@ -599,11 +601,18 @@ class ClientProtocol:
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
-        return self._network.exchange(method)
+        return self._network.exchange(method, self.address)
 
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""
         self._timeout.cancel()
+
+    def secured(self) -> Secured:
+        """The version of TLS, and the name in the client's certificate."""
+        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
+        if peer is None:
+            return Secured()
+        return Secured(peer.version() or "", _name_in(peer.getpeercert()))
 
     def later(self) -> None:
         """Let the others have their turn, then let the client go on; it is not read before that."""
@@ -692,6 +701,10 @@ class _Gone:
     def accepted(self) -> None:
         """Nobody waits for it."""
 
+    def secured(self) -> Secured:
+        """Nothing is left to be secured."""
+        return Secured()
+
     def later(self) -> None:
         """There is nothing to go on with."""
 
@@ -746,6 +759,17 @@ class _Farewell:
 
 
 _SCRATCH = bytearray(256 * 1024)
+
+
+def _name_in(certificate: Mapping[str, Any] | None) -> str:
+    """The common name of a certificate's subject, or else its first alternative name."""
+    if not certificate:
+        return ""
+    for part in certificate.get("subject", ()):
+        for key, value in part:
+            if key == "commonName":
+                return str(value)
+    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")
 
 
 def _tls_reason(error: BaseException) -> str:

@@ -58,7 +58,7 @@ class House:
         self.listeners = Listeners(
             self.broker,
             self._ask,
-            lambda method: None,
+            lambda method, address: None,
             Admission(connections, connect_timeout, **limits),
         )
         return self.listeners

@@ -22,6 +22,7 @@ from appliance.broker.ports import (
     Decision,
     Features,
     Identity,
+    Journal,
     Limits,
     Link,
     Observer,
@@ -131,6 +132,7 @@ class Broker:
         self.retained: TopicTree[Message] = TopicTree()
         self.retained_bytes = 0
         self.observer: Observer | None = None
+        self.journal: Journal | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
         #: Network clients with bytes to write.
@@ -578,7 +580,12 @@ class Broker:
         self.counters.publish_refused += 1
         if self.observer is not None:
             self.observer.refused(session, message)
+        self._tell_denied(session, Action.PUBLISH, route.topic, route.reason)
         self.complain(session, "may not publish to %s: %s", quote(route.topic), route.reason)
+
+    def _tell_denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        if self.journal is not None and session.identity is not None:
+            self.journal.denied(session, action, topic, reason)
 
     def complain(self, session: Session, message: str, *args: object) -> None:
         """Log what a client does wrong, but not every time that it does it again."""
@@ -654,6 +661,7 @@ class Broker:
         if refusal is not None:
             code, reason = refusal
             name = quote(subscription.filter)
+            self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
             self.complain(session, "may not subscribe to %s: %s", name, reason)
             return code
         if session.subscriptions.get(subscription.filter) != subscription:

@@ -19,7 +19,7 @@ from appliance.broker.handshake import (
     pending_will,
 )
 from appliance.broker.message import Message
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.broker.session import Held, Session
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
@@ -93,6 +93,9 @@ class Wire(Protocol):
 
     def accepted(self) -> None:
         """The client has logged in: the time limit for that is over."""
+
+    def secured(self) -> Secured:
+        """What protects the connection, and who its certificate says that the client is."""
 
     def later(self) -> None:
         """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
@@ -417,6 +420,7 @@ class Client:
             )
         log.info("%s disconnected", self)
         self._leave(
+            "it disconnected",
             publish_will=packet.reason_code != ReasonCode.NORMAL_DISCONNECTION,  # [MQTT-3.14.4-3]
             expiry=expiry if isinstance(expiry, int) else None,
         )
@@ -517,6 +521,9 @@ class Client:
             self.wire.address,
             reason,
         )
+        if self.broker.journal is not None:
+            address, secured = self.wire.address, self.wire.secured()
+            self.broker.journal.refused(address, reason, code, name, user, secured)
         self._counters.connects_refused += 1
         self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
@@ -578,6 +585,9 @@ class Client:
             agreement.keep_alive,
             ", session continued" if present else "",
         )
+        if self.broker.journal is not None:
+            address, secured = self.wire.address, self.wire.secured()
+            self.broker.journal.connected(session, address, packet.version, secured)
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
 
@@ -714,7 +724,7 @@ class Client:
         elif self.session is None or isinstance(packet, Connack):
             # There is nothing to refuse it with [MQTT-3.14.0-1].
             self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
-            self._leave(publish_will=False)
+            self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
         elif not isinstance(packet, Disconnect):
             reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
             self.close(ReasonCode.PACKET_TOO_LARGE, reason)
@@ -768,6 +778,8 @@ class Client:
         """The client broke the protocol: tell it why, where it can be told, and close."""
         self._complain("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
+            if self.broker.journal is not None:
+                self.broker.journal.refused(self.wire.address, str(error), error.code)
             # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
             # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
@@ -778,7 +790,7 @@ class Client:
         elif error.told:
             self._end(error.code, str(error))
         else:
-            self._leave(publish_will=True)
+            self._leave(str(error), publish_will=True)
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
@@ -789,7 +801,7 @@ class Client:
         if self._version == 5:
             words: Properties | None = {Property.REASON_STRING: message} if self._explain else None
             self._send(Disconnect(reason, words))
-        self._leave(publish_will=True)
+        self._leave(message, publish_will=True)
 
     def _complain(self, message: str, *args: object) -> None:
         """Log what came from the client's address, unless it is a flood."""
@@ -802,7 +814,7 @@ class Client:
         if not self._closed:
             if self.session is not None:
                 log.info("%s: connection lost", self)
-            self._leave(publish_will=True)
+            self._leave("connection lost", publish_will=True)
 
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
@@ -811,10 +823,12 @@ class Client:
         self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
         return True
 
-    def _leave(self, *, publish_will: bool, expiry: int | None = None) -> None:
+    def _leave(self, why: str, *, publish_will: bool, expiry: int | None = None) -> None:
         session = self.session
         self._shut()
         if session is not None:
+            if self.broker.journal is not None:
+                self.broker.journal.disconnected(session, self.wire.address, why)
             self.broker.disconnect(session, self, publish_will=publish_will, expiry=expiry)
 
     def _shut(self) -> None:

@@ -180,6 +180,41 @@ class Observer(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Secured:
+    """How a connection is secured: the version of TLS, and the name in the client's certificate.
+
+    Both are empty where there is none.
+    """
+
+    version: str = ""
+    certificate: str = ""
+
+
+class Journal(Protocol):
+    """Told of who comes, who is refused, and who leaves: an audit log. Not of messages."""
+
+    def connected(self, session: Session, address: str, version: int, secured: Secured) -> None:
+        """A client came in, with this version of MQTT."""
+
+    def refused(
+        self,
+        address: str,
+        reason: str,
+        code: int = 0,
+        client_id: str | None = None,
+        username: str | None = None,
+        secured: Secured | None = None,
+    ) -> None:
+        """A connection, or the client on it, did not come in; who it is, it said itself."""
+
+    def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        """The rules do not let a client publish or subscribe."""
+
+    def disconnected(self, session: Session, address: str, reason: str) -> None:
+        """A client's connection ended."""
+
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """What the standard leaves to the server's operator; see `broker` in appliance.yaml."""
 

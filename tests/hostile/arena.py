@@ -113,6 +113,9 @@ class Arena:
             problems.append(seen.failure)
         if seen.worst > ROUND_TRIP:
             problems.append(f"a round trip took {seen.worst * 1000:.0f} ms")
+        p99 = seen.percentile(0.99)
+        if p99 > attack.p99:
+            problems.append(f"p99 of the round trips is {p99 * 1000:.0f} ms")
         bound = base + _size(limits["memory"]) + _size(limits["retained_bytes"]) + ALLOWANCE
         if peak > bound:
             problems.append(f"memory: {peak // MIB} MiB, over the bound of {bound // MIB} MiB")
