@@ -20,7 +20,7 @@ from typing import Literal, cast
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
-from appliance.wire import FAREWELLS, Authenticate, ClientProtocol, Network
+from appliance.wire import FAREWELLS, Authenticate, Certificates, ClientProtocol, Network
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,9 @@ HANDSHAKES = 64
 #: it is the network that they wait for, or they are not meant to end.
 HANDSHAKE_STALL = 0.25
 
+#: Certificates that are looked at in one go when they are looked at anew, at most 0.2 ms each.
+CHECKED_A_TURN = 16
+
 #: Seconds that one address may open connections ahead of `limits.connection_rate`.
 CONNECTION_BURST = 5.0
 
@@ -57,12 +60,13 @@ OTHER_FILES = FAREWELLS + 256
 class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
-    `context` is None for a connection without TLS.
+    `context` is asked at each connection for its TLS settings, so that these can be replaced; None
+    is for connections without TLS.
     """
 
     host: str
     port: int
-    context: ssl.SSLContext | None
+    context: Callable[[], ssl.SSLContext] | None
     protocol: Literal["mqtt", "websocket"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
@@ -85,6 +89,7 @@ class Listeners:
         connections_per_address: float = math.inf,
         connection_rate: float = math.inf,
         publish_rate: float = math.inf,
+        certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
         self.connections = connections
@@ -95,6 +100,7 @@ class Listeners:
             self._ended,
             connect_timeout=connect_timeout,
             publish_rate=publish_rate,
+            certificates=certificates,
         )
         self._addresses = _Addresses(connections_per_address, connection_rate)
         self._doors: list[_Door] = []
@@ -153,7 +159,8 @@ class Listeners:
     ) -> None:
         try:
             is_websocket = listener.protocol == "websocket"
-            await protocol.begin(connection, listener.context, websocket=is_websocket)
+            context = listener.context and listener.context()
+            await protocol.begin(connection, context, websocket=is_websocket)
         finally:
             self._handshakes.discard(protocol)
             if self._stall is not None:
@@ -184,6 +191,14 @@ class Listeners:
             self._stall = None
         for door in self._doors:
             door.open()
+
+    async def check_certificates(self) -> None:
+        """End the connections whose client's certificate is not, or no longer, accepted."""
+        for number, protocol in enumerate(list(self.network.open)):
+            protocol.check_certificate()
+            if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
+                await asyncio.sleep(0)
+        self.broker.flush()
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""
