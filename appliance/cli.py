@@ -15,10 +15,21 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
+from appliance.cert_command import cert_app
+from appliance.console import (
+    CommandError,
+    ConfigOption,
+    GenerateOption,
+    PasswordFileOption,
+    new_password,
+)
+from appliance.console import load as _load
+from appliance.console import read_password as _read_password
+from appliance.console import shown as _shown
+
 if TYPE_CHECKING:
     from appliance.access import Passwords
     from appliance.client import Target
-    from appliance.config import Settings
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -30,27 +41,7 @@ user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
 acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
-
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        "-c",
-        metavar="FILE",
-        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
-    ),
-]
-PasswordFileOption = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
-]
-GenerateOption = Annotated[
-    bool, typer.Option("--generate", help="Make a random password, and show it once.")
-]
-
-
-class CommandError(Exception):
-    """Told to the user as it is; the command ends with exit code 1."""
+app.add_typer(cert_app, name="cert")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -69,15 +60,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         what = f"{error.filename}: {what}" if error.filename else what
         typer.secho(f"appliance: {what}", fg="red", err=True)
     sys.exit(1)
-
-
-def _load(config: Path | None) -> Settings:
-    from appliance.config import ConfigError, load
-
-    try:
-        return load(config)
-    except ConfigError as error:
-        raise CommandError(f"the configuration cannot be used\n{error}") from None
 
 
 # Setting up, running, checking
@@ -301,18 +283,7 @@ def _no_user(name: str, users: Passwords) -> str:
 def _set_password(
     users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
 ) -> None:
-    if generate and file:
-        raise typer.BadParameter("--generate and --password-file exclude each other")
-    if generate:
-        from appliance.init import generate_password
-
-        password = generate_password()
-    elif file:
-        password = _read_password(file)
-    elif sys.stdin.isatty():
-        password = typer.prompt(f"Password of {name}", hide_input=True, confirmation_prompt=True)
-    else:
-        raise CommandError("no terminal to ask on; use --generate or --password-file")
+    password = new_password(name, file, generate)
     try:
         users.set(name, password, scram)
     except ValueError as error:
@@ -320,11 +291,6 @@ def _set_password(
     users.save()
     if generate:
         typer.echo(f"password {password}")
-
-
-def _read_password(file: str) -> str:
-    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
-    return text.split("\n", 1)[0].rstrip("\r")
 
 
 # Access
@@ -511,14 +477,6 @@ def _target(
         raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
     protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
     return Target(host, port or 8883, ca, user, password, client_id, protocol, insecure)
-
-
-def _shown(path: Path) -> str:
-    """The path as a user of this folder would type it."""
-    try:
-        return str(path.absolute().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
 
 
 def _version(wanted: bool) -> None:

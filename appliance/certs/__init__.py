@@ -23,9 +23,10 @@ from .contexts import (
     load_tls,
     server_context,
 )
-from .export import write_bundle, write_pkcs12
+from .export import check_password, write_bundle, write_pkcs12
 from .files import CertificateError, issued_by, load_certificates, load_key
 from .identity import username_of
+from .listing import Listed, listed
 from .registry import Issued
 from .renewal import keep_server_certificate
 from .requests import REQUEST_SIZE
@@ -36,16 +37,19 @@ __all__ = [
     "CertificateError",
     "ClientCertificates",
     "Issued",
+    "Listed",
     "LoadedTls",
     "TlsContexts",
     "TlsFiles",
     "TlsPolicy",
+    "check_password",
     "create_authority",
     "issue_client",
     "issue_server",
     "issued",
     "issued_by",
     "keep_server_certificate",
+    "listed",
     "load_certificates",
     "load_key",
     "load_tls",

@@ -278,8 +278,8 @@ class _Authority:
         certificate = self._sign(key, common_name, kind, alternatives)
         if new is not None:
             write_key(key_file, new, replace=True)
-            for made_of_it in (".p12", ".pem"):
-                path.with_name(path.name + made_of_it).unlink(missing_ok=True)
+        for made_of_it in (".p12", ".pem"):  # of the certificate before
+            path.with_name(path.name + made_of_it).unlink(missing_ok=True)
         # The list first: what is in nobody's list cannot be revoked by its name.
         entry = registry.record(certificate, self.certificate, path.name, kind)
         self.save([*self.entries, entry])
@@ -429,7 +429,7 @@ def _entries(directory: Path, authority: x509.Certificate) -> list[Issued]:
     entries = [entry for entry in registry.load(directory) if entry.authority == own]
     known = {entry.serial for entry in entries}
     for file in (directory / "server.crt", *sorted((directory / "clients").glob("*.crt"))):
-        if file.is_file():
+        with contextlib.suppress(CertificateError):  # what is no certificate is not ours
             certificate = load_certificates(file)[0]
             if certificate.serial_number not in known and issued_by(certificate, authority):
                 kind: Kind = "server" if file.parent == directory else "client"

@@ -20,15 +20,20 @@ SHORTEST_PASSWORD: Final = 8
 _ROUNDS: Final = 100_000
 
 
+def check_password(password: str) -> None:
+    """CertificateError when the password is none for a file that gets around."""
+    if len(password) < SHORTEST_PASSWORD:
+        raise CertificateError(
+            f"a password of less than {SHORTEST_PASSWORD} characters is found by trying"
+        )
+
+
 def write_pkcs12(directory: Path, name: str, password: str) -> Path:
     """Writes `clients/NAME.p12`: key, certificate and `ca.crt` (RFC 7292). Returns its path.
 
     CertificateError when one of them is missing or unfit, or the password too short.
     """
-    if len(password) < SHORTEST_PASSWORD:
-        raise CertificateError(
-            f"a password of less than {SHORTEST_PASSWORD} characters is found by trying"
-        )
+    check_password(password)
     path, key = _key_of(directory, name)
     certificate = load_certificates(path.with_name(f"{name}.crt"))[0]
     # Not AES, which is newer than many phones: iOS before 16, Android before 13 and Windows 10

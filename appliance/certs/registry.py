@@ -34,7 +34,7 @@ class Issued:
     serial: int
     name: str
     kind: Kind
-    issued: datetime
+    starts: datetime
     expires: datetime
     key: str
     authority: str
@@ -117,13 +117,13 @@ def _decode(path: Path, data: bytes) -> Iterator[Issued]:
 def _entry(values: dict[str, Any]) -> Issued:
     if values["kind"] not in get_args(Kind):
         raise ValueError(f"kind {values['kind']!r}")
-    issued, expires = (datetime.fromisoformat(values[name]) for name in ("issued", "expires"))
+    starts, expires = (datetime.fromisoformat(values[name]) for name in ("starts", "expires"))
     revoked = datetime.fromisoformat(values["revoked"]) if "revoked" in values else None
-    if any(time is not None and time.tzinfo is None for time in (issued, expires, revoked)):
+    if any(time is not None and time.tzinfo is None for time in (starts, expires, revoked)):
         raise ValueError("a time without its zone")
     texts = [values[name] for name in ("name", "key", "authority")]
     if not all(isinstance(text, str) for text in texts):
         raise ValueError("name, key and authority must be texts")
     name, key, authority = texts
     serial = int(values["serial"], 16)
-    return Issued(serial, name, values["kind"], issued, expires, key, authority, revoked)
+    return Issued(serial, name, values["kind"], starts, expires, key, authority, revoked)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ipaddress
 import shutil
 import socket
 import ssl
@@ -12,6 +11,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
+from authorities import ADDRESSES, NAMES
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
@@ -25,28 +25,6 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from appliance import certs
 from appliance.certs import CertificateError, addresses, authority, files
-
-NAMES = ["r2d2", "r2d2.local", "localhost"]
-ADDRESSES: list[certs.Address] = [
-    ipaddress.IPv4Address("127.0.0.1"),
-    ipaddress.IPv6Address("::1"),
-]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with an authority, a server's certificate and a client's; nobody changes it."""
-    directory = tmp_path_factory.mktemp("appliance") / "certs"
-    certs.create_authority(directory, "r2d2")
-    certs.issue_server(directory, NAMES, ADDRESSES)
-    certs.issue_client(directory, "tablet")
-    return directory
-
-
-@pytest.fixture
-def own(made: Path, tmp_path: Path) -> Path:
-    """A copy of it to change."""
-    return Path(shutil.copytree(made, tmp_path / "certs"))
 
 
 def load(path: Path) -> x509.Certificate:
