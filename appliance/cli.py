@@ -330,6 +330,13 @@ CaOption = Annotated[
     Path | None,
     typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
 ]
+CertOption = Annotated[
+    Path | None,
+    typer.Option("--cert", metavar="FILE", help="A client certificate, with its key in it or in:"),
+]
+KeyOption = Annotated[
+    Path | None, typer.Option("--key", metavar="FILE", help="The key of the client certificate.")
+]
 UserOption = Annotated[
     str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
 ]
@@ -372,6 +379,8 @@ def pub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -389,7 +398,9 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -415,6 +426,8 @@ def sub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -423,7 +436,9 @@ def sub(
     config: ConfigOption = None,
 ) -> None:
     """Subscribe, and print what comes, a message a line."""
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -452,6 +467,8 @@ def _target(
     client_id: str,
     version: Literal["5", "311"],
     insecure: bool,
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> Target:
     """Where to connect and as whom; what no option says is taken from the configuration, if any."""
     from paho.mqtt.enums import MQTTProtocolVersion
@@ -476,7 +493,8 @@ def _target(
     else:
         raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
     protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
-    return Target(host, port or 8883, ca, user, password, client_id, protocol, insecure)
+    address = (host, port or 8883)
+    return Target(*address, ca, user, password, client_id, protocol, insecure, cert, key)
 
 
 def _version(wanted: bool) -> None:

@@ -286,7 +286,7 @@ class ApplianceBroker(amqtt.broker.Broker):
     ) -> Identity | Refusal:
         if connect.username not in (None, "", owner):
             # Two names are one too many to guess whose rights are meant.
-            reason = f"its certificate is user {quote(owner)}'s, and it says to be another one"
+            reason = f"its certificate is of user {quote(owner)}, and it says to be another one"
             return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
 
         def login() -> AmqttSession:
