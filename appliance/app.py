@@ -185,8 +185,7 @@ class App:
             try:
                 reason = await asyncio.to_thread(keep_server_certificate, tls.files)
                 if reason:
-                    loaded = await asyncio.to_thread(tls.prepare)
-                    self._take_tls(loaded)
+                    self._take_tls(tls.prepare())
                     log.info("the server's certificate was renewed: %s", reason)
             except (CertificateError, OSError) as error:
                 problems = [f"the server's certificate is not renewed: {error}"]

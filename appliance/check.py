@@ -106,7 +106,7 @@ def _certificates(settings: Settings) -> Iterator[Finding]:
     text = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d}, for {_names(certificate)}"
     yield Finding("ok", str(tls.certificate), text)
     yield from (Finding("warning", "tls", text) for text in loaded.warnings())
-    revoked = len(loaded.revocations.dates)
+    revoked = len(loaded.revocations)
     if revoked:
         yield Finding("ok", str(loaded.files.revocations), f"revoked certificates: {revoked}")
     yield from _own_authority(tls.ca, certificate, str(tls.certificate))

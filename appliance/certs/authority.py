@@ -352,8 +352,9 @@ class _Authority:
         if path.exists():
             for before in parse_crls(path, read(path, CRL_SIZE), [self.certificate]):
                 dates |= {item.serial_number: item.revocation_date_utc for item in before}
-                numbers = before.extensions.get_extension_for_class(x509.CRLNumber)
-                number = max(number, numbers.value.crl_number + 1)
+                for extension in before.extensions:
+                    if isinstance(extension.value, x509.CRLNumber):
+                        number = max(number, extension.value.crl_number + 1)
         dates |= {e.serial: e.revoked for e in entries if e.revoked and e.serial not in dates}
         builder = (
             x509.CertificateRevocationListBuilder()

@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from .files import (
     CERTIFICATES_SIZE,
+    MALFORMED,
     CertificateError,
     issued_by,
     load_key,
@@ -83,6 +84,8 @@ class LoadedTls:
     authorities: list[x509.Certificate]
     revocations: Revocations
     contexts: Mapping[str, ssl.SSLContext]
+    #: Counts those that were in force one after the other.
+    generation: int
 
     def warnings(self, now: datetime | None = None) -> list[str]:
         """What has run out or does soon, each with what to do."""
@@ -92,7 +95,8 @@ class LoadedTls:
 class TlsContexts:
     """TLS as the listeners use it now, by name of the listener.
 
-    It asks no lock: `prepare` may run in any thread, all else is the event loop's.
+    `prepare` may run in any thread, so that a long revocation list keeps nobody waiting; all else
+    is the event loop's.
     """
 
     def __init__(
@@ -110,7 +114,8 @@ class TlsContexts:
         self._username_from: UsernameFrom = username_from
         self._trusted: WeakKeyDictionary[ssl.SSLContext, frozenset[x509.Certificate]]
         self._trusted = WeakKeyDictionary()
-        self._take(_load(files, policies, None))
+        self._loaded = _load(files, policies, None)
+        self._remember()
 
     def prepare(
         self, files: TlsFiles | None = None, policies: Mapping[str, TlsPolicy] | None = None
@@ -126,17 +131,20 @@ class TlsContexts:
     def take(self, loaded: LoadedTls) -> bool:
         """Let it hold for all connections to come; returns whether it is something new.
 
-        Those that are open are looked at with `refusal`.
+        Those that are open are looked at with `refusal`. CertificateError when others were taken
+        after these were read: they may know of more revocations.
         """
         if loaded is self._loaded:
             return False
-        self._take(loaded)
+        if loaded.generation != self._loaded.generation + 1:
+            raise CertificateError("certificates were replaced meanwhile; to be read once more")
+        self._loaded = loaded
+        self._remember()
         return True
 
-    def _take(self, loaded: LoadedTls) -> None:
-        self._loaded = loaded
-        for context in loaded.contexts.values():
-            self._trusted[context] = frozenset(loaded.authorities)
+    def _remember(self) -> None:
+        for context in self._loaded.contexts.values():
+            self._trusted[context] = frozenset(self._loaded.authorities)
 
     def reload(self) -> bool:
         """Take over the files as they are now, all or nothing; see `prepare` and `take`."""
@@ -158,7 +166,7 @@ class TlsContexts:
         try:
             certificate = x509.load_der_x509_certificate(der)
             date = self._loaded.revocations.date(certificate)
-        except ValueError as error:
+        except MALFORMED as error:
             return f"its certificate cannot be read: {error}"
         who = f"its certificate {serial_text(certificate.serial_number)}"
         if date is not None:
@@ -181,7 +189,10 @@ class TlsContexts:
         der = tls.getpeercert(binary_form=True)
         if not der:
             return None
-        return username_of(x509.load_der_x509_certificate(der), self._username_from)
+        try:
+            return username_of(x509.load_der_x509_certificate(der), self._username_from)
+        except MALFORMED as error:
+            raise ValueError(str(error)) from None
 
     def warnings(self, now: datetime | None = None) -> list[str]:
         """What has run out or does soon, each with what to do."""
@@ -246,7 +257,8 @@ def _load(
     if problems:
         raise CertificateError(*problems)
     contexts = {name: made[policy] for name, policy in policies.items()}
-    return LoadedTls(files, policies, digest, chain, authorities, revocations, contexts)
+    generation = 0 if before is None else before.generation + 1
+    return LoadedTls(files, policies, digest, chain, authorities, revocations, contexts, generation)
 
 
 @contextlib.contextmanager
@@ -290,9 +302,9 @@ def _revocations(
     path = files.revocations
     if path is not None and path.exists():
         return load_revocations(path, _read(path, CRL_SIZE, hashed), authorities)
-    if before is not None and before.files == files and before.revocations.dates:
+    if before is not None and before.files == files and before.revocations:
         raise CertificateError(
-            f"{path} is gone, by which {len(before.revocations.dates)} certificates were revoked; "
+            f"{path} is gone, by which {len(before.revocations)} certificates were revoked; "
             "put it back (`appliance cert crl` makes ours anew), or start the appliance anew"
         )
     return NOTHING_REVOKED

@@ -22,6 +22,18 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+#: What the library raises over a certificate, a request or a list that is not as it should be; some
+#: of it only when a part of it is looked at.
+MALFORMED: Final = (
+    ValueError,
+    TypeError,
+    InvalidSignature,
+    UnsupportedAlgorithm,
+    x509.DuplicateExtension,
+    x509.InvalidVersion,
+    x509.UnsupportedGeneralNameType,
+)
+
 # A bundle of all authorities of the Web is a quarter of this.
 CERTIFICATES_SIZE: Final = 1 << 20
 KEY_SIZE: Final = 64 << 10
@@ -78,9 +90,12 @@ def load_certificates(path: Path) -> list[x509.Certificate]:
 def parse_certificates(path: Path, data: bytes) -> list[x509.Certificate]:
     """The same of what was read from there."""
     try:
-        return x509.load_pem_x509_certificates(data)
-    except ValueError:
+        certificates = x509.load_pem_x509_certificates(data)
+        for certificate in certificates:
+            _ = certificate.public_key(), certificate.subject, certificate.extensions
+    except MALFORMED:
         raise CertificateError(f"{path} is not a certificate in PEM form") from None
+    return certificates
 
 
 def load_key(path: Path) -> PrivateKeyTypes:
@@ -101,7 +116,7 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
     """Whether the authority signed the certificate with its own key."""
     try:
         certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
+    except MALFORMED:
         return False
     return True
 

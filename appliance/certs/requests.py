@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 from cryptography.x509.oid import NameOID
 
-from .files import CertificateError
+from .files import MALFORMED, CertificateError
 
 REQUEST_SIZE: Final = 64 << 10
 _CURVES: Final = (ec.SECP256R1, ec.SECP384R1, ec.SECP521R1)
@@ -40,7 +39,7 @@ def load_request(data: bytes) -> Request:
         key = request.public_key()
         signed = request.is_signature_valid
         names = request.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError) as error:
+    except MALFORMED as error:
         raise CertificateError(
             "not a certificate request (PKCS #10) in PEM or DER form, as `openssl req -new` makes "
             f"it ({error or type(error).__name__})"

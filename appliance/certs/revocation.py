@@ -12,32 +12,34 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
 
-from .files import CertificateError
+from .files import MALFORMED, CertificateError
 
 #: Some 400,000 entries.
 CRL_SIZE: Final = 16 << 20
-
-#: A certificate: who issued it, and the serial number (RFC 5652, section 10.2.4).
-IssuerAndSerial: TypeAlias = tuple[x509.Name, int]
 
 _PEM: Final = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Revocations:
-    """What was revoked and when; `ends` says of each list by whom it is and when it is outdated."""
+    """What was revoked and when, by issuer and serial number.
 
-    dates: Mapping[IssuerAndSerial, datetime]
+    `ends` says of each list by whom it is and when it is outdated.
+    """
+
+    dates: Mapping[x509.Name, Mapping[int, datetime]]
     ends: Sequence[tuple[str, datetime]]
 
     def date(self, certificate: x509.Certificate) -> datetime | None:
         """When the certificate was revoked; None when it was not."""
-        return self.dates.get((certificate.issuer, certificate.serial_number))
+        return self.dates.get(certificate.issuer, {}).get(certificate.serial_number)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.dates.values()))
 
 
 NOTHING_REVOKED: Final = Revocations({}, ())
@@ -47,11 +49,12 @@ def load_revocations(
     path: Path, data: bytes, authorities: Sequence[x509.Certificate]
 ) -> Revocations:
     """All lists of a file; CertificateError when one is not whole or not of these authorities."""
-    dates: dict[IssuerAndSerial, datetime] = {}
+    dates: dict[x509.Name, dict[int, datetime]] = {}
     ends: list[tuple[str, datetime]] = []
     for crl in parse_crls(path, data, authorities):
+        by_serial = dates.setdefault(crl.issuer, {})
         for item in crl:
-            dates[crl.issuer, item.serial_number] = item.revocation_date_utc
+            by_serial[item.serial_number] = item.revocation_date_utc
         if crl.next_update_utc is not None:
             ends.append((crl.issuer.rfc4514_string(), crl.next_update_utc))
     return Revocations(dates, ends)
@@ -69,7 +72,7 @@ def parse_crls(
             _check(path, crl, authorities)
     except CertificateError:
         raise
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+    except MALFORMED as error:
         raise CertificateError(
             f"{path} is not a certificate revocation list in PEM or DER form ({error})"
         ) from None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
+import random
 import shutil
 import ssl
 import stat
@@ -21,6 +24,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
 from appliance import certs, cli
+from appliance.certs.requests import load_request
 
 needs_openssl = pytest.mark.skipif(
     shutil.which("openssl") is None, reason="the openssl command is not installed"
@@ -212,6 +216,21 @@ def test_requests_that_are_refused(here: Path, data: bytes, message: str, capsys
     assert everything(here) == before
 
 
+def test_requests_with_damage_are_refused_in_words() -> None:
+    original = bytearray(
+        x509.load_pem_x509_csr(request_of(ec.generate_private_key(ec.SECP256R1()))).public_bytes(
+            Encoding.DER
+        )
+    )
+    randomly = random.Random(7)
+    for _ in range(1000):
+        data = original.copy()
+        for _ in range(randomly.randint(1, 4)):
+            data[randomly.randrange(len(data))] = randomly.randrange(256)
+        with contextlib.suppress(certs.CertificateError):
+            load_request(bytes(data))
+
+
 def test_a_request_that_is_not_there(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("cert", "sign", "nowhere.csr") == 1
     assert "nowhere.csr: No such file" in capsys.readouterr().err
@@ -361,8 +380,6 @@ def test_a_line_of_the_list_that_is_broken(here: Path, capsys) -> None:
 
 
 def test_a_file_that_is_none(here: Path, capsys) -> None:
-    import os
-
     (here / "ca.crt").unlink()
     os.mkfifo(here / "ca.crt")
     assert run("cert", "list") == 1

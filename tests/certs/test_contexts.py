@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
+import random
 import ssl
 from collections.abc import Callable
 from datetime import timedelta
@@ -281,6 +284,18 @@ def test_what_did_not_change_is_not_replaced(own: Path, contexts: TlsContexts) -
     assert contexts.reload() and contexts.context("here") is not before
 
 
+def test_what_was_read_before_others_were_taken_is_not_taken(
+    own: Path, contexts: TlsContexts, tablet: ssl.SSLContext
+) -> None:
+    certs.issue_server(own, ["localhost"], [])
+    early = contexts.prepare()
+    certs.revoke(own, "tablet")
+    contexts.reload()
+    with pytest.raises(CertificateError, match="replaced meanwhile"):
+        contexts.take(early)
+    assert "was revoked" in refusal_of(contexts, tablet)
+
+
 def test_a_certificate_out_of_its_time_is_better_than_none(own: Path, tablet) -> None:
     expired(own)
     contexts = TlsContexts(files_of(own), ASKING)
@@ -411,3 +426,46 @@ def test_renewal_without_the_authoritys_key_is_told(own: Path) -> None:
     (own / "ca.key").unlink()
     with pytest.raises(CertificateError, match=r"there is no .*ca\.key: only with"):
         certs.keep_server_certificate(files_of(own))
+
+
+# Bytes that nobody meant
+
+
+def test_damaged_files_are_refused_in_words(own: Path) -> None:
+    """Whatever is in a file, the error is ours."""
+    company = Company()
+    revoked = company.issue(own / "x", "x", alternatives=[x509.DNSName("x")])
+    ca = company.pem()
+    (own / "ca.crt").write_bytes(ca)
+    originals = {
+        "server.crt": (own / "server.crt").read_bytes(),
+        "ca.crt": ca,
+        "ca.crl": company.crl(revoked),
+        "server.key": (own / "server.key").read_bytes(),
+    }
+    (own / "ca.crl").write_bytes(originals["ca.crl"])
+    contexts = TlsContexts(files_of(own), ASKING)
+    randomly = random.Random(7)
+    for name, original in originals.items():
+        for number in range(150):
+            data = bytearray(base64_of(original) if number % 2 else original)
+            for _ in range(randomly.randint(1, 4)):
+                data[randomly.randrange(len(data))] = randomly.randrange(256)
+            if number % 2:  # in the DER under the PEM
+                data = bytearray(pem_of(bytes(data), original))
+            if number % 5 == 0:
+                del data[randomly.randrange(len(data)) :]
+            (own / name).write_bytes(data)
+            with contextlib.suppress(CertificateError):
+                contexts.prepare()
+            (own / name).write_bytes(original)
+    assert not contexts.reload()
+
+
+def base64_of(pem: bytes) -> bytes:
+    return base64.b64decode(b"".join(pem.splitlines()[1:-1]))
+
+
+def pem_of(der: bytes, like: bytes) -> bytes:
+    first, *_, last = like.splitlines()
+    return b"\n".join([first, base64.encodebytes(der).strip(), last, b""])

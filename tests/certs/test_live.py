@@ -21,6 +21,10 @@ from appliance_process import HOST, PATIENCE, ApplianceProcess, eventually
 from authorities import NOW, Company
 from cryptography import x509
 from raw_client import RawClient
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.sync.client import ClientConnection
+from websockets.sync.client import connect as websocket
+from websockets.typing import Subprotocol
 
 from appliance import certs, cli
 from appliance.mqtt.codec import Property
@@ -99,6 +103,12 @@ def make(directory: Path, **tls: Any) -> ApplianceProcess:
     listeners = [
         {"bind": "127.0.0.1:0", "tls": True},
         {"bind": "127.0.0.1:0", "tls": True, "client_certificates": "required"},
+        {
+            "bind": "127.0.0.1:0",
+            "tls": True,
+            "client_certificates": "optional",
+            "protocol": "websocket",
+        },
         {"bind": "127.0.0.1:0"},
     ]
     process = ApplianceProcess(
@@ -119,9 +129,9 @@ def process(tmp_path: Path) -> Iterator[ApplianceProcess]:
 
 
 def _ports(process: ApplianceProcess) -> list[int]:
-    """With TLS, with TLS and a certificate required, without TLS."""
-    process.wait_for_log(r"listening on", 3)
-    return [int(port) for port in re.findall(r"listening on \S+:(\d+)", process.log)]
+    """With TLS, with TLS and a certificate required, for WebSocket with TLS, without TLS."""
+    process.wait_for_log(r"listening ", 4)
+    return [int(port) for port in re.findall(r"listening .*on \S+:(\d+)", process.log)]
 
 
 # Who comes in
@@ -244,6 +254,26 @@ def test_revoked_while_connected(process: ApplianceProcess) -> None:
                 again.sendall(Connect("a").encode())
                 assert again.recv(100) == b""
         process.wait_for_log("no TLS connection: its certificate .* was revoked", 2)
+
+
+def test_revoked_over_websocket(process: ApplianceProcess) -> None:
+    url = f"wss://{HOST}:{_ports(process)[2]}/mqtt"
+    context = context_of(process, "tablet")
+
+    def dial() -> ClientConnection:
+        return websocket(url, ssl=context, subprotocols=[Subprotocol("mqtt")], proxy=None)
+
+    with dial() as connection:
+        connection.send(Connect("a").encode())
+        answer = connection.recv(PATIENCE)
+        assert isinstance(answer, bytes) and (answer[0], answer[3]) == (0x20, ReasonCode.SUCCESS)
+        certs.revoke(process.directory / "certs", "tablet")
+        os.kill(process.pid, signal.SIGHUP)
+        with pytest.raises(ConnectionClosed):
+            while connection.recv(PATIENCE):
+                pass
+    with pytest.raises((ssl.SSLError, ConnectionError, EOFError, WebSocketException)), dial():
+        pass
 
 
 def test_the_servers_certificate_is_replaced_under_load(process: ApplianceProcess) -> None:
