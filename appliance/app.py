@@ -180,13 +180,15 @@ class App:
     async def _keep(self, tls: TlsContexts) -> None:
         told: dict[str, float] = {}
         loop = asyncio.get_running_loop()
+        reason = ""
         while True:
             problems: list[str] = []
             try:
-                reason = await asyncio.to_thread(keep_server_certificate, tls.files)
+                reason = await asyncio.to_thread(keep_server_certificate, tls.files) or reason
                 if reason:
                     self._take_tls(tls.prepare())
                     log.info("the server's certificate was renewed: %s", reason)
+                    reason = ""
             except (CertificateError, OSError) as error:
                 problems = [f"the server's certificate is not renewed: {error}"]
             now = loop.time()

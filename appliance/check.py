@@ -90,7 +90,8 @@ def _access(settings: Settings) -> Iterator[Finding]:
         yield Finding("warning", str(broker.users), text)
     if rules is not None:
         yield Finding("ok", str(broker.acl), f"rules: {len(rules)}")
-    if rules is not None and users is not None and not broker.plugins:  # which may know others
+    others = broker.plugins or broker.tls.username_from != "none"  # they may know more
+    if rules is not None and users is not None and not others:
         for name in sorted({rule.user for rule in rules if rule.user} - set(users)):
             yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
 

@@ -198,7 +198,6 @@ class Listeners:
             protocol.check_certificate()
             if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
                 await asyncio.sleep(0)
-        self.broker.flush()
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""

@@ -333,12 +333,12 @@ class ClientProtocol(Upper):
         reason = certificates.refusal(tls_object)
         if not reason:
             return
-        assert self._transport is not None
         if self._client.session is None:
             self.complain("no TLS connection", reason)
-            self._transport.close()
+            self._client.abandon()
         else:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
+        self._broker.flush()
         self._loop.call_later(REVOKED_TIMEOUT, self.abort)
 
     def _too_late(self) -> None:
@@ -801,6 +801,9 @@ def _tls_reason(error: BaseException) -> str:
         return f"the client does not trust our certificate; does it have ca.crt? ({text})"
     if "http request" in text or "wrong version number" in text:
         return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
+    if "certificate verify failed" in text:
+        why = getattr(error, "verify_message", "")
+        return f"the client's certificate is not accepted: {why or text} (broker.tls.ca)"
     if "peer did not return a certificate" in text:
         return f"it has no client certificate, and one is required ({text})"
     return text

@@ -79,6 +79,7 @@ class LoadedTls:
 
     files: TlsFiles
     policies: Mapping[str, TlsPolicy]
+    username_from: UsernameFrom
     digest: bytes = field(repr=False)
     chain: list[x509.Certificate]
     authorities: list[x509.Certificate]
@@ -111,22 +112,25 @@ class TlsContexts:
         clock is not set yet, or whose certificate has run out, can still be reached by those who
         do not look at that, and on its other listeners.
         """
-        self._username_from: UsernameFrom = username_from
         self._trusted: WeakKeyDictionary[ssl.SSLContext, frozenset[x509.Certificate]]
         self._trusted = WeakKeyDictionary()
-        self._loaded = _load(files, policies, None)
+        self._loaded = _load(files, policies, username_from, None)
         self._remember()
 
     def prepare(
-        self, files: TlsFiles | None = None, policies: Mapping[str, TlsPolicy] | None = None
+        self,
+        files: TlsFiles | None = None,
+        policies: Mapping[str, TlsPolicy] | None = None,
+        username_from: UsernameFrom | None = None,
     ) -> LoadedTls:
-        """Read the files as they are now, for `take`; changes nothing.
+        """Read the files as they are now, for `take`; changes nothing. What is not given stays.
 
         CertificateError has all that is wrong. So is a server's certificate that was put here out
         of its time, and that a revocation list has gone.
         """
         now = self._loaded
-        return _load(files or now.files, policies or now.policies, now)
+        username_from = username_from or now.username_from
+        return _load(files or now.files, policies or now.policies, username_from, now)
 
     def take(self, loaded: LoadedTls) -> bool:
         """Let it hold for all connections to come; returns whether it is something new.
@@ -173,8 +177,11 @@ class TlsContexts:
             return f"{who} was revoked on {date:%Y-%m-%d}"
         trusted = self._loaded.authorities
         before = self._trusted.get(tls.context, frozenset())
-        # One of another authority stays; also through one between, which the client has sent.
-        if before <= frozenset(trusted) or any(issued_by(certificate, ca) for ca in trusted):
+        # Only when one was taken away is it asked by whom it is: a chain may go through one that
+        # the client has sent, and that is not known here.
+        if not trusted or before <= frozenset(trusted):
+            return ""
+        if any(issued_by(certificate, authority) for authority in trusted):
             return ""
         return f"{who} is of an authority that is trusted no longer"
 
@@ -184,13 +191,14 @@ class TlsContexts:
         Raises:
             ValueError: it names none.
         """
-        if self._username_from == "none":
+        source = self._loaded.username_from
+        if source == "none":
             return None
         der = tls.getpeercert(binary_form=True)
         if not der:
             return None
         try:
-            return username_of(x509.load_der_x509_certificate(der), self._username_from)
+            return username_of(x509.load_der_x509_certificate(der), source)
         except MALFORMED as error:
             raise ValueError(str(error)) from None
 
@@ -217,7 +225,7 @@ def server_context(
 
 def load_tls(files: TlsFiles, policies: Mapping[str, TlsPolicy]) -> LoadedTls:
     """Read everything and look at it strictly; CertificateError has all that is wrong."""
-    loaded = _load(files, policies, None)
+    loaded = _load(files, policies, "none", None)
     problems = list(_out_of_time(loaded, datetime.now(timezone.utc)))
     if problems:
         raise CertificateError(*problems)
@@ -225,7 +233,10 @@ def load_tls(files: TlsFiles, policies: Mapping[str, TlsPolicy]) -> LoadedTls:
 
 
 def _load(
-    files: TlsFiles, policies: Mapping[str, TlsPolicy], before: LoadedTls | None
+    files: TlsFiles,
+    policies: Mapping[str, TlsPolicy],
+    username_from: UsernameFrom,
+    before: LoadedTls | None,
 ) -> LoadedTls:
     """What is in the files; `before` itself when it is the same."""
     problems: list[str] = []
@@ -241,7 +252,8 @@ def _load(
             revocations = _revocations(files, authorities, hashed, before)
     digest = hashed.digest()
     if before is not None and not problems:
-        if (files, policies, digest) == (before.files, before.policies, before.digest):
+        wanted = (files, policies, username_from, digest)
+        if wanted == (before.files, before.policies, before.username_from, before.digest):
             return before
         if chain[0] != before.chain[0]:
             problem = out_of_time(files.certificate, chain[0], datetime.now(timezone.utc))
@@ -258,7 +270,17 @@ def _load(
         raise CertificateError(*problems)
     contexts = {name: made[policy] for name, policy in policies.items()}
     generation = 0 if before is None else before.generation + 1
-    return LoadedTls(files, policies, digest, chain, authorities, revocations, contexts, generation)
+    return LoadedTls(
+        files,
+        policies,
+        username_from,
+        digest,
+        chain,
+        authorities,
+        revocations,
+        contexts,
+        generation,
+    )
 
 
 @contextlib.contextmanager

@@ -60,8 +60,8 @@ with a password, as phones take it, with `--bundle` one with key, certificate an
 microcontrollers do. Better still, the key never leaves the device: it makes a request, and
 `appliance cert sign FILE` a certificate of that.
 
-A device is lost: `appliance cert revoke NAME`. In force at once, also for connections that are
-open; its files are not needed for that.
+A device is lost: `appliance cert revoke NAME`. In force when the appliance reloads, also for
+connections that are open; the device's files are not needed for that.
 """
 
 

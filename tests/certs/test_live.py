@@ -185,6 +185,13 @@ def test_a_listener_that_requires_certificates(process: ApplianceProcess) -> Non
     process.wait_for_log("it has no client certificate, and one is required")
 
 
+def test_a_certificate_of_someone_else(process: ApplianceProcess) -> None:
+    Company().issue(process.directory / "certs/clients/foreign", "alice")
+    with pytest.raises((ssl.SSLError, ConnectionError)), Peer(process, "foreign") as peer:
+        peer.log_in("a")
+    process.wait_for_log("the client's certificate is not accepted: unable to get local issuer")
+
+
 @pytest.mark.skipif(shutil.which("mosquitto_sub") is None, reason="mosquitto-clients not installed")
 def test_mosquittos_clients(process: ApplianceProcess) -> None:
     clients = process.directory / "certs/clients"
