@@ -150,16 +150,21 @@ class Listeners:
             return
         protocol = ClientProtocol(self.network, address, host)
         self.network.open.add(protocol)
+        context = None
         if listener.context is not None:
+            context = listener.context()
             self._handshakes.add(protocol)
-        self.network.in_background(self._begin(protocol, connection, listener))
+        is_websocket = listener.protocol == "websocket"
+        self.network.in_background(self._begin(protocol, connection, context, is_websocket))
 
     async def _begin(
-        self, protocol: ClientProtocol, connection: socket.socket, listener: ListenerSettings
+        self,
+        protocol: ClientProtocol,
+        connection: socket.socket,
+        context: ssl.SSLContext | None,
+        is_websocket: bool,
     ) -> None:
         try:
-            is_websocket = listener.protocol == "websocket"
-            context = listener.context and listener.context()
             await protocol.begin(connection, context, websocket=is_websocket)
         finally:
             self._handshakes.discard(protocol)
