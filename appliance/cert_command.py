@@ -87,7 +87,8 @@ def cert_sign(
         from appliance import certs
 
         data = _read_request(request, certs.REQUEST_SIZE)
-        typer.echo(f"made  {shown(certs.sign(directory, data, name, ca_key))}")
+        made = certs.sign(directory, data, name, ca_key)
+        typer.echo(f"made  {shown(made)}, for client {made.stem!r}")
 
 
 def _read_request(file: str, limit: int) -> bytes:

@@ -154,10 +154,11 @@ def test_hostile_names_reach_no_file(here: Path, name: str, capsys) -> None:
     ],
     ids=["P-256", "P-384", "Ed25519", "RSA"],
 )
-def test_a_request(here: Path, key) -> None:
+def test_a_request(here: Path, key, capsys) -> None:
     file = here.parent / "device.csr"
     file.write_bytes(request_of(key))
     assert run("cert", "sign", "device.csr") == 0
+    assert "clients/esp.crt, for client 'esp'" in capsys.readouterr().out
     [certificate] = certs.load_certificates(here / "clients/esp.crt")
     assert certificate.public_key() == key.public_key()
     assert not (here / "clients/esp.key").exists()

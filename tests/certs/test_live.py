@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from appliance_process import HOST, PATIENCE, ApplianceProcess, eventually
 from authorities import NOW, Company
@@ -261,6 +262,27 @@ def test_revoked_while_connected(process: ApplianceProcess) -> None:
                 again.sendall(Connect("a").encode())
                 assert again.recv(100) == b""
         process.wait_for_log("no TLS connection: its certificate .* was revoked", 2)
+
+
+def test_revoked_while_it_does_not_read(process: ApplianceProcess) -> None:
+    """It may have what was sent before, but not for long."""
+    with Peer(process, "tablet") as peer, Peer(process, "stranger") as other:
+        assert peer.log_in("a") == other.log_in("b") == 0
+        assert peer.subscribe("r2d2/tablet/#") == 1
+        for _ in range(40):
+            other.send(Publish("r2d2/tablet/x", bytes(500_000), 0))
+        other.drain()
+        port = peer.socket.getsockname()[1]
+        broker = psutil.Process(process.pid)
+
+        def is_connected() -> bool:
+            return any(c.raddr and c.raddr.port == port for c in broker.net_connections("tcp"))
+
+        assert is_connected()
+        certs.revoke(process.directory / "certs", "tablet")
+        os.kill(process.pid, signal.SIGHUP)
+        eventually(lambda: not is_connected(), "the connection is closed", PROMPT)
+        other.drain()
 
 
 def test_revoked_over_websocket(process: ApplianceProcess) -> None:
