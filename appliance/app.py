@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import gc
 import logging
 import os
 import signal
-import ssl
 from dataclasses import asdict
 from importlib.metadata import version
 
@@ -23,10 +21,15 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
-from appliance.certs import ClientCertificates, server_context
+from appliance.certs import (
+    CertificateError,
+    LoadedTls,
+    TlsContexts,
+    keep_server_certificate,
+)
+from appliance.certs.settings import listener_name, tls_files, tls_policies
 from appliance.config import (
     OPEN_WITH_SECRETS,
-    Listener,
     Settings,
     TopicRoute,
     is_open_with_secrets,
@@ -49,6 +52,12 @@ SHORTEST_TICK = 0.01
 #: often it has to have done so, in tens, before it looks through those that have grown old.
 YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
+
+
+#: Seconds between two looks at the server's certificate and this computer's names and addresses,
+#: and after which the log is told again of what has run out or does soon.
+CERTIFICATE_CHECK = 300.0
+CERTIFICATE_WARNING = 86400.0
 
 
 class App:
@@ -87,6 +96,7 @@ class App:
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         # A file may be missing where plugins do its work, and only there.
         authenticating, ruling = plugin_kinds(broker_settings.plugins)
+        self._tls = tls = self._load_tls()
         self._access = access = FileAccess(
             None if authenticating and not users.exists() else users,
             None if ruling and not acl.exists() else acl,
@@ -109,7 +119,7 @@ class App:
         broker.tick(loop.time())
 
         async def listen() -> None:
-            wanted = self._listener_settings()
+            wanted = self._listener_settings(tls)
             self.addresses = await listeners.start(wanted)
             for (host, port), listener in zip(self.addresses, wanted, strict=True):
                 kind = " for WebSocket" if listener.protocol == "websocket" else ""
@@ -133,51 +143,87 @@ class App:
             answers=Answers(answers.keep, answers.keep_refusals, answers.size),
             secrets=secrets_in(broker_settings.plugins),
             patience=0.2 * limits.connect_timeout,
+            certificate_user=tls.username if tls is not None else lambda _: None,
         )
-        listeners = Listeners(
+        self._listeners = listeners = Listeners(
             broker,
             frame.authenticate,
             # It would pass by plugins that refuse clients.
             access.exchange if not authenticating else lambda method, address: None,
             _admission(settings),
+            tls,
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", _Deaf())
         self._start_clock(loop)
         await frame.start()
         self._stack.push_async_callback(frame.shutdown)
+        if tls is not None:
+            self._keep_certificates(tls)
         self._start_bridge(loop)
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
 
-    def _listener_settings(self) -> list[ListenerSettings]:
-        tls = self.settings.broker.tls
+    def _load_tls(self) -> TlsContexts | None:
+        """The TLS of the listeners, by their place in the configuration; None when none has it."""
+        broker = self.settings.broker
+        policies = tls_policies(broker)
+        if not policies:
+            return None
+        return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
 
-        @functools.cache
-        def context(asked_for: ClientCertificates) -> ssl.SSLContext:
-            return server_context(tls.certificate, tls.key, tls.ca, asked_for)
-
-        def context_of(listener: Listener) -> ssl.SSLContext | None:
-            if not listener.tls:
-                return None
-            asked_for = tls.client_certificates
-            # Asked for a certificate that it does not have, a browser gives a WebSocket up.
-            if listener.protocol == "websocket" and asked_for == "optional":
-                asked_for = "none"
-            return context(asked_for)
-
+    def _listener_settings(self, tls: TlsContexts | None) -> list[ListenerSettings]:
         return [
             ListenerSettings(
                 listener.bind.host,
                 listener.bind.port,
-                context_of(listener),
+                tls.source(listener_name(index)) if listener.tls and tls else None,
                 listener.protocol,
                 listener.bind.path,
                 listener.mode,
             )
-            for listener in self.settings.broker.listeners
+            for index, listener in enumerate(self.settings.broker.listeners)
         ]
+
+    def _keep_certificates(self, tls: TlsContexts) -> None:
+        """Renew the server's certificate when that is due, and tell of what has run out."""
+        keeping = asyncio.ensure_future(self._keep(tls))
+
+        async def end() -> None:
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+
+        self._stack.push_async_callback(end)
+
+    async def _keep(self, tls: TlsContexts) -> None:
+        told: dict[str, float] = {}
+        loop = asyncio.get_running_loop()
+        reason = ""
+        while True:
+            problems: list[str] = []
+            try:
+                reason = await asyncio.to_thread(keep_server_certificate, tls.files) or reason
+                if reason:
+                    self._take_tls(tls.prepare())
+                    log.info("the server's certificate was renewed: %s", reason)
+                    reason = ""
+            except (CertificateError, OSError) as error:
+                problems = [f"the server's certificate is not renewed: {error}"]
+            now = loop.time()
+            told = {text: at for text, at in told.items() if now - at < CERTIFICATE_WARNING}
+            for text in (*problems, *tls.warnings()):
+                if text not in told:
+                    told[text] = now
+                    log.warning("%s", text)
+            await asyncio.sleep(CERTIFICATE_CHECK)
+
+    def _take_tls(self, loaded: LoadedTls) -> None:
+        """Let these certificates hold, for the connections that are open too."""
+        assert self._tls is not None
+        if self._tls.take(loaded):
+            self._listeners.network.in_background(self._listeners.check_certificates())
+            log.info("certificates reloaded")
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""
@@ -241,14 +287,17 @@ class App:
             await self.stop()
 
     def reload(self) -> None:
-        """Take over the users and ACL files as they are now; a wrong one changes nothing."""
+        """Take over users, ACL and certificates as they are now; a wrong file changes nothing."""
         try:
+            certificates = self._tls.prepare() if self._tls is not None else None
             changes = self._access.reload()
-        except AccessFileError as error:
+        except (AccessFileError, CertificateError) as error:
             log.error("not reloaded, what was in force stays so: %s", error)
             if self.audit is not None:
                 self.audit.changed("nothing: the files cannot be used", error=str(error))
             return
+        if certificates is not None:
+            self._take_tls(certificates)
         self._take_over(changes)
 
     def _take_over(self, changes: Changes) -> None:

@@ -15,6 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
+from appliance.cert_command import cert_app
+from appliance.console import (
+    CommandError,
+    ConfigOption,
+    GenerateOption,
+    PasswordFileOption,
+    new_password,
+)
+from appliance.console import load as _load
+from appliance.console import read_password as _read_password
+from appliance.console import shown as _shown
+
 if TYPE_CHECKING:
     from appliance.access import Passwords
     from appliance.client import Target
@@ -30,27 +42,7 @@ user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
 acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
-
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        "-c",
-        metavar="FILE",
-        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
-    ),
-]
-PasswordFileOption = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
-]
-GenerateOption = Annotated[
-    bool, typer.Option("--generate", help="Make a random password, and show it once.")
-]
-
-
-class CommandError(Exception):
-    """Told to the user as it is; the command ends with exit code 1."""
+app.add_typer(cert_app, name="cert")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -69,15 +61,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         what = f"{error.filename}: {what}" if error.filename else what
         typer.secho(f"appliance: {what}", fg="red", err=True)
     sys.exit(1)
-
-
-def _load(config: Path | None) -> Settings:
-    from appliance.config import ConfigError, load
-
-    try:
-        return load(config)
-    except ConfigError as error:
-        raise CommandError(f"the configuration cannot be used\n{error}") from None
 
 
 # Setting up, running, checking
@@ -319,18 +302,7 @@ def _no_user(name: str, users: Passwords) -> str:
 def _set_password(
     users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
 ) -> None:
-    if generate and file:
-        raise typer.BadParameter("--generate and --password-file exclude each other")
-    if generate:
-        from appliance.init import generate_password
-
-        password = generate_password()
-    elif file:
-        password = _read_password(file)
-    elif sys.stdin.isatty():
-        password = typer.prompt(f"Password of {name}", hide_input=True, confirmation_prompt=True)
-    else:
-        raise CommandError("no terminal to ask on; use --generate or --password-file")
+    password = new_password(name, file, generate)
     try:
         users.set(name, password, scram)
     except ValueError as error:
@@ -338,11 +310,6 @@ def _set_password(
     users.save()
     if generate:
         typer.echo(f"password {password}")
-
-
-def _read_password(file: str) -> str:
-    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
-    return text.split("\n", 1)[0].rstrip("\r")
 
 
 # Access
@@ -381,6 +348,13 @@ PortOption = Annotated[
 CaOption = Annotated[
     Path | None,
     typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
+]
+CertOption = Annotated[
+    Path | None,
+    typer.Option("--cert", metavar="FILE", help="A client certificate, with its key in it or in:"),
+]
+KeyOption = Annotated[
+    Path | None, typer.Option("--key", metavar="FILE", help="The key of the client certificate.")
 ]
 UserOption = Annotated[
     str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
@@ -424,6 +398,8 @@ def pub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -441,7 +417,9 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -467,6 +445,8 @@ def sub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -475,7 +455,9 @@ def sub(
     config: ConfigOption = None,
 ) -> None:
     """Subscribe, and print what comes, a message a line."""
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -504,6 +486,8 @@ def _target(
     client_id: str,
     version: Literal["5", "311"],
     insecure: bool,
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> Target:
     """Where to connect and as whom; what no option says is taken from the configuration, if any."""
     from paho.mqtt.enums import MQTTProtocolVersion
@@ -528,15 +512,8 @@ def _target(
     else:
         raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
     protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
-    return Target(host, port or 8883, ca, user, password, client_id, protocol, insecure)
-
-
-def _shown(path: Path) -> str:
-    """The path as a user of this folder would type it."""
-    try:
-        return str(path.absolute().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+    address = (host, port or 8883)
+    return Target(*address, ca, user, password, client_id, protocol, insecure, cert, key)
 
 
 def _version(wanted: bool) -> None:

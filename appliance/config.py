@@ -285,6 +285,14 @@ def _check_bus(value: object) -> object:
     return value
 
 
+def _unquoted_off(value: object) -> object:
+    return "off" if value is False else value  # off is a boolean in YAML 1.1
+
+
+def _unquoted_version(value: object) -> object:
+    return str(value) if isinstance(value, float) else value
+
+
 def _or_auto(value: object) -> object:
     return "auto" if value is None else value
 
@@ -307,6 +315,10 @@ Retain = Annotated[
     bool | None, PlainValidator(_parse_retain), PlainSerializer(_or_auto, when_used="json")
 ]
 Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
+ClientCertificates = Annotated[
+    Literal["off", "optional", "required"], BeforeValidator(_unquoted_off)
+]
+TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
 Encoding = Literal["json", "text", "cdr"]
 Direction = Literal["mqtt", "ros", "both"]
@@ -327,11 +339,17 @@ def _section() -> Any:
 
 
 class Listener(_Section):
-    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket."""
+    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket.
+
+    What is None of `client_certificates`, `min_version` and `ciphers` is as `broker.tls` says.
+    """
 
     bind: Address
     tls: bool = False
     protocol: Literal["mqtt", "websocket"] = "mqtt"
+    client_certificates: ClientCertificates | None = None
+    min_version: TlsVersion | None = None
+    ciphers: str | None = None
     mode: Mode = 0o660
 
     @property
@@ -349,12 +367,19 @@ class Listener(_Section):
 
 
 class Tls(_Section):
-    """The server's certificate, and the CA whose client certificates are accepted."""
+    """The server's certificate, whose client certificates are accepted, and what they are for.
+
+    Without `crl` it is `ca.crl` beside `ca`, if there is one.
+    """
 
     certificate: FilePath = Path("certs/server.crt")
     key: FilePath = Path("certs/server.key")
     ca: FilePath = Path("certs/ca.crt")
-    client_certificates: Literal["none", "optional", "required"] = "optional"
+    crl: Annotated[Path, PlainValidator(_parse_path)] | None = None
+    client_certificates: ClientCertificates = "optional"
+    username_from: Literal["none", "subject", "san"] = "none"
+    min_version: TlsVersion = "1.2"
+    ciphers: str | None = None
 
 
 class Limits(_Section):
@@ -425,6 +450,15 @@ class Broker(_Section):
         dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)
     ] = {}
     plugin_answers: PluginAnswers = _section()
+
+    def client_certificates(self, listener: Listener) -> Literal["off", "optional", "required"]:
+        """Whether that listener asks its clients for one."""
+        if listener.client_certificates is not None:
+            return listener.client_certificates
+        # Asked for a certificate that it does not have, a browser gives a WebSocket up.
+        if listener.protocol == "websocket" and self.tls.client_certificates == "optional":
+            return "off"
+        return self.tls.client_certificates
 
 
 class RouteDefaults(_Section):
@@ -556,6 +590,13 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if first != number and (listener.bind.port or listener.bind.path):
             path = ("broker", "listeners", number, "bind")
             yield path, f"broker.listeners[{first}] listens there already"
+    tls = settings.broker.tls
+    if tls.username_from != "none" and not any(
+        listener.tls and settings.broker.client_certificates(listener) != "off"
+        for listener in settings.broker.listeners
+    ):
+        problem = "needs a listener with tls: true that asks for client certificates"
+        yield ("broker", "tls", "username_from"), problem
     routes: dict[tuple[str, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
         first = routes.setdefault((route.ros, route.topic(settings.robot)), number)

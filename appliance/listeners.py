@@ -18,7 +18,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
 from appliance.sockets import allow_files, listen, listen_on_path
-from appliance.wire import FAREWELLS, Authenticate, ClientProtocol, Network
+from appliance.wire import FAREWELLS, Authenticate, Certificates, ClientProtocol, Network
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,9 @@ HANDSHAKES = 64
 #: Seconds without one handshake ending after which those under way no longer keep others waiting:
 #: it is the network that they wait for, or they are not meant to end.
 HANDSHAKE_STALL = 0.25
+
+#: Certificates that are looked at in one go when they are looked at anew, at most 0.2 ms each.
+CHECKED_A_TURN = 16
 
 #: Seconds that one address may open connections ahead of `limits.connection_rate`.
 CONNECTION_BURST = 5.0
@@ -65,12 +68,13 @@ class Admission:
 class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
-    `context` is None for a connection without TLS.
+    `context` is asked at each connection for its TLS settings, so that these can be replaced; None
+    is for connections without TLS.
     """
 
     host: str
     port: int
-    context: ssl.SSLContext | None
+    context: Callable[[], ssl.SSLContext] | None
     protocol: Literal["mqtt", "websocket"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
@@ -90,6 +94,7 @@ class Listeners:
         authenticate: Authenticate,
         exchange: Callable[[str, str], Exchange | None],
         admission: Admission,
+        certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
         self.admission = admission
@@ -100,6 +105,7 @@ class Listeners:
             self._ended,
             connect_timeout=admission.connect_timeout,
             publish_rate=admission.publish_rate,
+            certificates=certificates,
         )
         self._addresses = _Addresses(admission)
         self._doors: list[_Door] = []
@@ -184,16 +190,22 @@ class Listeners:
             return
         protocol = ClientProtocol(self.network, address, host)
         self.network.open.add(protocol)
+        context = None
         if listener.context is not None:
+            context = listener.context()
             self._handshakes.add(protocol)
-        self.network.in_background(self._begin(protocol, connection, listener))
+        is_websocket = listener.protocol == "websocket"
+        self.network.in_background(self._begin(protocol, connection, context, is_websocket))
 
     async def _begin(
-        self, protocol: ClientProtocol, connection: socket.socket, listener: ListenerSettings
+        self,
+        protocol: ClientProtocol,
+        connection: socket.socket,
+        context: ssl.SSLContext | None,
+        is_websocket: bool,
     ) -> None:
         try:
-            is_websocket = listener.protocol == "websocket"
-            await protocol.begin(connection, listener.context, websocket=is_websocket)
+            await protocol.begin(connection, context, websocket=is_websocket)
         finally:
             self._handshakes.discard(protocol)
             if self._stall is not None:
@@ -224,6 +236,13 @@ class Listeners:
             self._stall = None
         for door in self._doors:
             door.open()
+
+    async def check_certificates(self) -> None:
+        """End the connections whose client's certificate is not, or no longer, accepted."""
+        for number, protocol in enumerate(list(self.network.open)):
+            protocol.check_certificate()
+            if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
+                await asyncio.sleep(0)
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""

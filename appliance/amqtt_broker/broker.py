@@ -24,6 +24,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Identity, Refusal
 from appliance.broker.session import Session
+from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
@@ -144,7 +145,8 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     `listen` and `hang_up` start and stop the listeners, where amqtt would its own. `files` stay
     in force: plugins can admit clients that the files do not know, and refuse what these allow.
-    `plugin_timeout` is in seconds.
+    `plugin_timeout` is in seconds. `certificate_user` is the user that a client's certificate
+    names, None for none; its ValueError refuses the client.
     """
 
     def __init__(
@@ -159,6 +161,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         answers: Answers = _ANSWERS,
         secrets: Iterable[str] = (),
         patience: float = PLUGIN_TIMEOUT,
+        certificate_user: Callable[[ssl.SSLObject], str | None] = lambda tls: None,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
 
@@ -175,6 +178,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._guard = Guard(plugin_timeout, secrets)
         self._threads = Threads()
         self._answers = answers
+        self._certificate_user = certificate_user
         self._views = Sessions(broker)
         self._inside: Session | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -292,15 +296,22 @@ class ApplianceBroker(amqtt.broker.Broker):
     ) -> Identity | Refusal:
         """Who sent the CONNECT, or why it is refused.
 
-        Who has a line in the users file is decided by that file alone, and who needs none, as
-        anonymous clients are let in, comes in. Others come in when at least one plugin says yes
-        and none says no, under the user name that they gave if a plugin vouches for it. With a yes
-        of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
+        Who shows a certificate that names a user is that one, without a password, and may not say
+        to be another one. Who has a line in the users file is decided by that file alone, and who
+        needs none, as anonymous clients are let in, comes in. Others come in when at least one
+        plugin says yes and none says no, under the user name that they gave if a plugin vouches
+        for it. With a yes of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
         """
         username, password = connect.username, connect.password
         plugins = self.plugins_manager
         if plugins.plugins:
             self._events.connect_received(connect)
+        try:
+            owner = self._certificate_user(ssl_object) if ssl_object is not None else None
+        except ValueError as error:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, str(error))
+        if owner is not None:
+            return self._by_certificate(owner, connect, address, ssl_object)
         known = not plugins._auth_plugins or username in self._files.users()
         if known or username is None:
             who = await self._files.authenticate(username, password, connect.client_id, address)
@@ -318,6 +329,23 @@ class ApplianceBroker(amqtt.broker.Broker):
         who = await self._logins.ask(login, address)
         if isinstance(who, Identity):
             self._admit(who, address, lambda: login)
+        return who
+
+    def _by_certificate(
+        self, owner: str, connect: Connect, address: str, ssl_object: ssl.SSLObject | None
+    ) -> Identity | Refusal:
+        if connect.username not in (None, "", owner):
+            # Two names are one too many to guess whose rights are meant.
+            reason = f"its certificate is of user {quote(owner)}, and it says to be another one"
+            return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
+
+        def login() -> AmqttSession:
+            shown = login_of(connect, address, None, ssl_object)
+            shown.username = owner
+            return shown
+
+        who = Identity(owner, connect.client_id)
+        self._admit(who, address, login)
         return who
 
     def _admit(self, identity: Identity, address: str, login: Callable[[], AmqttSession]) -> None:

@@ -188,7 +188,7 @@ def appliance(
                 "certificate": str(site.directory / "server.crt"),
                 "key": str(site.directory / "server.key"),
                 "ca": str(site.ca),
-                "client_certificates": "none",
+                "client_certificates": "off",
             },
             "limits": {"inflight": INFLIGHT, **LIMITS},
         },
