@@ -79,7 +79,7 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         *,
         connections: int,
         connect_timeout: float,

@@ -85,7 +85,7 @@ class Network:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         ended: Callable[[ClientProtocol], None],
         *,
         connect_timeout: float,
@@ -593,7 +593,8 @@ class ClientProtocol(Upper):
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
-        return self._network.exchange(method, self.address)
+        stranger = self._client.session is None
+        return self._network.exchange(method, self.address if stranger else None)
 
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""
