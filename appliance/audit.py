@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 #: Events that wait to be written; more are lost, and counted.
 WAITING: Final = 10_000
 
-#: Events of one kind from one address that are written in one interval, and its seconds. More are
-#: counted. And of how many kinds and addresses this is known.
+#: Events of one kind from one address, or of one user, that are written in one interval, and its
+#: seconds. More are counted. And of how many kinds and addresses this is known.
 BURST: Final = 100
 INTERVAL: Final = 10.0
 SOURCES: Final = 1024
@@ -183,8 +183,9 @@ class Audit:
         """What is to be written of an event: nothing when there were too many like it."""
         if event["event"] in ("changed", "started", "stopped"):
             return [event]
-        host = event["address"].rpartition(":")[0] if "address" in event else event["client"]
-        source = event["event"], host
+        # Client ids are free to choose: of who is in, it is the user that counts.
+        whose = event["address"].rpartition(":")[0] if "address" in event else event["user"]
+        source = event["event"], whose or ""
         flood = self._floods.get(source)
         written: list[Fields] = []
         if flood is None or now - flood.since >= INTERVAL:
@@ -327,7 +328,7 @@ def note(path: Path | None, what: str, **details: Any) -> None:
     if path is None:
         return
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
         return
     line = {"time": _now(), "event": "changed", "what": what, **details, "by": _who_types()}

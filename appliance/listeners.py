@@ -92,7 +92,7 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         admission: Admission,
         certificates: Certificates | None = None,
     ) -> None:

@@ -99,7 +99,7 @@ class Network:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         ended: Callable[[ClientProtocol], None],
         *,
         connect_timeout: float,
@@ -654,7 +654,8 @@ class ClientProtocol:
                     return None
             except ValueError:
                 return None
-        return self._network.exchange(method, self.address)
+        stranger = self._client.session is None
+        return self._network.exchange(method, self.address if stranger else None)
 
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""

@@ -151,13 +151,17 @@ def test_a_flood_is_told_in_part_and_counted(tmp_path: Path) -> None:
         for number in range(2000):
             audit.refused(f"10.0.0.1:{number}", "wrong password", 0x87, f"c{number}", "alice")
             time.sleep(0 if number % 100 else 0.002)
+        for number in range(1000):  # of one user under many names
+            session = session_of("mallory", f"client-{number}")
+            audit.denied(session, Action.SUBSCRIBE, "a/#", "no rule")
         audit.refused("10.0.0.2:1", "wrong password", 0x87, "c", "bob")
         audit.changed("certificates")
     refused = events(path, "refused")
     more = events(path, "more")
     assert len(refused) == audit_module.BURST + 1
     assert refused[-1]["user"] == "bob"
-    assert [entry["count"] for entry in more] == [2000 - audit_module.BURST]
+    assert [entry["count"] for entry in more] == [2000 - audit_module.BURST, 900]
+    assert more[1]["from"] == "mallory"
     assert more[0]["from"] == "10.0.0.1" and more[0]["last"]["client"] == "c1999"
     assert len(events(path, "changed")) == 1
 

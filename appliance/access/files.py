@@ -22,7 +22,7 @@ from .checks import BusyError, Checks
 from .guesses import Guesses, Recent
 from .passwords import Passwords
 from .problems import AccessFileError, Problem
-from .scram import METHOD, ScramExchange
+from .scram import METHOD, ScramExchange, Verifier
 
 _log = logging.getLogger(__name__)
 
@@ -189,8 +189,11 @@ class FileAccess:
         """The names of all users, sorted."""
         return self._passwords.users()
 
-    def exchange(self, method: str, address: str) -> Exchange | None:
+    def exchange(self, method: str, address: str | None) -> Exchange | None:
         """Begins an enhanced authentication; None when the method is not offered.
+
+        A stranger's, from this address, is a guess; with None it is one who has logged in, and
+        whom the guesses of others must not throw out.
 
         SCRAM-SHA-256 is, where there is a users file. The exchange knows the users as they are at
         each of its steps, a reload between them included. amqtt's plugins are not asked: they
@@ -198,9 +201,15 @@ class FileAccess:
         """
         if method != METHOD or self._in_force.users_path is None:
             return None
+
+        def verifier_of(username: str) -> Verifier:
+            return self._passwords.verifier(username)
+
+        if address is None:
+            return ScramExchange(verifier_of)
         guesses = self.guesses
         return ScramExchange(
-            lambda username: self._passwords.verifier(username),
+            verifier_of,
             admits=lambda: guesses.turn(address, METHOD, patience=0.0) is not None,
             failed=lambda username: guesses.failed(address, username),
         )

@@ -180,7 +180,9 @@ async def _guess(fight: Fight) -> None:
         task.cancel()
 
 
-@attack(r"refused: (too many logins from its address|wrong password|unknown user)", p99=0.05)
+@attack(
+    r"refused: (too many (logins|passwords)|wrong password|unknown user)", at_least=2.0, p99=0.05
+)
 async def wrong_logins(fight: Fight) -> None:
     """A thousand wrong logins a second, of which no limit of connections keeps any away."""
     await _guess(fight)
