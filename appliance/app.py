@@ -27,7 +27,7 @@ from appliance.listeners import Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
-from appliance.store import MemoryStore
+from appliance.store import MemoryStore, SqliteStore
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +59,7 @@ class App:
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
             PluginSettingsError: one of broker.plugins cannot be loaded.
+            StoreError: the store is in use, of a newer version, or cannot be read.
             OSError: a port cannot be listened on.
         """
         try:
@@ -82,10 +83,13 @@ class App:
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
+        store = self._open_store()
         self.broker = broker = Broker(
-            access, MemoryStore(), _broker_limits(settings), _features(settings)
+            access, store or MemoryStore(), _broker_limits(settings), _features(settings)
         )
         broker.tick(loop.time())
+        if store is not None:
+            store.restore(broker)
 
         async def listen() -> None:
             wanted = self._listener_settings()
@@ -125,6 +129,15 @@ class App:
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
+
+    def _open_store(self) -> SqliteStore | None:
+        wanted = self.settings.broker.store
+        if wanted.durability == "off":
+            return None
+        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size)
+        store.open()
+        self._stack.push_async_callback(store.close)
+        return store
 
     def _listener_settings(self) -> list[ListenerSettings]:
         tls = self.settings.broker.tls

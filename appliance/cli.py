@@ -144,10 +144,11 @@ def _start_errors() -> Iterator[None]:
     from appliance.access import AccessFileError
     from appliance.amqtt_broker import PluginSettingsError
     from appliance.certs import CertificateError
+    from appliance.store import StoreError
 
     try:
         yield
-    except (AccessFileError, CertificateError, PluginSettingsError) as error:
+    except (AccessFileError, CertificateError, PluginSettingsError, StoreError) as error:
         raise CommandError(str(error)) from None
 
 

@@ -373,6 +373,14 @@ class Limits(_Section):
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
 
 
+class Store(_Section):
+    """Where sessions and retained messages are kept; `size` is in bytes."""
+
+    path: FilePath = Path("state/store.db")
+    durability: Literal["power", "process", "off"] = "power"
+    size: Annotated[Size, Field(ge=1 << 20)] = 1 << 30
+
+
 class Broker(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
@@ -388,6 +396,7 @@ class Broker(_Section):
     anonymous: bool = False
     tls: Tls = _section()
     limits: Limits = _section()
+    store: Store = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None

@@ -191,6 +191,7 @@ def appliance(
                 "client_certificates": "none",
             },
             "limits": {"inflight": INFLIGHT, **LIMITS},
+            "store": {"durability": "off"},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
         "log": {"level": "warning"},
