@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import logging
 import os
 import shutil
@@ -175,6 +176,21 @@ def _salvage(path: Path) -> Rows:
 def make_directory(path: Path) -> None:
     """The directory of the database, for its user only when it is made here. Raises OSError."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def lock(path: Path) -> int | None:
+    """Take hold of the database, until the descriptor is closed; None when another process has it.
+
+    Raises:
+        OSError: the lock's file cannot be made.
+    """
+    descriptor = os.open(_beside(path, ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    return descriptor
 
 
 def _beside(path: Path, suffix: str) -> Path:

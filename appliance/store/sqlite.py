@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import itertools
 import logging
 import os
@@ -153,16 +152,12 @@ class SqliteStore:
             raise
 
     def _take_lock(self) -> None:
-        lock = lock_file(self.path)
-        self._lock = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._let_go()
+        self._lock = database.lock(self.path)
+        if self._lock is None:
             raise StoreError(
                 f"{self.path} is in use by another appliance: stop that one, or set another "
                 "broker.store.path"
-            ) from None
+            )
 
     def _let_go(self) -> None:
         lock, self._lock = self._lock, None
@@ -611,8 +606,3 @@ class SqliteStore:
             self._open.remove(Table.RECEIVED, entry[0])
             self._release(entry[1])
             self._stage()
-
-
-def lock_file(path: Path) -> Path:
-    """The file that a running appliance has locked, for a database there."""
-    return path.with_name(f"{path.name}.lock")

@@ -118,20 +118,24 @@ class Writer:
     def _write(self, batch: Batch) -> None:
         if self._connection is None:
             self._connection = connect(self._path, self._durability)
-        connection = self._connection
-        connection.execute("BEGIN IMMEDIATE")
-        for table in Table:
-            for keys in _chunks(list(batch.deleted[table])):
-                connection.execute(delete(table, len(keys)), keys)
-            for rows in _chunks(list(batch.rows[table].values())):
-                connection.execute(insert(table, len(rows)), list(chain.from_iterable(rows)))
-        connection.execute("COMMIT")
+        write(self._connection, batch)
 
     def _close(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
             roll_back(connection)
             connection.close()
+
+
+def write(connection: sqlite3.Connection, batch: Batch) -> None:
+    """Write a batch in one transaction. Raises sqlite3.Error, with the transaction not ended."""
+    connection.execute("BEGIN IMMEDIATE")
+    for table in Table:
+        for keys in _chunks(list(batch.deleted[table])):
+            connection.execute(delete(table, len(keys)), keys)
+        for rows in _chunks(list(batch.rows[table].values())):
+            connection.execute(insert(table, len(rows)), list(chain.from_iterable(rows)))
+    connection.execute("COMMIT")
 
 
 def _chunks(items: list[_Item]) -> Iterator[list[_Item]]:

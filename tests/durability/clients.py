@@ -114,7 +114,8 @@ class Client:
 
     def send(self, packet: Packet) -> None:
         assert self._writer is not None
-        self._writer.write(packet.encode(self.version))
+        if not self._writer.transport.is_closing():
+            self._writer.write(packet.encode(self.version))
 
     def leave(self) -> None:
         """Be gone without a word."""
