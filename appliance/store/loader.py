@@ -24,6 +24,9 @@ log = logging.getLogger("appliance.store")
 
 _T = TypeVar("_T")
 
+#: A key beyond this was not given out by us, who could not count so far.
+LARGEST_KEY = 1 << 53
+
 
 # --- to rows: `offset` is what the wall clock is ahead of the broker's clock, in seconds ---------
 
@@ -75,9 +78,14 @@ def subscription_row(key: int, session: int, subscription: Subscription) -> Row:
 
 
 def owed_row(
-    key: int, session: int, message: int | None, delivery: Delivery, packet_id: int | None
+    key: int,
+    session: int,
+    message: int | None,
+    delivery: Delivery,
+    packet_id: int | None,
+    sent: int | None,
 ) -> Row:
-    """The row of what is owed to a session."""
+    """The row of what is owed to a session; `sent` grows in the order of sending."""
     _, qos, retain, subscription_ids, share = delivery
     return (
         key,
@@ -88,16 +96,18 @@ def owed_row(
         json.dumps(subscription_ids) if subscription_ids else None,
         share.filter if share is not None else None,
         packet_id,
+        sent,
     )
 
 
-def received_row(key: int, session: int, packet_id: int, message: int, held: Held) -> Row:
-    """The row of a QoS 2 message that waits for PUBREL."""
+def received_row(
+    key: int, session: int, packet_id: int, message: int, held: Held, full: list[int]
+) -> Row:
+    """The row of a QoS 2 message that waits for PUBREL; `full` are the sessions without room."""
     no_room = None
     if held.full:
         shares = [receiver.filter for receiver in held.full if isinstance(receiver, Share)]
-        sessions = [each.client_id for each in held.full if isinstance(each, Session)]
-        no_room = json.dumps([sessions, shares])
+        no_room = json.dumps([full, shares])
     return key, session, packet_id, message, no_room
 
 
@@ -134,13 +144,16 @@ class _WrongRowError(Exception):
 def load(rows: Rows, offset: float) -> Loaded:
     """What the rows stand for; those that are wrong are left out, and counted in the log."""
     loaded = Loaded()
-    loaded.last_key = max((max(table, default=0) for table in rows), default=0)
+    keys = [key for table in rows for key in table if key < LARGEST_KEY]
+    orders = [row[8] for row in rows[Table.OWED].values() if isinstance(row[8], int)]
+    loaded.last_key = max(0, *keys, *(order for order in orders if order < LARGEST_KEY), 0)
     wrong = 0
 
     def each(table: Table, take: Callable[[Row], None]) -> None:
         nonlocal wrong
         for key in sorted(rows[table]):
             try:
+                _within(key, 1, LARGEST_KEY)
                 take(rows[table][key])
             except (
                 _WrongRowError,
@@ -166,6 +179,7 @@ def load(rows: Rows, offset: float) -> Loaded:
     _drop_doubles(loaded)
     each(Table.SUBSCRIPTION, lambda row: _take_subscription(row, loaded))
     each(Table.OWED, lambda row: _take_owed(row, loaded))
+    _put_in_order(loaded, rows)
     each(Table.RECEIVED, lambda row: _take_received(row, loaded))
     each(Table.RETAINED, lambda row: _take_retained(row, loaded))
     if wrong:
@@ -181,6 +195,15 @@ def _drop_doubles(loaded: Loaded) -> None:
             del loaded.sessions[newest[client_id]]
             loaded.useless.append((Table.SESSION, newest[client_id]))
         newest[client_id] = key
+
+
+def _put_in_order(loaded: Loaded, rows: Rows) -> None:
+    """What is in flight, in the order in which it was sent."""
+    for session in loaded.sessions.values():
+        flying = zip(session.inflight, session.kept.inflight.items(), strict=True)
+        ordered = sorted(flying, key=lambda each: cast(int, rows[Table.OWED][each[0]][8]))
+        session.inflight = [key for key, _ in ordered]
+        session.kept.inflight = dict(item for _, item in ordered)
 
 
 def _of(kind: type[_T], value: object) -> _T:
@@ -257,11 +280,13 @@ def _take_subscription(row: Row, loaded: Loaded) -> None:
 
 
 def _take_owed(row: Row, loaded: Loaded) -> None:
-    key, owner, message, qos, retain, subscription_ids, share, packet_id = row
+    key, owner, message, qos, retain, subscription_ids, share, packet_id, sent = row
     session = loaded.sessions[_of(int, owner)]
     kept = session.kept
     if packet_id is not None and _within(packet_id, 1, 0xFFFF) in kept.inflight:
         raise _WrongRowError("a second message with one packet id")
+    if packet_id is not None:
+        _within(sent, 1, LARGEST_KEY)
     if message is None:
         kept.inflight[_within(packet_id, 1, 0xFFFF)] = None
         session.inflight.append(_of(int, key))
@@ -291,7 +316,8 @@ def _take_received(row: Row, loaded: Loaded) -> None:
     if number in session.received:
         raise _WrongRowError("a second message with one packet id")
     sessions, shares = json.loads(_of(str, no_room)) if no_room is not None else ([], [])
-    names = [_of(str, name) for name in _of(list, sessions)]
+    full = [loaded.sessions[key] for key in _of(list, sessions) if key in loaded.sessions]
+    names = [each.kept.identity.client_id for each in full]
     filters = [_of(str, name) for name in _of(list, shares)]
     session.kept.received[number] = (loaded.messages[_of(int, message)], names, filters)
     session.received[number] = _of(int, key)

@@ -54,7 +54,8 @@ COLUMNS: dict[Table, tuple[str, ...]] = {
         *("retain_handling", "identifier"),
     ),
     Table.OWED: (
-        *("id", "session", "message", "qos", "retain", "subscription_ids", "share", "packet_id"),
+        *("id", "session", "message", "qos", "retain", "subscription_ids", "share"),
+        *("packet_id", "sent"),
     ),
     Table.RECEIVED: ("id", "session", "packet_id", "message", "no_room"),
     Table.RETAINED: ("id", "message"),
@@ -97,21 +98,22 @@ MIGRATIONS: tuple[str, ...] = (
         identifier INTEGER NOT NULL
     );
     CREATE TABLE owed (
-        id INTEGER PRIMARY KEY,   -- in the order of sending
+        id INTEGER PRIMARY KEY,   -- in the order of queueing
         session INTEGER NOT NULL,
         message INTEGER,          -- NULL: PUBREC came, PUBREL is all that is left
         qos INTEGER NOT NULL,
         retain INTEGER NOT NULL,
         subscription_ids TEXT,    -- JSON
         share TEXT,               -- the filter of the shared subscription that chose the session
-        packet_id INTEGER         -- NULL while it waits
+        packet_id INTEGER,        -- NULL while it waits
+        sent INTEGER              -- in the order of sending: what is retained passes the queue
     );
     CREATE TABLE received (
         id INTEGER PRIMARY KEY,
         session INTEGER NOT NULL,
         packet_id INTEGER NOT NULL,
         message INTEGER NOT NULL,
-        no_room TEXT              -- JSON: client ids, and filters of shared subscriptions
+        no_room TEXT              -- JSON: keys of sessions, and filters of shared subscriptions
     );
     CREATE TABLE retained (
         id INTEGER PRIMARY KEY,

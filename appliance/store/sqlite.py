@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -68,8 +69,8 @@ class _Known:
     def __init__(self, key: int) -> None:
         self.key = key
         self.filters: dict[str, int] = {}
-        #: By the delivery's identity: the session holds it for as long as it is owed.
-        self.owed: dict[int, tuple[int, Delivery]] = {}
+        #: By the delivery's identity: its row, itself, and its place in the order of sending.
+        self.owed: dict[int, tuple[int, Delivery, int | None]] = {}
         #: After PUBREC, by packet id.
         self.recorded: dict[int, int] = {}
         self.received: dict[int, tuple[int, Message]] = {}
@@ -181,9 +182,10 @@ class SqliteStore:
             self._messages[message] = stored = _Stored(key, message, 0.0)
             stored.stored_at = float(contents.rows[Table.MESSAGE][key][8] or 0.0)
             self.bytes += stored.size
-        self._adopt(broker, loaded)
+        self._adopt(broker, loaded, contents.rows)
         for table, key in loaded.useless:
-            self._open.remove(table, key)
+            self._open.rows[table].pop(key, None)
+            self._open.deleted[table][key] = None
         for message in loaded.messages.values():
             if not self._messages[message].references:
                 self._forget(message)
@@ -209,7 +211,7 @@ class SqliteStore:
                 self.path,
             )
 
-    def _adopt(self, broker: Broker, loaded: Loaded) -> None:
+    def _adopt(self, broker: Broker, loaded: Loaded, rows: database.Rows) -> None:
         broker.restore(
             [session.kept for session in loaded.sessions.values()], list(loaded.retained.values())
         )
@@ -230,9 +232,9 @@ class SqliteStore:
                 if delivery is None:
                     known.recorded[packet_id] = key
                 else:
-                    self._take(known, key, delivery)
+                    self._take(known, key, delivery, cast(int, rows[Table.OWED][key][8]))
             for key, delivery in zip(entry.queue, session.queue, strict=True):
-                self._take(known, key, delivery)
+                self._take(known, key, delivery, None)
             for packet_id, held in session.received.items():
                 known.received[packet_id] = entry.received[packet_id], held.message
                 self._messages[held.message].references += 1
@@ -242,8 +244,8 @@ class SqliteStore:
             if entry.kept.ends_at is None:  # its time runs from now on, through further restarts
                 self._put_session(session, known)
 
-    def _take(self, known: _Known, key: int, delivery: Delivery) -> None:
-        known.owed[id(delivery)] = key, delivery
+    def _take(self, known: _Known, key: int, delivery: Delivery, sent: int | None) -> None:
+        known.owed[id(delivery)] = key, delivery, sent
         self._messages[delivery[0]].references += 1
 
     async def close(self) -> None:
@@ -473,7 +475,7 @@ class SqliteStore:
         """Forget all of a session but for itself and its will."""
         for key in known.filters.values():
             self._open.remove(Table.SUBSCRIPTION, key)
-        for key, delivery in known.owed.values():
+        for key, delivery, _ in known.owed.values():
             self._open.remove(Table.OWED, key)
             self._release(delivery[0])
         for key in known.recorded.values():
@@ -549,12 +551,13 @@ class SqliteStore:
         entry = known.owed.get(id(delivery))
         if entry is None:
             key = next(self._keys)
-            known.owed[id(delivery)] = key, delivery
             message = self._refer(delivery[0])
         else:
             key = entry[0]
             message = self._messages[delivery[0]].key
-        row = owed_row(key, known.key, message, delivery, packet_id)
+        sent = next(self._keys) if packet_id is not None else None
+        known.owed[id(delivery)] = key, delivery, sent
+        row = owed_row(key, known.key, message, delivery, packet_id, sent)
         self._open.put(Table.OWED, key, row)
         self._stage()
 
@@ -572,9 +575,10 @@ class SqliteStore:
         known = self._sessions.get(session)
         entry = known.owed.pop(id(delivery), None) if known is not None else None
         if known is not None and entry is not None:
-            key = entry[0]
+            key, _, sent = entry
             known.recorded[packet_id] = key
-            self._open.put(Table.OWED, key, owed_row(key, known.key, None, delivery, packet_id))
+            row = owed_row(key, known.key, None, delivery, packet_id, sent)
+            self._open.put(Table.OWED, key, row)
             self._release(delivery[0])
             self._stage()
 
@@ -594,7 +598,12 @@ class SqliteStore:
         key = next(self._keys)
         known.received[packet_id] = key, held.message
         message = self._refer(held.message)
-        row = received_row(key, known.key, packet_id, message, held)
+        full = [
+            self._sessions[each].key
+            for each in held.full
+            if isinstance(each, Session) and each in self._sessions
+        ]
+        row = received_row(key, known.key, packet_id, message, held, full)
         self._open.put(Table.RECEIVED, key, row)
         self._stage()
 

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import TypeAlias, TypeVar
 
 from appliance.store.schema import (
-    DamagedError,
     Durability,
     Row,
-    StoreError,
     Table,
     connect,
     delete,
@@ -108,7 +106,7 @@ class Writer:
             error: Exception | None = None
             try:
                 self._write(batch)
-            except (sqlite3.Error, OSError, DamagedError, StoreError) as problem:
+            except Exception as problem:  # whatever it is, the thread has to go on
                 error = problem
                 # What is wrong may be the file that was opened: the next attempt opens it anew.
                 self._close()
