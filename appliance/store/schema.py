@@ -125,9 +125,9 @@ MIGRATIONS: tuple[str, ...] = (
 #: Bytes of the database file, "MQTA": so that another program's database is not taken for ours.
 APPLICATION_ID = 0x4D515441
 
-#: Pages of the write-ahead log after which it is moved into the database: 8 MB. It is then written
+#: Pages of the write-ahead log after which it is moved into the database: 4 MB. It is then written
 #: from its beginning again, which is faster than to let it grow.
-CHECKPOINT_PAGES = 2000
+CHECKPOINT_PAGES = 1000
 
 #: Seconds to wait for another program that has the database locked, such as a backup.
 BUSY_TIMEOUT = 5.0

@@ -194,7 +194,7 @@ class SqliteStore:
         if contents.problem:
             self._failing = True
             self._complain(contents.problem)
-            self._timer = self._loop.call_later(RETRY, self._retry)
+            self._stage_lazily()
             self._tell(False)
         elif contents.rescued:
             self._hand_over()
@@ -300,16 +300,12 @@ class SqliteStore:
     def _stage_lazily(self) -> None:
         """Nothing depends on it: it is written when something else is, or in a while."""
         if self._timer is None and self._running and not self._writing:
-            self._timer = self._loop.call_later(LINGER, self._lingered)
+            delay = RETRY if self._failing else LINGER
+            self._timer = self._loop.call_later(delay, self._write_in_time)
 
-    def _lingered(self) -> None:
+    def _write_in_time(self) -> None:
         self._timer = None
-        if not self._writing and not self._failing and self._open:
-            self._hand_over()
-
-    def _retry(self) -> None:
-        self._timer = None
-        if not self._writing:
+        if not self._writing and (self._open or self._failed is not None or self._failing):
             self._hand_over()
 
     def _hand_over(self) -> None:
@@ -355,12 +351,9 @@ class SqliteStore:
         self._tell(error is None)
         if not self._running or self._writing:
             return
-        if self._failing:
-            if self._timer is None:
-                self._timer = self._loop.call_later(RETRY, self._retry)
-        elif self._urgent:
+        if self._urgent and not self._failing:
             self._hand_over()
-        elif self._open:
+        elif self._open or self._failing:
             self._stage_lazily()
 
     def _complain(self, problem: str) -> None:

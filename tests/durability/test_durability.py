@@ -30,7 +30,7 @@ def test_it_starts_whatever_was_done_to_its_files(tmp_path: Path) -> None:
 @contextlib.contextmanager
 def small_disk(path: Path) -> Iterator[Path]:
     path.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=3m,mode=700", "tmpfs", str(path)]
+    command = ["mount", "-t", "tmpfs", "-o", "size=16m,mode=700", "tmpfs", str(path)]
     if os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
         pytest.skip("only root may mount a small disk")
     try:

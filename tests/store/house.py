@@ -88,7 +88,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         if owed is None:
             return None
         message, qos, retain, ids, share = owed
-        group = share.filter if share in broker._shares.values() else None
+        group = share.filter if share and share.filter in broker._shares else None
         return _message(message), qos, retain, ids or None, group
 
     will = session.will
