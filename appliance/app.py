@@ -134,7 +134,7 @@ class App:
         wanted = self.settings.broker.store
         if wanted.durability == "off":
             return None
-        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size)
+        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
         store.open()
         self._stack.push_async_callback(store.close)
         return store

@@ -374,11 +374,12 @@ class Limits(_Section):
 
 
 class Store(_Section):
-    """Where sessions and retained messages are kept; `size` is in bytes."""
+    """Where sessions and retained messages are kept; `size` is in bytes, `age` in seconds."""
 
     path: FilePath = Path("state/store.db")
     durability: Literal["power", "process", "off"] = "power"
     size: Annotated[Size, Field(ge=1 << 20)] = 1 << 30
+    age: Annotated[Duration, Field(gt=0)] | None = None
 
 
 class Broker(_Section):

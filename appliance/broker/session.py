@@ -413,6 +413,19 @@ class Session:
             else:
                 self._send(link, delivery)
 
+    def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
+        """Drop what waits and is too old; returns how many messages that were."""
+        kept = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
+        dropped = len(self.queue) - len(kept)
+        if dropped:
+            for delivery in self.queue:
+                if is_old(delivery[0]):
+                    self._uncount(delivery[0])
+                    self._settled(delivery)
+            self.queue = kept
+            self.ledger.counters.publish_dropped += dropped
+        return dropped
+
     def open_window(self, size: int) -> None:
         """Let so many messages be in flight, once it can be kept that they are."""
         self._agreed_window = size

@@ -40,7 +40,8 @@ LINGER = 1.0
 RETRY = 1.0
 
 #: Seconds between two looks at the wall clock, and by how many it is wrong when it was set anew.
-CLOCK_CHECK = 30.0
+#: What is too old is looked for as often.
+CLOCK_CHECK = 10.0
 CLOCK_STEP = 2.0
 
 #: Bytes that a message takes in the database beside topic and payload, roughly, with what it is
@@ -80,7 +81,8 @@ class _Known:
 class SqliteStore:
     """The `Store` in a SQLite database; `open`, `restore`, `start`, and at the end `close`.
 
-    `size` is the most that messages may take, in bytes. Only the event loop's thread may call it.
+    `size` is the most that messages may take, in bytes, and `age`, in seconds, how long they may
+    wait at most; None for ever. Only the event loop's thread may call it.
     """
 
     def __init__(
@@ -89,10 +91,12 @@ class SqliteStore:
         durability: Durability = "power",
         *,
         size: int = 1 << 30,
+        age: float | None = None,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self.path = path
         self.size = size
+        self.age = age
         self.staged = False
         self.fresh = False
         self.batch = 1
@@ -368,6 +372,7 @@ class SqliteStore:
     def _check_clock(self) -> None:
         """Store the times anew when the wall clock was set, as it is on a robot after its boot."""
         self._clock = self._loop.call_later(CLOCK_CHECK, self._check_clock)
+        self._drop_old()
         offset = self._wall() - self._loop.time()
         if abs(offset - self._offset) < CLOCK_STEP:
             return
@@ -379,6 +384,27 @@ class SqliteStore:
             if message.expires_at is not None:
                 self._put_message(message, stored)
         self._stage_lazily()
+
+    def _drop_old(self) -> None:
+        """Drop what has waited for longer than `age`."""
+        if self.age is None:
+            return
+        limit = self._loop.time() + self._offset - self.age
+        oldest = next(iter(self._messages.values()), None)
+        if oldest is None or oldest.stored_at >= limit:
+            return
+
+        def is_old(message: Message) -> bool:
+            stored = self._messages.get(message)
+            return stored is not None and stored.stored_at < limit
+
+        dropped = sum(session.drop_queued(is_old) for session in list(self._sessions))
+        if dropped:
+            log.warning(
+                "%d messages have waited for longer than %g s and are dropped (broker.store.age)",
+                dropped,
+                self.age,
+            )
 
     # --- messages ------------------------------------------------------------------------------
 

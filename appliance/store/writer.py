@@ -23,7 +23,7 @@ from appliance.store.schema import (
 
 #: Rows that one statement writes: each statement lets go of Python's lock and takes it again, for
 #: which it may wait as long as the event loop is busy.
-_CHUNKS = (64, 8, 1)
+_CHUNKS = (64, 32, 16, 8, 4, 2, 1)
 
 _Item = TypeVar("_Item")
 

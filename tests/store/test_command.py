@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from appliance_process import ACL, ApplianceProcess
 from raw_client import RawClient
 
+from appliance import cli
 from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription
 
 
@@ -33,13 +35,20 @@ def process(tmp_path: Path) -> Iterator[ApplianceProcess]:
     process.stop()
 
 
-def store(process: ApplianceProcess, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "appliance", "store", *arguments, "-c", str(process.config)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+@dataclass
+class Told:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def store(process: ApplianceProcess, *arguments: str) -> Told:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main(["store", *arguments, "-c", str(process.config)])
+        except SystemExit as end:
+            return Told(int(end.code or 0), out.getvalue(), err.getvalue())
 
 
 def entries(process: ApplianceProcess) -> dict[str, dict[str, object]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import pytest_asyncio
-from broker.conftest import lasting
+from broker.conftest import check_accounts, lasting
 from durability.harm import HARMS
 
 from appliance.mqtt.packets import Publish, Subscribe, Subscription
@@ -172,6 +172,32 @@ async def test_what_is_too_much_for_it_is_refused(tmp_path: Path) -> None:
         await house.written()
         codes += [packet.reason_code for packet in publisher.received()]
     assert codes == [0] * 20 + [0x97] * 10
+    await house.stop()
+
+
+async def test_what_is_too_old_is_dropped(tmp_path: Path) -> None:
+    clock = 1_000_000.0
+    house = House(tmp_path / "first", age=3600, wall=lambda: clock).start()
+    client = await house.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a", 1)]))
+    client.lose()
+    publisher = await house.join("publisher")
+    publisher.send(Publish("a", b"old", 1, packet_id=1))
+    await house.written()
+    clock += 3000  # as after a restart
+    twin = house.twin(tmp_path / "twin")
+    publisher = await twin.join("publisher")
+    publisher.send(Publish("a", b"new", 1, packet_id=1))
+    await twin.written()
+    twin.store._drop_old()
+    queue = twin.broker.sessions["client"].queue
+    assert len(queue) == 2
+    twin.store._offset += 1000
+    twin.store._drop_old()
+    queue = twin.broker.sessions["client"].queue
+    assert [delivery[0].payload for delivery in queue] == [b"new"]
+    check_accounts(twin.broker)
+    await twin.stop()
     await house.stop()
 
 
