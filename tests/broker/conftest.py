@@ -11,7 +11,7 @@ from appliance.broker.broker import Broker, retained_size
 from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
-from appliance.broker.session import Delivery, Session, subscription_size
+from appliance.broker.session import Delivery, Held, Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
@@ -128,6 +128,12 @@ class FakeStore(MemoryStore):
     def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
         self._stage()
         self.settled(session, delivery)
+
+    def held(self, session: Session, packet_id: int, held: Held) -> None:
+        self._stage()
+
+    def unheld(self, session: Session, packet_id: int) -> None:
+        self._stage()
 
     def settled(self, session: Session, delivery: Delivery) -> None:
         self._known.remove((session.client_id, id(delivery)))
