@@ -39,7 +39,7 @@ from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
-from appliance.store import MemoryStore
+from appliance.store import MemoryStore, SqliteStore
 
 log = logging.getLogger(__name__)
 
@@ -79,6 +79,7 @@ class App:
             AccessFileError, CertificateError: a file is missing or wrong.
             AuditError: the audit log cannot be written.
             PluginSettingsError: one of broker.plugins cannot be loaded.
+            StoreError: the store is in use, of a newer version, or cannot be read.
             OSError: a port cannot be listened on.
         """
         try:
@@ -107,8 +108,9 @@ class App:
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
+        store = self._open_store()
         self.broker = broker = Broker(
-            access, MemoryStore(), _broker_limits(settings), _features(settings)
+            access, store or MemoryStore(), _broker_limits(settings), _features(settings)
         )
         audit = broker_settings.audit
         if audit.path is not None:
@@ -117,6 +119,8 @@ class App:
             self.audit.began()
             self._stack.callback(self.audit.ended)
         broker.tick(loop.time())
+        if store is not None:
+            store.restore(broker)
 
         async def listen() -> None:
             wanted = self._listener_settings(tls)
@@ -172,6 +176,15 @@ class App:
         if not policies:
             return None
         return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
+
+    def _open_store(self) -> SqliteStore | None:
+        wanted = self.settings.broker.store
+        if wanted.durability == "off":
+            return None
+        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
+        store.open()
+        self._stack.push_async_callback(store.close)
+        return store
 
     def _listener_settings(self, tls: TlsContexts | None) -> list[ListenerSettings]:
         return [

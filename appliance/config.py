@@ -426,6 +426,15 @@ class AuditLog(_Section):
     keep: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
+class Store(_Section):
+    """Where sessions and retained messages are kept; `size` is in bytes, `age` in seconds."""
+
+    path: FilePath = Path("state/store.db")
+    durability: Literal["power", "process", "off"] = "power"
+    size: Annotated[Size, Field(ge=1 << 20)] = 1 << 30
+    age: Annotated[Duration, Field(gt=0)] | None = None
+
+
 class Broker(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
@@ -442,6 +451,7 @@ class Broker(_Section):
     tls: Tls = _section()
     limits: Limits = _section()
     audit: AuditLog = _section()
+    store: Store = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import uuid
+from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -107,6 +108,10 @@ class Wire(Protocol):
         """Write what was written so far, then close."""
 
 
+#: Why a message is refused while the store cannot take it.
+CANNOT_KEEP = "it cannot be stored: see the log of the store"
+
+
 def _reason(code: int, route: Route) -> str:
     """Why a message was refused, in words."""
     return route.reason if code == ReasonCode.NOT_AUTHORIZED else "no room to keep it"
@@ -123,6 +128,12 @@ class Client:
         self.session: Session | None = None
         self._ledger = broker.ledger
         self._counters = broker.counters
+        self._store = broker.store
+        #: The batch of the store that what it is answered depends on, and what waits for which.
+        self._batch = 0
+        self._waiting: deque[tuple[int, list[bytes]]] = deque()
+        #: PUBRELs that wait until the store can keep what they release.
+        self._postponed: dict[int, None] = {}
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
         self._out: list[bytes] = []
@@ -179,8 +190,15 @@ class Client:
                     self.later()
         except ProtocolError as error:
             self.fail(error)
+        if self._store.fresh:
+            self._depend()
         if connection.held != self._held:
             self._count_held()
+
+    def _depend(self) -> None:
+        """What it was just answered depends on what was just staged."""
+        self._store.fresh = False
+        self._batch = self._store.batch
 
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
@@ -282,6 +300,15 @@ class Client:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         code = ReasonCode.SUCCESS
         held = session.received.get(packet_id)
+        if (
+            self._ledger.refusing
+            and route.allowed
+            and self.broker.must_store(route, message, session)
+        ):
+            session.unhold(packet_id)
+            self._counters.publish_dropped += 1
+            self._acknowledge(0x50, packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
+            return
         if held is not None and not held.message.is_like(message):
             # A client that has lost its memory begins anew with the same ids: what it does not
             # know of any more, it will not release. mosquitto sees it like this, too.
@@ -321,17 +348,43 @@ class Client:
             known = session.pubrec(packet_id, code)
             if not known:
                 log.debug("%s: PUBREC %d for nothing in flight", self, packet_id)
-            if code < 0x80:
+            if code < 0x80 and not (self._ledger.failing and session.expiry):
                 # An unknown id is answered too, or a client that missed our end would wait forever;
                 # without 0x92, which says nothing that it needs (and as mosquitto does).
                 self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
+            if self._ledger.failing and self._must_postpone(session, packet_id):
+                return
             held = session.unhold(packet_id)
             if held is not None:
                 self.broker.release(held, session)
             self._acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
+
+    def _must_postpone(self, session: Session, packet_id: int) -> bool:
+        """Whether a PUBREL, which cannot be refused, has to wait until the store can keep it."""
+        held = session.received.get(packet_id)
+        if held is None:
+            # Its PUBCOMP may depend on what is not kept yet.
+            postpone = session.persistent
+        else:
+            route = self.broker.route(session, held.message.topic_wire)
+            postpone = self.broker.must_store(route, held.message, session)
+        if postpone:
+            self._postponed[packet_id] = None
+        return postpone
+
+    def resume(self) -> None:
+        """The store keeps again what is to be kept: go on with what had to wait for it."""
+        postponed, self._postponed = self._postponed, {}
+        try:
+            for packet_id in postponed:
+                self._on_acknowledgement(PUBREL, packet_id, 0)
+        except ProtocolError as error:
+            self.fail(error)
+        if self._store.fresh:
+            self._depend()
 
     def _on_packet(self, packet: Packet) -> None:
         if isinstance(packet, Publish):
@@ -552,7 +605,7 @@ class Client:
             self.refuse(error.code, str(error))
             return
         self.wire.accepted()
-        session.window = agreement.window
+        session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         self.session = session
@@ -693,16 +746,20 @@ class Client:
 
         `reason` is for a refusal, and for clients that are to be told.
         """
-        if code >= 0x80 and self._explain and reason:
-            self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
-            return
+        packet = bytes((first, 2, packet_id >> 8, packet_id & 0xFF))
+        if code:
+            if self._version == 5:
+                if code >= 0x80 and self._explain and reason:
+                    self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
+                    return
+                packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
+            elif code == ReasonCode.QUOTA_EXCEEDED and self._ledger.refusing:
+                # 3.1.1 cannot refuse, and what is acknowledged must be kept.
+                raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
         out = self._out
         if not out:
             self.broker.unflushed.append(self)
-        if code and self._version == 5:
-            out.append(bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code)))
-        else:
-            out.append(bytes((first, 2, packet_id >> 8, packet_id & 0xFF)))
+        out.append(packet)
         self._counters.control_sent += 1
 
     def _send(self, packet: Packet) -> None:
@@ -745,8 +802,43 @@ class Client:
             if self.writable:  # the network has not asked for a pause
                 self.resume_writing()
 
+    def wait(self, committed: int) -> bool:
+        """Keep what was sent since the last flush, if it depends on a later batch than this."""
+        batch = self._batch
+        session = self.session
+        if session is not None and session.batch > batch:
+            batch = session.batch
+        waiting = self._waiting
+        if waiting and waiting[-1][0] > batch:
+            batch = waiting[-1][0]  # nothing passes what waits
+        if batch <= committed:
+            return False
+        out, self._out = self._out, []
+        if waiting and waiting[-1][0] == batch:
+            waiting[-1][1].extend(out)
+        else:
+            waiting.append((batch, out))
+        return True
+
+    def release(self, committed: int) -> bool:
+        """Write what waited for this batch; True when something waits for a later one."""
+        waiting = self._waiting
+        if self._full and not self._out:
+            self.writable = not self._closed
+        while waiting and waiting[0][0] <= committed:
+            chunks = waiting.popleft()[1]
+            if chunks:
+                self.wire.write(chunks)
+        if waiting:
+            return True
+        if not self._out:
+            self._out_size = 0
+            self.flush()
+        return False
+
     def abandon(self) -> None:
         """Close without sending what waits: what it would acknowledge could not be kept."""
+        self._waiting.clear()
         self._out.clear()
         self.lost()
         self.wire.close()
