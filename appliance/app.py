@@ -8,18 +8,18 @@ import gc
 import logging
 import os
 import signal
-from dataclasses import asdict
+from collections.abc import Coroutine
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, Changes, FileAccess
+from appliance import wiring
+from appliance.access import FileAccess
 from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
 from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import (
     CertificateError,
@@ -27,19 +27,20 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
-from appliance.certs.settings import listener_name, tls_files, tls_policies
+from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
-    TopicRoute,
     is_open_with_secrets,
     secrets_in,
 )
-from appliance.listeners import Admission, Listeners, ListenerSettings
-from appliance.mqtt.reason import ReasonCode
-from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.control import Control, ControlError
+from appliance.listeners import Listeners
+from appliance.reload import Parts, Reload, ReloadError
+from appliance.ros.bridge import Bridge
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
 from appliance.store import MemoryStore, SqliteStore
+from appliance.watch import watch
 
 log = logging.getLogger(__name__)
 
@@ -92,15 +93,12 @@ class App:
         loop = asyncio.get_running_loop()
         settings = self.settings
         broker_settings = settings.broker
-        users, acl = broker_settings.users, broker_settings.acl
         if is_open_with_secrets(settings):
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
-        # A file may be missing where plugins do its work, and only there.
-        authenticating, ruling = plugin_kinds(broker_settings.plugins)
+        authenticating, _ = plugin_kinds(broker_settings.plugins)
         self._tls = tls = self._load_tls()
         self._access = access = FileAccess(
-            None if authenticating and not users.exists() else users,
-            None if ruling and not acl.exists() else acl,
+            *wiring.access_files(settings),
             settings.robot,
             broker_settings.anonymous,
             failed_logins=broker_settings.limits.failed_logins,
@@ -110,7 +108,10 @@ class App:
         limits = broker_settings.limits
         store = self._open_store()
         self.broker = broker = Broker(
-            access, store or MemoryStore(), _broker_limits(settings), _features(settings)
+            access,
+            store or MemoryStore(),
+            wiring.broker_limits(settings),
+            wiring.features(settings),
         )
         audit = broker_settings.audit
         if audit.path is not None:
@@ -123,7 +124,7 @@ class App:
             store.restore(broker)
 
         async def listen() -> None:
-            wanted = self._listener_settings(tls)
+            wanted = wiring.listener_settings(settings, tls)
             self.addresses = await listeners.start(wanted)
             for (host, port), listener in zip(self.addresses, wanted, strict=True):
                 kind = " for WebSocket" if listener.protocol == "websocket" else ""
@@ -154,7 +155,7 @@ class App:
             frame.authenticate,
             # It would pass by plugins that refuse clients.
             access.exchange if not authenticating else lambda method, address: None,
-            _admission(settings),
+            wiring.admission(settings),
             tls,
         )
         self._stack.push_async_callback(listeners.stop)
@@ -165,6 +166,11 @@ class App:
         if tls is not None:
             self._keep_certificates(tls)
         self._start_bridge(loop)
+        self._reload = Reload(
+            Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
+        )
+        if settings.file is not None:
+            await self._open_to_commands()
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
@@ -186,26 +192,17 @@ class App:
         self._stack.push_async_callback(store.close)
         return store
 
-    def _listener_settings(self, tls: TlsContexts | None) -> list[ListenerSettings]:
-        return [
-            ListenerSettings(
-                listener.bind.host,
-                listener.bind.port,
-                tls.source(listener_name(index)) if listener.tls and tls else None,
-                listener.protocol,
-                listener.bind.path,
-                listener.mode,
-            )
-            for index, listener in enumerate(self.settings.broker.listeners)
-        ]
-
     def _keep_certificates(self, tls: TlsContexts) -> None:
         """Renew the server's certificate when that is due, and tell of what has run out."""
-        keeping = asyncio.ensure_future(self._keep(tls))
+        self._beside(self._keep(tls))
+
+    def _beside(self, work: Coroutine[object, object, None]) -> None:
+        """Run this beside everything else, until the stop."""
+        task = asyncio.ensure_future(work)
 
         async def end() -> None:
-            keeping.cancel()
-            await asyncio.gather(keeping, return_exceptions=True)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
         self._stack.push_async_callback(end)
 
@@ -248,7 +245,7 @@ class App:
         self.bridge = Bridge(
             Ros2Node(bridge.node, bridge.namespace, bridge.domain_id),
             self.broker,
-            [_route_settings(route, settings.robot) for route in bridge.topics],
+            wiring.routes(settings),
             loop,
             settings.robot,
         )
@@ -292,38 +289,39 @@ class App:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)
         await self.start()
-        loop.add_signal_handler(signal.SIGHUP, self.reload)
+        loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         try:
             await self._stopping.wait()
             log.info("stopping")
         finally:
             await self.stop()
 
-    def reload(self) -> None:
-        """Take over users, ACL and certificates as they are now; a wrong file changes nothing."""
-        try:
-            certificates = self._tls.prepare() if self._tls is not None else None
-            changes = self._access.reload()
-        except (AccessFileError, CertificateError) as error:
-            log.error("not reloaded, what was in force stays so: %s", error)
-            if self.audit is not None:
-                self.audit.changed("nothing: the files cannot be used", error=str(error))
-            return
-        if certificates is not None:
-            self._take_tls(certificates)
-        self._take_over(changes)
+    async def reload(self) -> list[str]:
+        """Take over all files as they are now; see `Reload.run`."""
+        return await self._reload.run()
 
-    def _take_over(self, changes: Changes) -> None:
-        """Let connected clients have the rights that they have now, and no others."""
-        removed = set(changes.users_removed)  # others are known to plugins
-        for session in list(self.broker.sessions.values()):
-            if session.identity and session.identity.username in removed:
-                session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
-        self.broker.rules_changed()
-        self.broker.flush()
-        log.info("users and access rules reloaded")
-        if self.audit is not None:
-            self.audit.changed("users and access rules", **asdict(changes))
+    async def _try_reload(self) -> None:
+        with contextlib.suppress(ReloadError):  # the log was told
+            await self._reload.run()
+
+    def _on_hangup(self) -> None:
+        self._listeners.network.in_background(self._try_reload())
+
+    async def _answer_reload(self) -> list[str]:
+        try:
+            return await self._reload.run()
+        except ReloadError as error:
+            raise ControlError(f"nothing was reloaded: {error}") from None
+
+    async def _open_to_commands(self) -> None:
+        """Answer commands of this computer, and follow the files."""
+        settings = self.settings
+        settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        control = Control(settings.control, {"reload": self._answer_reload})
+        await control.start()
+        self._stack.push_async_callback(control.stop)
+        if settings.reload_on_change:
+            self._beside(watch(self._reload.files, self._try_reload))
 
     def request_stop(self) -> None:
         """Let `run` end."""
@@ -350,62 +348,6 @@ class _Deaf:
 
     def close(self, reason: object, message: str) -> None:
         """There is no connection to close."""
-
-
-def _broker_limits(settings: Settings) -> Limits:
-    limits = settings.broker.limits
-    return Limits(
-        connections=limits.connections,
-        packet_size=limits.packet_size,
-        memory=limits.memory,
-        queue_messages=limits.queue_messages,
-        queue_bytes=limits.queue_bytes,
-        queue_full=limits.queue_full,
-        keep=0 if limits.keep == "latest" else limits.keep,
-        inflight=limits.inflight,
-        sessions=limits.sessions,
-        subscriptions=limits.subscriptions,
-        topic_length=limits.topic_length,
-        topic_levels=limits.topic_levels,
-        retained_messages=limits.retained_messages,
-        retained_bytes=limits.retained_bytes,
-        session_expiry=round(limits.session_expiry),
-        topic_alias=limits.topic_alias,
-        keep_alive=round(limits.keep_alive),
-    )
-
-
-def _admission(settings: Settings) -> Admission:
-    limits = settings.broker.limits
-    return Admission(
-        limits.connections,
-        limits.connect_timeout,
-        limits.connections_per_address,
-        limits.connection_rate,
-        limits.publish_rate,
-    )
-
-
-def _features(settings: Settings) -> Features:
-    return Features(
-        check_payload_format=settings.broker.check_payload_format,
-        reason_strings=settings.broker.reason_strings,
-        response_information=settings.broker.response_information or "",
-    )
-
-
-def _route_settings(route: TopicRoute, robot: str) -> RouteSettings:
-    return RouteSettings(
-        ros=route.ros,
-        to=route.to,
-        mqtt=route.topic(robot),
-        type=route.type,
-        encoding=route.encoding,
-        rate=route.rate,
-        qos=route.qos,
-        retain=route.retain,
-        keep=route.keep,
-    )
 
 
 def run(settings: Settings) -> int:

@@ -145,6 +145,19 @@ def _start_errors() -> Iterator[None]:
 
 
 @app.command()
+def reload(config: ConfigOption = None) -> None:
+    """Have the running appliance take over its files as they are now: all of them, or none."""
+    settings = _load(config)
+    from appliance.control import ControlError, ask
+
+    try:
+        changed = ask(settings.control, "reload")
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    typer.echo("\n".join(changed) if changed else "nothing has changed")
+
+
+@app.command()
 def check(
     config: ConfigOption = None,
     show: Annotated[

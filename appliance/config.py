@@ -540,6 +540,8 @@ class Settings(_Section):
     broker: Broker = _section()
     bridge: Bridge = _section()
     log: Log = _section()
+    control: FilePath = Path("state/control.sock")
+    reload_on_change: bool = True
     _file: Path | None = PrivateAttr(default=None)
 
     @property

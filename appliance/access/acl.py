@@ -169,9 +169,12 @@ class Acl:
     the action decides, and what none decides is refused.
     """
 
-    def __init__(self, name: str, rules: Iterable[Rule]) -> None:
-        """`name` is what the file is called in reasons."""
+    def __init__(
+        self, name: str, rules: Iterable[Rule], files: frozenset[Path] = frozenset()
+    ) -> None:
+        """`name` is what the file is called in reasons, `files` is it and what it includes."""
         self._name = name
+        self.files = files
         own: dict[str | None, list[Rule]] = {}
         patterns: list[Rule] = []
         for rule in rules:
@@ -189,7 +192,7 @@ class Acl:
         AccessFileError names all that is wrong, in included files too; ValueError when `robot`
         cannot stand in a topic.
         """
-        return cls(path.name, read_rules(path, robot))
+        return cls(path.name, *read_rules(path, robot))
 
     @property
     def rules(self) -> list[Rule]:

@@ -85,6 +85,12 @@ class Rules:
             raise AccessFileError(problems)
         return cls(users, acl, robot, anonymous, passwords, rules)
 
+    @property
+    def files(self) -> frozenset[Path]:
+        """What they were read from, included files too."""
+        named = {path for path in (self.users_path, self.acl_path) if path is not None}
+        return frozenset(named) | (self.acl.files if self.acl else frozenset())
+
 
 @dataclass(frozen=True, slots=True)
 class Changes:
@@ -158,6 +164,11 @@ class FileAccess:
         # One of two cores stays with the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._checks: Checks[str | None] = Checks(workers, max_waiting)
+
+    @property
+    def in_force(self) -> Rules:
+        """What both files said when they were last read."""
+        return self._in_force
 
     def reload(self) -> Changes:
         """Reads both files again. AccessFileError leaves what was in force in force."""

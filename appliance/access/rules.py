@@ -84,8 +84,10 @@ class Rule:
         return f"{self.file}:{self.line}: {self.text}"
 
 
-def read_rules(path: Path, robot: str) -> list[Rule]:
+def read_rules(path: Path, robot: str) -> tuple[list[Rule], frozenset[Path]]:
     """The rules of the file at `path` and of those that it includes, `{robot}` replaced.
+
+    Returns these files as well.
 
     AccessFileError names all that is wrong; ValueError when `robot` cannot stand in a topic.
     """
@@ -94,7 +96,7 @@ def read_rules(path: Path, robot: str) -> list[Rule]:
     reader.read(path)
     if reader.problems:
         raise AccessFileError(reader.problems)
-    return reader.rules
+    return reader.rules, frozenset(reader.files)
 
 
 class _LineError(ValueError):
@@ -125,6 +127,7 @@ class _Reader:
     def __init__(self, directory: Path, robot: str) -> None:
         """File names of rules are as seen from `directory`."""
         self.problems: list[Problem] = []
+        self.files: set[Path] = set()
         self._directory = directory
         self._robot = robot
         self._told: set[Problem] = set()
@@ -151,6 +154,7 @@ class _Reader:
         The file that includes it goes on with the user that it had. `including` are the files that
         led here, and `via` the lines.
         """
+        self.files.add(path)
         file = path.resolve()
         if (file, user) in self._read:
             return
