@@ -120,7 +120,7 @@ class App:
             listen,
             lambda: listeners.stop(),
             plugin_timeout,
-            tls.username if tls is not None else lambda _: None,
+            certificate_user=tls.username if tls is not None else lambda _: None,
         )
         self._listeners = listeners = Listeners(
             broker,

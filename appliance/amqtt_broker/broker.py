@@ -129,6 +129,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         listen: Callable[[], Awaitable[None]],
         hang_up: Callable[[], Awaitable[None]],
         plugin_timeout: float = PLUGIN_TIMEOUT,
+        *,
         certificate_user: Callable[[ssl.SSLObject], str | None] = lambda tls: None,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
