@@ -64,12 +64,13 @@ class Peer(RawClient):
     def __init__(
         self, process: ApplianceProcess, certificate: str | None = None, port: int | None = None
     ) -> None:
-        super().__init__(process, 5)
-        self.socket.close()
         self.context = context_of(process, certificate)
-        self.socket = self.context.wrap_socket(
-            socket.create_connection((HOST, port or process.port), PATIENCE), server_hostname=HOST
-        )
+        self.port = port or process.port
+        super().__init__(process, 5, tls=True)
+
+    def open(self, *, tls: bool) -> socket.socket:
+        plain = socket.create_connection((HOST, self.port), PATIENCE)
+        return self.context.wrap_socket(plain, server_hostname=HOST)
 
     def log_in(self, client_id: str, user: str | None = None, password: str | None = None) -> int:
         """The reason code of the CONNACK."""
@@ -122,11 +123,26 @@ def make(directory: Path, **tls: Any) -> ApplianceProcess:
 
 @pytest.fixture
 def process(tmp_path: Path) -> Iterator[ApplianceProcess]:
-    process = make(tmp_path, username_from="subject")
+    with running(tmp_path) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def unchanged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
+    """The same for all tests that change nothing about it."""
+    with running(tmp_path_factory.mktemp("certs")) as process:
+        yield process
+
+
+@contextlib.contextmanager
+def running(directory: Path) -> Iterator[ApplianceProcess]:
+    process = make(directory, username_from="subject")
     process.start()
-    process.port = _ports(process)[0]
-    yield process
-    process.stop()
+    try:
+        process.port = _ports(process)[0]
+        yield process
+    finally:
+        process.stop()
 
 
 def _ports(process: ApplianceProcess) -> list[int]:
@@ -138,65 +154,65 @@ def _ports(process: ApplianceProcess) -> list[int]:
 # Who comes in
 
 
-def test_a_certificate_is_a_login(process: ApplianceProcess) -> None:
-    with Peer(process, "tablet") as peer:
+def test_a_certificate_is_a_login(unchanged: ApplianceProcess) -> None:
+    with Peer(unchanged, "tablet") as peer:
         assert peer.log_in("a") == 0
         assert peer.subscribe("r2d2/tablet/#") == 1
         assert peer.subscribe("r2d2/other/#") == ReasonCode.NOT_AUTHORIZED
-    process.wait_for_log("client 'a' \\(user 'tablet'\\) at .* connected")
-    with Peer(process, "tablet") as peer:  # and may say so
+    unchanged.wait_for_log("client 'a' \\(user 'tablet'\\) at .* connected")
+    with Peer(unchanged, "tablet") as peer:  # and may say so
         assert peer.log_in("a", "tablet", "whatever") == 0
-    with Peer(process, "tablet") as peer:
-        assert peer.log_in("b", "alice", process.passwords["alice"]) == ReasonCode.NOT_AUTHORIZED
-    process.wait_for_log("its certificate is of user 'tablet', and it says to be another one")
-    with Peer(process) as peer:  # who has none needs a password, as ever
-        assert peer.log_in("c", "alice", process.passwords["alice"]) == 0
-    with Peer(process) as peer:
+    with Peer(unchanged, "tablet") as peer:
+        assert peer.log_in("b", "alice", unchanged.passwords["alice"]) == ReasonCode.NOT_AUTHORIZED
+    unchanged.wait_for_log("its certificate is of user 'tablet', and it says to be another one")
+    with Peer(unchanged) as peer:  # who has none needs a password, as ever
+        assert peer.log_in("c", "alice", unchanged.passwords["alice"]) == 0
+    with Peer(unchanged) as peer:
         assert peer.log_in("d", "tablet") == ReasonCode.NOT_AUTHORIZED
 
 
-def test_a_session_of_the_certificates_user_is_no_one_elses(process: ApplianceProcess) -> None:
-    with Peer(process, "tablet") as peer:
+def test_a_session_of_the_certificates_user_is_no_one_elses(unchanged: ApplianceProcess) -> None:
+    with Peer(unchanged, "tablet") as peer:
         assert peer.log_in("mine") == 0
-        with Peer(process, "stranger") as other:
+        with Peer(unchanged, "stranger") as other:
             assert other.log_in("mine") not in (0,)
         peer.drain()
 
 
 def test_enhanced_authentication_is_not_for_who_has_a_certificate(
-    process: ApplianceProcess,
+    unchanged: ApplianceProcess,
 ) -> None:
     properties = {Property.AUTHENTICATION_METHOD: "SCRAM-SHA-256"}
-    with Peer(process, "tablet") as peer:
+    with Peer(unchanged, "tablet") as peer:
         peer.send(Connect("a", properties=dict(properties)))
         answer = peer.decode(peer.receive())
         assert isinstance(answer, Connack)
         assert answer.reason_code == ReasonCode.BAD_AUTHENTICATION_METHOD
-    with Peer(process) as peer:
+    with Peer(unchanged) as peer:
         peer.send(Connect("a", properties=dict(properties)))
         assert isinstance(peer.decode(peer.receive()), Auth)
 
 
-def test_a_listener_that_requires_certificates(process: ApplianceProcess) -> None:
-    port = _ports(process)[1]
-    with Peer(process, "tablet", port) as peer:
+def test_a_listener_that_requires_certificates(unchanged: ApplianceProcess) -> None:
+    port = _ports(unchanged)[1]
+    with Peer(unchanged, "tablet", port) as peer:
         assert peer.log_in("a") == 0
-    with pytest.raises((ssl.SSLError, ConnectionError)), Peer(process, None, port) as peer:
-        peer.log_in("b", "alice", process.passwords["alice"])
-    process.wait_for_log("it has no client certificate, and one is required")
+    with pytest.raises((ssl.SSLError, ConnectionError)), Peer(unchanged, None, port) as peer:
+        peer.log_in("b", "alice", unchanged.passwords["alice"])
+    unchanged.wait_for_log("it has no client certificate, and one is required")
 
 
-def test_a_certificate_of_someone_else(process: ApplianceProcess) -> None:
-    Company().issue(process.directory / "certs/clients/foreign", "alice")
-    with pytest.raises((ssl.SSLError, ConnectionError)), Peer(process, "foreign") as peer:
+def test_a_certificate_of_someone_else(unchanged: ApplianceProcess) -> None:
+    Company().issue(unchanged.directory / "certs/clients/foreign", "alice")
+    with pytest.raises((ssl.SSLError, ConnectionError)), Peer(unchanged, "foreign") as peer:
         peer.log_in("a")
-    process.wait_for_log("the client's certificate is not accepted: unable to get local issuer")
+    unchanged.wait_for_log("the client's certificate is not accepted: unable to get local issuer")
 
 
 @pytest.mark.skipif(shutil.which("mosquitto_sub") is None, reason="mosquitto-clients not installed")
-def test_mosquittos_clients(process: ApplianceProcess) -> None:
-    clients = process.directory / "certs/clients"
-    common = ["-h", HOST, "-p", str(process.port), "--cafile", str(process.ca), "-V", "5"]
+def test_mosquittos_clients(unchanged: ApplianceProcess) -> None:
+    clients = unchanged.directory / "certs/clients"
+    common = ["-h", HOST, "-p", str(unchanged.port), "--cafile", str(unchanged.ca), "-V", "5"]
     certificate = ["--cert", f"{clients}/tablet.crt", "--key", f"{clients}/tablet.key"]
     listening = subprocess.Popen(
         ["mosquitto_sub", *common, *certificate, "-t", "r2d2/tablet/x", "-q", "1", "-C", "1"],
@@ -204,7 +220,7 @@ def test_mosquittos_clients(process: ApplianceProcess) -> None:
         text=True,
     )
     try:
-        process.wait_for_log("user 'tablet'\\) at .* connected")
+        unchanged.wait_for_log("user 'tablet'\\) at .* connected")
         publish = ["mosquitto_pub", *common, *certificate, "-q", "1", "-m", "hello"]
         deadline = time.monotonic() + PATIENCE
         while listening.poll() is None and time.monotonic() < deadline:
@@ -215,10 +231,10 @@ def test_mosquittos_clients(process: ApplianceProcess) -> None:
         listening.wait()
 
 
-def test_our_own_client(process: ApplianceProcess, capfdbinary) -> None:
-    certs.write_bundle(process.directory / "certs", "tablet")
-    clients = process.directory / "certs/clients"
-    where = ["-H", HOST, "-p", str(process.port), "--ca", str(process.ca)]
+def test_our_own_client(unchanged: ApplianceProcess, capfdbinary) -> None:
+    certs.write_bundle(unchanged.directory / "certs", "tablet")
+    clients = unchanged.directory / "certs/clients"
+    where = ["-H", HOST, "-p", str(unchanged.port), "--ca", str(unchanged.ca)]
     pair = ["--cert", f"{clients}/tablet.crt", "--key", f"{clients}/tablet.key"]
 
     def run(*arguments: str) -> tuple[int, bytes]:
