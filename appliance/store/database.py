@@ -162,7 +162,7 @@ def _salvage(path: Path) -> Rows:
     except sqlite3.Error:
         return rows
     with contextlib.closing(connection):
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(sqlite3.Error):  # so that what is damaged is not taken for rows
             connection.execute("PRAGMA cell_size_check = ON")
         for table in Table:
             # From both ends, up to what cannot be read.

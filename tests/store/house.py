@@ -137,6 +137,11 @@ def difference(before: Any, after: Any, path: str = "") -> list[str]:
         for key in {**before, **after}:
             found += difference(before.get(key), after.get(key), f"{path}/{key}")
         return found
+    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        found = []
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            found += difference(one, other, f"{path}/{number}")
+        return found
     return [] if _same(before, after) else [f"{path}: {before!r} before, {after!r} after"]
 
 
