@@ -16,10 +16,7 @@ from appliance.ros.calls import CallError, ErrorCode
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, RosClient, RosNode
 
-#: Looks (some 0.15 s each) between two looks at all services there are.
-LOOKS_A_GRAPH = 3
-
-#: Looks that a client is kept for which nobody asks: a minute.
+#: Looks (some 0.15 s each) that a client is kept for which nobody asks: a minute.
 IDLE_LOOKS = 400
 
 #: Name and type of a service.
@@ -69,7 +66,6 @@ class Requests:
         # The ROS thread's.
         self._seen: dict[str, list[str]] = {}
         self._remotes: dict[Key, _Remote] = {}
-        self._looks = 0
         #: What could not be made a client of, and why; it is tried anew when the graph changes.
         self._unusable: dict[Key, tuple[ErrorCode, str]] = {}
 
@@ -113,21 +109,16 @@ class Requests:
 
     def look(self) -> None:
         """Follow the graph, send what has waited for its server, tell who waits in vain."""
-        if self._looks % LOOKS_A_GRAPH == 0:
-            self._look_at_graph()
-        self._looks += 1
-        for key in self._pinned:
-            if key not in self._remotes and key[0] in self._seen:
-                self._remote(key)
-        for key, remote in list(self._remotes.items()):
-            self._follow(key, remote)
-
-    def _look_at_graph(self) -> None:
         services = self._node.services()
         if services != self._seen:
             self._seen = services
             self._unusable.clear()
             self._post(self._take_services, services)
+        for key in self._pinned:
+            if key not in self._remotes and key[0] in self._seen:
+                self._remote(key)
+        for key, remote in list(self._remotes.items()):
+            self._follow(key, remote)
 
     def _take_services(self, services: dict[str, list[str]]) -> None:
         self.services = services
@@ -145,7 +136,7 @@ class Requests:
             for request in remote.waiting:
                 self._send(remote, request)
             remote.waiting.clear()
-        elif remote.waiting and key[0] not in self._node.services():
+        elif remote.waiting and key[0] not in self._seen:
             for request in remote.waiting:
                 self._fail(request, *_unavailable(key[0]))
             remote.waiting.clear()
@@ -168,7 +159,7 @@ class Requests:
     def _begin(self, key: Key, request: _Request) -> None:
         if not request.cdr:
             return
-        if key not in self._remotes and key[0] not in self._node.services():
+        if key not in self._remotes and key[0] not in self._seen:
             self._fail(request, *_unavailable(key[0]))
             return
         remote = self._remote(key)
@@ -177,7 +168,7 @@ class Requests:
         elif remote.client.is_ready():
             remote.was_ready = True
             self._send(remote, request)
-        elif key[0] in self._node.services():
+        elif key[0] in self._seen:
             remote.waiting.append(request)  # they have not found each other yet
         else:
             self._fail(request, *_unavailable(key[0]))
