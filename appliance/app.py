@@ -248,6 +248,7 @@ class App:
             wiring.routes(settings),
             loop,
             settings.robot,
+            wiring.call_routes(settings),
         )
         self._stack.push_async_callback(self.bridge.stop)
         self.bridge.start()

@@ -177,4 +177,5 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
         text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
         yield Finding("warning", "bridge", text)
     else:
-        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics)}")
+        called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
+        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics) + called}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import ipaddress
+import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -250,15 +251,65 @@ def _check_ros_type(value: str) -> str:
     raise ValueError(f"must be package/msg/Type, such as geometry_msgs/msg/Twist{hint}")
 
 
-def _check_topic_template(value: str) -> str:
-    plain = value.replace("{robot}", "r").replace("{ros}", "/r")
+def _check_topic_template(value: str, name: str = "{ros}") -> str:
+    plain = value.replace("{robot}", "r").replace(name, "/r")
     if not plain or any(char in plain for char in "+#\0"):
         raise ValueError("must be an MQTT topic without '+' and '#'")
     if "{" in plain or "}" in plain:
-        raise ValueError("knows the placeholders {robot} and {ros} only")
+        raise ValueError(f"knows the placeholders {{robot}} and {name} only")
     if plain.startswith("$"):
         raise ValueError("must not begin with '$': those topics are the broker's own")
     return value
+
+
+def _check_node_topic(value: str) -> str:
+    return _check_topic_template(value, "{node}")
+
+
+def _check_called(value: str) -> str:
+    """A ROS name or a pattern; with `!` before it, what is left out."""
+    return _excluded(value) + _check_ros_pattern(value.removeprefix("!"))
+
+
+def _check_parameters(value: str) -> str:
+    """The full name of a node, `/`, and the name of a parameter; all may be patterns."""
+    node, _, name = value.removeprefix("!").rpartition("/")
+    if not node or not re.fullmatch(r"[\w.*-]+", name):
+        raise ValueError(
+            "must be a node's full name, '/', and a parameter's: /arm/speed, /arm/* for all of "
+            "/arm, /**/* for all of every node"
+        )
+    return f"{_excluded(value)}{_check_ros_pattern(node)}/{name}"
+
+
+def _excluded(value: str) -> str:
+    return "!" if value.startswith("!") else ""
+
+
+def _check_called_type(value: str, kind: str, example: str) -> str:
+    if not re.fullmatch(rf"[A-Za-z*][\w*]*/{kind}/[A-Za-z*][\w*]*", value):
+        raise ValueError(f"must be package/{kind}/Type, such as {example}")
+    return value
+
+
+def _check_service_type(value: str) -> str:
+    return _check_called_type(value, "srv", "std_srvs/srv/Trigger")
+
+
+def _check_action_type(value: str) -> str:
+    return _check_called_type(value, "action", "nav2_msgs/action/NavigateToPose")
+
+
+def _check_response(value: object) -> object:
+    try:
+        json.dumps(value)
+    except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
+        raise ValueError("has a value that JSON does not know; put text in quotes") from None
+    return value
+
+
+def _from_name(value: object) -> object:
+    return {"ros": value} if isinstance(value, str) else value
 
 
 def _check_response_information(value: str) -> str:
@@ -500,6 +551,72 @@ class TopicRoute(RouteDefaults):
         return topic if self.is_pattern else topic.replace("{ros}", self.ros)
 
 
+class _CalledRoute(_Section):
+    """What every route has that is called; `timeout` in seconds.
+
+    `ros` may be a pattern or, with `!` before it, what patterns are not to take.
+    """
+
+    ros: Annotated[str, AfterValidator(_check_called)]
+    mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+    timeout: Annotated[Duration, Field(gt=0)] = 5.0
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the route is for many names."""
+        return "*" in self.ros
+
+    def topic(self, robot: str) -> str:
+        """The MQTT topic on that robot; the ROS name is still to be filled in."""
+        return self.mqtt.replace("{robot}", robot)
+
+
+class ServiceRoute(_CalledRoute):
+    """ROS services that MQTT clients call, or one that they answer (`to: mqtt`)."""
+
+    to: Literal["ros", "mqtt"] = "ros"
+    type: Annotated[str, AfterValidator(_check_service_type)] | None = None
+    encoding: Literal["json", "cdr"] = "json"
+    on_error: Annotated[dict[str, Any], BeforeValidator(_check_response)] | None = None
+
+
+class ActionRoute(_CalledRoute):
+    """ROS actions for MQTT clients; `keep_result` in seconds."""
+
+    type: Annotated[str, AfterValidator(_check_action_type)] | None = None
+    keep_result: Annotated[Duration, Field(ge=0)] = 60.0
+    cancel_on_disconnect: bool = False
+
+
+class ParameterRoute(_CalledRoute):
+    """Parameters of ROS nodes, for MQTT clients to read and set."""
+
+    ros: Annotated[str, AfterValidator(_check_parameters)]
+    mqtt: Annotated[str, AfterValidator(_check_node_topic)] = "{robot}{node}/_param"
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the route is for many nodes."""
+        return "*" in self.node
+
+    @property
+    def node(self) -> str:
+        """The name, or the pattern, of the nodes; with `!` before it when they are left out."""
+        return self.ros.rpartition("/")[0]
+
+    @property
+    def name(self) -> str:
+        """The name, or the pattern, of their parameters."""
+        return self.ros.rpartition("/")[2]
+
+
+class BridgeLimits(_Section):
+    """Calls and goals under way: of one client, and of all together."""
+
+    calls: Count = 500
+    calls_per_client: Count = 20
+
+
 class Bridge(_Section):
     """The way between the robot's bus and the broker."""
 
@@ -509,6 +626,10 @@ class Bridge(_Section):
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
     defaults: RouteDefaults = _section()
     topics: list[TopicRoute] = []
+    services: list[Annotated[ServiceRoute, BeforeValidator(_from_name)]] = []
+    actions: list[Annotated[ActionRoute, BeforeValidator(_from_name)]] = []
+    parameters: list[Annotated[ParameterRoute, BeforeValidator(_from_name)]] = []
+    limits: BridgeLimits = _section()
 
     @field_validator("topics")
     @classmethod
@@ -619,6 +740,38 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
             yield ("bridge", "topics", number, "mqtt"), problem
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
+    yield from _cross_check_called(settings.bridge)
+
+
+def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    sections: dict[str, tuple[str, Sequence[ServiceRoute | ActionRoute | ParameterRoute]]] = {
+        "services": ("{ros}", bridge.services),
+        "actions": ("{ros}", bridge.actions),
+        "parameters": ("{node}", bridge.parameters),
+    }
+    for section, (placeholder, routes) in sections.items():
+        seen: dict[str, int] = {}
+        for number, route in enumerate(routes):
+            path: KeyPath = ("bridge", section, number)
+            first = seen.setdefault(route.ros, number)
+            if first != number:
+                yield (*path, "ros"), f"is the same as bridge.{section}[{first}]"
+            if route.ros.startswith("!"):
+                for key in sorted(route.model_fields_set - {"ros"}):
+                    yield (*path, key), "has no meaning for what is left out"
+            elif route.is_pattern and placeholder not in route.mqtt:
+                problem = f"needs {placeholder} in it, or all of the pattern would be one"
+                yield (*path, "mqtt"), problem
+            kind = None if isinstance(route, ParameterRoute) else route.type
+            if kind is not None and "*" in kind and not route.is_pattern:
+                yield (*path, "type"), "can be a pattern only when ros is one"
+            if isinstance(route, ServiceRoute) and route.to == "mqtt":
+                if route.is_pattern:
+                    yield (*path, "to"), "must be ros when ros is a pattern"
+                elif route.type is None:
+                    yield (*path, "type"), "is needed when to is mqtt"
+            elif isinstance(route, ServiceRoute) and route.on_error is not None:
+                yield (*path, "on_error"), "is for services that MQTT answers: to: mqtt"
 
 
 _PLAIN = {

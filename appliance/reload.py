@@ -137,6 +137,7 @@ class Reload:
         changed += self._take_access(parts.access.adopt(read.rules))
         if parts.bridge is not None:
             parts.bridge.replace(wiring.routes(settings))
+            parts.bridge.calls.replace(wiring.call_routes(settings))
         if before.log != settings.log:
             logs.setup(settings.log.level, settings.log.levels, settings.log.format)
         parts.broker.rules_changed()

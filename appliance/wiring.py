@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from appliance.amqtt_broker import plugin_kinds
@@ -11,6 +12,13 @@ from appliance.certs.settings import listener_name
 from appliance.config import Settings
 from appliance.listeners import Admission, ListenerSettings
 from appliance.ros.bridge import RouteSettings
+from appliance.ros.graph import (
+    ActionSettings,
+    CallLimits,
+    CallRoutes,
+    ParameterSettings,
+    ServiceSettings,
+)
 
 
 def access_files(settings: Settings) -> tuple[Path | None, Path | None]:
@@ -99,3 +107,43 @@ def routes(settings: Settings) -> list[RouteSettings]:
         )
         for route in settings.bridge.topics
     ]
+
+
+def call_routes(settings: Settings) -> CallRoutes:
+    """The services, actions and parameters that are called, and how many at a time."""
+    bridge, robot = settings.bridge, settings.robot
+    return CallRoutes(
+        services=tuple(
+            ServiceSettings(
+                ros=route.ros,
+                mqtt=route.topic(robot),
+                to=route.to,
+                type=route.type,
+                timeout=route.timeout,
+                encoding=route.encoding,
+                on_error=None if route.on_error is None else json.dumps(route.on_error),
+            )
+            for route in bridge.services
+        ),
+        actions=tuple(
+            ActionSettings(
+                ros=route.ros,
+                mqtt=route.topic(robot),
+                type=route.type,
+                timeout=route.timeout,
+                keep_result=route.keep_result,
+                cancel_on_disconnect=route.cancel_on_disconnect,
+            )
+            for route in bridge.actions
+        ),
+        parameters=tuple(
+            ParameterSettings(
+                node=route.node,
+                name=route.name,
+                mqtt=route.topic(robot),
+                timeout=route.timeout,
+            )
+            for route in bridge.parameters
+        ),
+        limits=CallLimits(bridge.limits.calls_per_client, bridge.limits.calls),
+    )

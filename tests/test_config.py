@@ -73,12 +73,27 @@ def test_the_reference_has_every_key_with_its_default() -> None:
 
 
 def test_the_example_routes_of_the_reference_load() -> None:
-    text = re.sub(r"(?m)^  topics: \[\].*", "  topics:", REFERENCE.read_text())
+    text = re.sub(
+        r"(?m)^  (topics|services|actions|parameters): \[\].*", r"  \1:", REFERENCE.read_text()
+    )
     example = re.sub(r"(?m)^  #  ", "    ", text)
-    routes = config.loads(example, HERE).bridge.topics
+    bridge = config.loads(example, HERE).bridge
+    routes = bridge.topics
     assert [(route.ros, route.to) for route in routes] == [("/odom", "mqtt"), ("/cmd_vel", "ros")]
     assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
     assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
+    for called, model in (
+        (bridge.services, config.ServiceRoute),
+        (bridge.actions, config.ActionRoute),
+        (bridge.parameters, config.ParameterRoute),
+    ):
+        # Every key is there, and what is its default is told as that.
+        assert set().union(*(route.model_fields_set for route in called)) == {*model.model_fields}
+        first = called[0]
+        defaults = model(ros=first.ros).model_dump()
+        assert {k: v for k, v in first.model_dump().items() if k != "type"} == {
+            k: v for k, v in defaults.items() if k != "type"
+        }
 
 
 def test_every_problem_is_told_at_once_with_line_and_key() -> None:
@@ -320,3 +335,58 @@ broker:
 def test_tls_that_cannot_be(text: str, problem: str) -> None:
     [found] = problems(f"broker:\n  tls: {text}\n")
     assert found.startswith(f"2: broker.tls.{problem}")
+
+
+def test_what_is_called_can_be_named_or_described() -> None:
+    bridge = loads(
+        "robot: r2\nbridge:\n"
+        "  services: [/reset, {ros: '/arm/**', type: 'std_srvs/srv/*'}, '!/arm/off']\n"
+        "  actions: [{ros: /walk, keep_result: 1 min, cancel_on_disconnect: true}]\n"
+        "  parameters: [/arm/*, '/**/use_*', '!/arm/key']\n"
+        "  limits: {calls: 9, calls_per_client: 3}"
+    ).bridge
+    assert [(r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services] == [
+        ("/reset", False, "r2{ros}"),
+        ("/arm/**", True, "r2{ros}"),
+        ("!/arm/off", False, "r2{ros}"),
+    ]
+    assert bridge.actions[0].keep_result == 60
+    assert [(r.node, r.name, r.is_pattern) for r in bridge.parameters] == [
+        ("/arm", "*", False),
+        ("/**", "use_*", True),
+        ("!/arm", "key", False),
+    ]
+    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3)
+
+
+@pytest.mark.parametrize(
+    ("section", "route", "problem"),
+    [
+        ("services", "reset", "ros: must be a full ROS name that begins with '/'"),
+        ("services", "'!/a/'", "ros: is not a ROS name"),
+        ("services", "{ros: /a, type: std_srvs/Trigger}", "type: must be package/srv/Type"),
+        ("services", "{ros: /a, type: 'a/srv/*'}", "type: can be a pattern only when ros is one"),
+        ("services", "{ros: /a, to: mqtt}", "type: is needed when to is mqtt"),
+        ("services", "{ros: '/a/*', to: mqtt, type: a/srv/B}", "to: must be ros when ros is a"),
+        ("services", "{ros: /a, on_error: {}}", "on_error: is for services that MQTT answers"),
+        ("services", "{ros: '!/a', timeout: 1 s}", "timeout: has no meaning for what is left out"),
+        ("services", "{ros: '/a/*', mqtt: 'x'}", "mqtt: needs {ros} in it"),
+        ("services", "{ros: /a, timeout: 0 s}", "timeout: must be more than 0 ms"),
+        ("services", "{ros: /a, on_error: {a: 2024-01-01}, to: mqtt}", "on_error: has a value"),
+        ("actions", "{ros: /a, type: a/srv/B}", "type: must be package/action/Type"),
+        ("actions", "{ros: /a, keep: 1 s}", "keep: unknown key"),
+        ("parameters", "/a", "ros: must be a node's full name"),
+        ("parameters", "/a/b c", "ros: must be a node's full name"),
+        ("parameters", "{ros: '/*/b', mqtt: 'x'}", "mqtt: needs {node} in it"),
+        ("parameters", "{ros: /a/b, mqtt: 'x{ros}'}", "mqtt: knows the placeholders {robot} and"),
+    ],
+)
+def test_mistakes_in_what_is_called(section: str, route: str, problem: str) -> None:
+    (found,) = problems(f"bridge:\n  {section}:\n  - {route}")
+    assert found.startswith(f"3: bridge.{section}[0].{problem}"), found
+
+
+def test_what_is_called_twice_is_told() -> None:
+    assert problems("bridge: {actions: [/a, {ros: /a, timeout: 1 s}]}") == [
+        "1: bridge.actions[1].ros: is the same as bridge.actions[0]"
+    ]
