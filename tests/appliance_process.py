@@ -152,10 +152,11 @@ class BrokerProcess:
 
 
 class ApplianceProcess(BrokerProcess):
-    """`appliance run` in a directory that `appliance init` has filled, without a ROS bus.
+    """`appliance run` in a directory that `appliance init` has filled.
 
     alice is the user that init makes; `users` are more, by name and password. `acl` takes the
-    place of init's rules, and `broker` goes into appliance.yaml beside the listeners.
+    place of init's rules, and `broker` goes into appliance.yaml beside the listeners. Without
+    `bridge` there is no ROS bus.
     """
 
     name = "appliance"
@@ -167,6 +168,7 @@ class ApplianceProcess(BrokerProcess):
         users: Mapping[str, str] | None = None,
         acl: str | None = None,
         broker: Mapping[str, Any] | None = None,
+        bridge: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(directory)
         self.config = directory / "appliance.yaml"
@@ -183,7 +185,7 @@ class ApplianceProcess(BrokerProcess):
         settings = yaml.safe_load(self.config.read_text())
         listeners = [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
         settings["broker"] = {"listeners": listeners, **(broker or {})}
-        settings["bridge"] = {"bus": "none"}
+        settings["bridge"] = dict(bridge or {"bus": "none"})
         self.config.write_text(yaml.safe_dump(settings))
 
     def start(self) -> None:

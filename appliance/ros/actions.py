@@ -185,7 +185,7 @@ class ActionRoutes:
                 self._actions[name] = Action(name, route, self._counters[route], self)
             fixed = route.type if route.type is not None and "*" not in route.type else None
             self._actions[name].type = fixed or found.get(name) or self._actions[name].type
-            self._actions[name].is_there = name in found
+            self._actions[name].see(name in found)
 
     def keys(self) -> Iterable[Key]:
         """The services that a client should be ready for."""
@@ -284,7 +284,14 @@ class Action:
             self._board.offer(Offer(topic, f"{ros} {verb[1:]}", route.timeout, counters, handle))
         log.info("%s can be called at %s/_goal", ros, self.base)
 
+    def see(self, is_there: bool) -> None:
+        """Whether the action is on the bus now."""
+        if self.is_there and not is_there:
+            self.forget()
+        self.is_there = is_there
+
     def keys(self) -> Iterable[Key]:
+        """The services that it is made of."""
         if self.type is not None:
             yield f"{self.ros}{SEND_GOAL}", f"{self.type}_SendGoal"
             yield f"{self.ros}/_action/get_result", f"{self.type}_GetResult"

@@ -50,7 +50,7 @@ ErrorCode: TypeAlias = Literal[
     "unknown_goal",  # the action's server knows of no such goal, or it has ended
     "unknown_type",  # the type is not installed here
     "ros_error",  # ROS itself refused, or is not there
-    "stopping",  # the appliance stops, or the route was removed
+    "stopping",  # the appliance stops
 ]
 
 JSON = "application/json"
@@ -126,7 +126,6 @@ class Offer:
     timeout: float
     counters: CallCounters
     handle: Handle
-    calls: set[Call] = field(default_factory=set)
 
 
 Receive: TypeAlias = Callable[[Session, Message], None]
@@ -182,7 +181,7 @@ class Switchboard:
         self._receivers: dict[int, Receive] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
-        self._offers: dict[str, Offer] = {}
+        self._offers: set[str] = set()
         self._under_way: Counter[Session] = Counter()
         self._calls: set[Call] = set()
         self._report_at: dict[str, float] = {}
@@ -200,6 +199,8 @@ class Switchboard:
         for topic in list(self._offers):
             self.withdraw(topic)
         tasks = [call.task for call in self._calls if call.task is not None]
+        for task in tasks:
+            task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await asyncio.sleep(0)  # the answers go out
         session, self._session = self._session, None
@@ -233,20 +234,17 @@ class Switchboard:
 
     def offer(self, offer: Offer) -> None:
         """Let `offer.topic`, which may have a `+` in it, be called."""
-        self._offers[offer.topic] = offer
+        self._offers.add(offer.topic)
         self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
         self.listen(
             f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
         )
 
     def withdraw(self, topic: str) -> None:
-        """Offer it no longer; what is under way is answered with `stopping`."""
-        offer = self._offers.pop(topic)
+        """Offer it no longer; calls under way have their answers yet."""
+        self._offers.remove(topic)
         self.ignore(topic)
         self.ignore(f"{topic}/+")
-        for call in offer.calls:
-            if call.task is not None:
-                call.task.cancel()
 
     def receive(self, origin: Session, message: Message, identifier: int) -> None:
         """A message came through the subscription with that identifier."""
@@ -288,7 +286,6 @@ class Switchboard:
         self._under_way[caller] += 1
         offer.counters.under_way += 1
         self._calls.add(call)
-        offer.calls.add(call)
         call.task = self._loop.create_task(self._run(offer, call))
         call.task.add_done_callback(lambda _: self._forget(offer, call))
 
@@ -371,7 +368,6 @@ class Switchboard:
         if call.task is not None and call.task.cancelled():  # before it had begun
             self._fail(offer, call.caller, call.reply, _stopping())
         offer.counters.under_way -= 1
-        offer.calls.discard(call)
         self._calls.discard(call)
         self._under_way[call.caller] -= 1
         if not self._under_way[call.caller]:
@@ -407,4 +403,4 @@ def error_payload(error: CallError) -> bytes:
 
 
 def _stopping() -> CallError:
-    return CallError("stopping", "the appliance stops, or this is not offered any more")
+    return CallError("stopping", "the appliance stops")

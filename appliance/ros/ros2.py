@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -195,7 +195,14 @@ class Ros2Node:
         return dict(self._node.get_topic_names_and_types())
 
     def services(self) -> dict[str, list[str]]:
-        return dict(self._node.get_service_names_and_types())
+        from rclpy.node import NodeNameNonExistentError
+
+        # Asked for all at once, ROS also names the services that there are only clients of.
+        found: dict[str, list[str]] = {}
+        for node in self._node.get_node_names_and_namespaces():
+            with suppress(NodeNameNonExistentError):  # it has gone meanwhile
+                found.update(self._node.get_service_names_and_types_by_node(*node))
+        return found
 
     def count(self, topic: str) -> tuple[int, int]:
         handle = self._node.handle  # the node's own methods would expand and check the name again

@@ -1,0 +1,604 @@
+"""A robot driven end to end: the appliance, the robot and the clients are as in the field."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import uuid
+from pathlib import Path
+
+import pytest
+import yaml
+from appliance_process import ApplianceProcess, eventually
+
+pytest.importorskip("rclpy")
+pytest.importorskip("test_msgs.action")
+import paho.mqtt.client as paho
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from appliance.environment import for_other_programs
+
+DEADLINE = 15.0
+V5, V311 = paho.MQTTv5, paho.MQTTv311
+both = pytest.mark.parametrize("version", [V5, V311], ids=["v5", "v311"])
+
+TURTLE = "r2d2/turtle"
+BRIDGE = {
+    "node": "bridge",
+    "topics": [{"ros": "/cmd_vel", "to": "ros", "type": "geometry_msgs/msg/Twist"}],
+    "services": [
+        "/turtle/*",
+        {"ros": "/turtle/think", "timeout": "300 ms"},
+        "/turtle/absent",
+        {
+            "ros": "/turtle/ask_human",
+            "to": "mqtt",
+            "type": "std_srvs/srv/SetBool",
+            "timeout": "1 s",
+            "on_error": {"success": False, "message": "nobody"},
+        },
+    ],
+    "actions": ["/turtle/walk"],
+    "parameters": ["/turtle/*", "!/turtle/gains", "/visit*/use_*"],
+    "limits": {"calls_per_client": 8},
+}
+ACL = """\
+user alice
+topic readwrite r2d2/#
+topic readwrite answers/#
+
+user mallory
+topic write r2d2/turtle/pen/_call/#
+topic readwrite answers/#
+"""
+
+
+class Robot:
+    """robot.py in a process of its own."""
+
+    def __init__(self):
+        self.told = queue.Queue()
+        self._answers = queue.Queue()
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).parent / "robot.py")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=for_other_programs(),
+        )
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        for line in self._process.stdout:
+            kind, *rest = json.loads(line)
+            (self._answers if kind == "ok" else self.told).put([kind, *rest])
+
+    def wait(self):
+        return self._answers.get(timeout=DEADLINE)[1]
+
+    def hear(self, *expected):
+        """Wait until it has told that by itself."""
+        while self.told.get(timeout=DEADLINE)[: len(expected)] != [*expected]:
+            pass
+
+    def do(self, *command):
+        self._process.stdin.write(json.dumps(command) + "\n")
+        self._process.stdin.flush()
+        return self.wait()
+
+    def stop(self):
+        self._process.stdin.close()
+        try:
+            self._process.wait(DEADLINE)
+        finally:
+            self._process.kill()
+            self._process.wait()
+            self._process.stdout.close()
+
+
+class Client:
+    """An MQTT client that calls as its version of MQTT does."""
+
+    def __init__(self, appliance, version, user="alice", name=None, *, keeps=False):
+        self.version = version
+        self.name = name or f"{user}-{uuid.uuid4().hex[:6]}"
+        self.received = []
+        self._changed = threading.Condition()
+        self._waiting = {}
+        how = {} if version == V5 else {"clean_session": not keeps}
+        self.paho = paho.Client(
+            paho.CallbackAPIVersion.VERSION2, self.name, protocol=version, **how
+        )
+        self.paho.username_pw_set(user, appliance.passwords[user])
+        self.paho.on_message = self._on_message
+        self.paho.on_publish = lambda c, u, mid, code, p: self._put(("published", mid, code))
+        self.paho.on_subscribe = lambda c, u, mid, codes, p: self._put(("subscribed", mid))
+        self.paho.on_connect = lambda c, u, flags, code, p: self._put(("connected", code))
+        properties = None
+        if version == V5 and keeps:
+            properties = Properties(PacketTypes.CONNECT)
+            properties.SessionExpiryInterval = 60
+        more = {"clean_start": not keeps, "properties": properties} if version == V5 else {}
+        self.paho.connect("127.0.0.1", appliance.plain_port, **more)
+        self.paho.loop_start()
+        (code,) = self._take("connected")
+        assert code == 0
+        self._number = 0
+        self.subscribe(f"answers/{self.name}")
+
+    def _put(self, what):
+        with self._changed:
+            self.received.append(what)
+            self._changed.notify_all()
+
+    def _on_message(self, client, userdata, message):
+        payload = json.loads(message.payload) if message.payload else None
+        about = message.properties if self.version == V5 else None
+        self._put(("message", message.topic, payload, message.retain, about))
+
+    def _wait(self, condition, what):
+        with self._changed:
+            if not self._changed.wait_for(condition, DEADLINE):
+                raise AssertionError(f"{self.name}: not within {DEADLINE} s: {what}")
+
+    def _take(self, kind, *beginning):
+        found = []
+
+        def is_there():
+            wanted = (kind, *beginning)
+            found[:] = [one for one in self.received if one[: len(wanted)] == wanted]
+            return found
+
+        self._wait(is_there, (kind, *beginning))
+        with self._changed:
+            self.received.remove(found[0])
+        return found[0][1 + len(beginning) :]
+
+    def subscribe(self, *topics):
+        _, mid = self.paho.subscribe([(topic, 1) for topic in topics])
+        self._take("subscribed", mid)
+
+    def payloads(self, topic):
+        with self._changed:
+            return [one[2] for one in self.received if one[:2] == ("message", topic)]
+
+    def next(self, topic):
+        """The payload of the next message there."""
+        return self._take("message", topic)[0]
+
+    def until(self, topic, payload):
+        """Wait for that payload, with others before it."""
+        self._wait(lambda: payload in self.payloads(topic), f"{topic} {payload}")
+
+    def publish(self, topic, payload=None, **named):
+        """The reason code with which the broker acknowledges."""
+        properties = None
+        if named:
+            properties = Properties(PacketTypes.PUBLISH)
+            for name, value in named.items():
+                setattr(properties, name, value)
+        payload = payload if isinstance(payload, bytes) else json.dumps(payload)
+        info = self.paho.publish(topic, payload, 1, properties=properties)
+        return self._take("published", info.mid)[0]
+
+    def send(self, topic, payload=b""):
+        """Begin a call; returns what its answer is waited for with."""
+        self._number += 1
+        if self.version == V5:
+            number = f"{self._number}".encode()
+            named = {"ResponseTopic": f"answers/{self.name}", "CorrelationData": number}
+            assert self.publish(topic, payload, **named) == 0
+            return number
+        reply = f"{topic.rpartition('/')[0]}/_reply/{self.name}/{self._number}"
+        self.subscribe(reply)
+        self.publish(f"{topic}/{self._number}", payload)
+        return reply
+
+    def answer(self, ticket):
+        if self.version != V5:
+            return self.next(ticket)
+        found = []
+
+        def is_there():
+            found[:] = [
+                one
+                for one in self.received
+                if one[:2] == ("message", f"answers/{self.name}")
+                and one[4].CorrelationData == ticket
+            ]
+            return found
+
+        self._wait(is_there, f"the answer to {ticket!r}")
+        _, _, payload, _, about = found[0]
+        assert about.ContentType == "application/json"
+        status = dict(about.UserProperty)["status"]
+        assert status == ("error" if "error" in payload else "ok")
+        return payload
+
+    def call(self, topic, payload=b""):
+        return self.answer(self.send(topic, payload))
+
+    def error(self, topic, payload=b""):
+        """(code, message)"""
+        error = self.call(topic, payload)["error"]
+        return error["code"], error["message"]
+
+    def drop(self):
+        """The network takes the connection away."""
+        self.paho.loop_stop()
+        self.paho.socket().close()
+
+    def leave(self):
+        self.paho.disconnect()
+        self.paho.loop_stop()
+
+
+@pytest.fixture(scope="module")
+def domain():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield
+
+
+@pytest.fixture(scope="module")
+def robot(domain):
+    robot = Robot()
+    robot.wait()
+    yield robot
+    robot.stop()
+
+
+@pytest.fixture(scope="module")
+def appliance(domain, robot, tmp_path_factory):
+    appliance = ApplianceProcess(
+        tmp_path_factory.mktemp("appliance"),
+        users={"mallory": "mallory's"},
+        acl=ACL,
+        # Of two listeners on one address without a port, a reload could not tell which is which.
+        broker={"listeners": [{"bind": "127.0.0.2:0", "tls": True}, {"bind": "127.0.0.1:0"}]},
+        bridge=BRIDGE,
+    )
+    appliance.start()
+    try:
+        appliance.wait_for_log(r"/turtle/pen can be called")
+        appliance.wait_for_log(r"parameters of /turtle are at")
+        yield appliance
+    finally:
+        print(appliance.log)
+        appliance.stop()
+
+
+@pytest.fixture
+def client_of(appliance):
+    clients = []
+
+    def make(version, *args, **kw):
+        clients.append(Client(appliance, version, *args, **kw))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.leave()
+
+
+# Services
+
+
+@both
+def test_a_service_and_a_command(client_of, version):
+    client = client_of(version)
+    assert client.call(f"{TURTLE}/pen/_call", {"data": True}) == {
+        "success": True,
+        "message": "down",
+    }
+    speed = 0.25 if version == V5 else -1.5
+    client.publish("r2d2/cmd_vel", {"linear": {"x": speed}})
+    eventually(
+        lambda: client.call(f"{TURTLE}/reset/_call")["message"] == f"cmd_vel {speed}",
+        "the robot has its command",
+    )
+
+
+@both
+def test_services_that_are_absent_silent_or_vanish(client_of, robot, version):
+    client = client_of(version)
+    assert client.error(f"{TURTLE}/absent/_call") == (
+        "unavailable",
+        "there is no /turtle/absent on the bus",
+    )
+    assert client.error(f"{TURTLE}/think/_call") == (
+        "timeout",
+        "no answer from /turtle/think within 0.3 s",
+    )
+    code, message = client.error(f"{TURTLE}/pen/_call", {"data": "yes"})
+    assert code == "bad_request" and message.startswith("data: expected true or false")
+
+
+def test_a_service_comes_and_vanishes_with_a_call_under_way(client_of, robot, appliance):
+    client = client_of(V5)
+    assert client.publish(f"{TURTLE}/muse/_call", ResponseTopic=f"answers/{client.name}") == 0x10
+    robot.do("offer", "muse")
+    appliance.wait_for_log("/turtle/muse can be called")
+    ticket = client.send(f"{TURTLE}/muse/_call")
+    robot.hear("asked", "muse")
+    robot.do("vanish", "muse")
+    assert client.answer(ticket)["error"] == {
+        "code": "vanished",
+        "message": "/turtle/muse went away before it answered",
+    }
+
+
+@both
+def test_a_call_without_a_way_back(client_of, robot, version):
+    client = client_of(version)
+    client.subscribe(f"{TURTLE}/pen/_reply/{client.name}")
+    client.publish(f"{TURTLE}/pen/_call", {"data": True})
+    error = client.next(f"{TURTLE}/pen/_reply/{client.name}")["error"]
+    assert error["code"] == "no_response_topic"
+    assert f"{TURTLE}/pen/_call/TOKEN" in error["message"]
+
+
+def test_rights(client_of):
+    alice, mallory = client_of(V5), client_of(V5, "mallory")
+    old = client_of(V311, "mallory")
+    alice.subscribe(f"{TURTLE}/reset/#", f"{TURTLE}/pen/_reply/#", "r2d2/cmd_vel")
+    assert mallory.call(f"{TURTLE}/pen/_call", {"data": True})["message"] == "down"
+    # It may not write to that call topic.
+    here = f"answers/{mallory.name}"
+    assert mallory.publish(f"{TURTLE}/reset/_call", ResponseTopic=here) == 0x87
+    # Nor have an answer published where it may not publish, nor get one that it may not read.
+    mallory.publish(f"{TURTLE}/pen/_call", {"data": True}, ResponseTopic="r2d2/cmd_vel")
+    old.publish(f"{TURTLE}/pen/_call/1", {"data": True})
+    for client in mallory, old:
+        error = alice.next(f"{TURTLE}/pen/_reply/{client.name}")["error"]
+        assert error["code"] == "not_authorized"
+    assert alice.payloads("r2d2/cmd_vel") == []
+    assert alice.payloads(f"{TURTLE}/reset/_call") == []
+
+
+@both
+def test_too_many_calls_of_one_client(client_of, robot, version):
+    client, other = client_of(version), client_of(version)
+    tickets = [client.send(f"{TURTLE}/think/_call") for _ in range(9)]
+    assert other.call(f"{TURTLE}/pen/_call")["success"]
+    codes = [client.answer(ticket)["error"]["code"] for ticket in tickets]
+    assert codes == ["timeout"] * 8 + ["too_many"]
+
+
+@both
+def test_an_mqtt_client_answers_a_ros_client(client_of, robot, version):
+    assert robot.do("ask", True) == [False, "nobody"]
+    client = client_of(version)
+    request = f"{TURTLE}/ask_human/_request/+"
+    client.subscribe(request)
+
+    def on_request(paho_client, userdata, message):
+        token = message.topic.rpartition("/")[2]
+        answer = f"{TURTLE}/ask_human/_response/{token}"
+        if version == V5:
+            assert message.properties.ResponseTopic == answer
+        asked = json.loads(message.payload)["data"]
+        payload = {"success": asked, "message": "human"} if asked else {"success": "no"}
+        paho_client.publish(answer, json.dumps(payload), 1)
+
+    client.paho.message_callback_add(request, on_request)
+    assert robot.do("ask", True) == [True, "human"]
+    assert robot.do("ask", False) == [False, "nobody"]  # what it said was no answer
+
+
+# Actions
+
+
+WALK = f"{TURTLE}/walk"
+
+
+@both
+def test_several_goals_at_once_to_their_ends(client_of, version):
+    client = client_of(version)
+    client.subscribe(f"{WALK}/_feedback/+", f"{WALK}/_result/+", f"{WALK}/_status")
+    tickets = {order: client.send(f"{WALK}/_goal", {"order": order}) for order in (3, 6, 99)}
+    goals = {order: client.answer(ticket)["goal_id"] for order, ticket in tickets.items()}
+    results = {order: client.next(f"{WALK}/_result/{goal}") for order, goal in goals.items()}
+    assert results == {
+        3: {"status": "succeeded", "result": {"sequence": [0, 1, 1, 2, 3]}},
+        6: {"status": "succeeded", "result": {"sequence": [0, 1, 1, 2, 3, 5, 8, 13]}},
+        99: {"status": "aborted", "result": {"sequence": [0, 1, 1, 2]}},
+    }
+    client.until(f"{WALK}/_feedback/{goals[6]}", {"sequence": [5, 8, 13]})
+    feedback = client.payloads(f"{WALK}/_feedback/{goals[6]}")
+    assert feedback[0] == {"sequence": [0, 1, 1]} and 3 <= len(feedback) <= 6
+
+    def ended():
+        return {
+            one["goal_id"]: one["status"]
+            for status in client.payloads(f"{WALK}/_status")[-1:]
+            for one in status
+        }
+
+    eventually(lambda: ended().get(goals[6]) == "succeeded", "the status")
+    assert ended()[goals[99]] == "aborted"
+
+
+@both
+def test_a_goal_cancelled_half_way(client_of, robot, version):
+    client = client_of(version)
+    client.subscribe(f"{WALK}/_feedback/+", f"{WALK}/_result/+")
+    goal = client.call(f"{WALK}/_goal", {"order": 300})["goal_id"]
+    client.next(f"{WALK}/_feedback/{goal}")
+    assert client.call(f"{TURTLE}/reset/_call")["message"] == "it walks"
+    assert client.call(f"{WALK}/_cancel", {"goal_id": goal}) == {"goals_canceling": [goal]}
+    result = client.next(f"{WALK}/_result/{goal}")
+    assert result["status"] == "canceled"
+    assert 2 < len(result["result"]["sequence"]) < 100
+    code, message = client.error(f"{WALK}/_cancel", {"goal_id": goal})
+    assert (code, message) == ("unknown_goal", "the goal has ended already")
+
+
+def test_goals_that_are_refused(client_of):
+    client = client_of(V5)
+    assert client.error(f"{WALK}/_goal", {"order": -1}) == (
+        "rejected",
+        "/turtle/walk does not accept the goal",
+    )
+    code, message = client.error(f"{WALK}/_goal", {"order": 2**31})
+    assert code == "bad_request" and message.startswith("order: ")
+    code, message = client.error(f"{WALK}/_cancel", {"goal_id": "00" * 15 + "01"})
+    assert code == "unknown_goal"
+    assert client.error(f"{WALK}/_cancel", {"goal": 1})[0] == "bad_request"
+    goal = client.call(f"{WALK}/_goal", {"order": 13})["goal_id"]
+    assert client.error(f"{WALK}/_cancel", {"goal_id": goal}) == (
+        "rejected",
+        "the action's server does not cancel it",
+    )
+    goals = [client.call(f"{WALK}/_goal", {"order": 300})["goal_id"] for _ in range(2)]
+    cancelled = client.call(f"{WALK}/_cancel", {"all": True})["goals_canceling"]
+    assert sorted(cancelled) == sorted(goals)
+    client.subscribe(f"{WALK}/_result/{goal}")
+    assert client.next(f"{WALK}/_result/{goal}")["status"] == "succeeded"
+
+
+@both
+def test_a_client_that_comes_back_gets_its_goals_result(client_of, robot, version):
+    name = f"tablet-{uuid.uuid4().hex[:6]}"
+    client = client_of(version, name=name, keeps=True)
+    client.subscribe(f"{WALK}/_result/+")
+    goal = client.call(f"{WALK}/_goal", {"order": 7})["goal_id"]
+    client.drop()
+    robot.hear("walked", 7, 7)
+    back = client_of(version, name=name, keeps=True)
+    assert back.next(f"{WALK}/_result/{goal}")["status"] == "succeeded"
+    # One that had no session finds it retained.
+    late = client_of(version)
+    late.subscribe(f"{WALK}/_result/{goal}")
+    assert len(late.next(f"{WALK}/_result/{goal}")["result"]["sequence"]) == 9
+
+
+def test_the_goals_of_a_client_that_has_gone_are_cancelled_when_the_route_says_so(
+    client_of, robot, appliance
+):
+    client, watcher = client_of(V5), client_of(V311)
+    goal = client.call(f"{WALK}/_goal", {"order": 301})["goal_id"]
+    settings = yaml.safe_load(appliance.config.read_text())
+    settings["bridge"]["actions"] = [
+        {"ros": "/turtle/walk", "cancel_on_disconnect": True, "keep_result": "1 s"}
+    ]
+    appliance.config.write_text(yaml.safe_dump(settings))
+    os.kill(appliance.pid, signal.SIGHUP)
+    appliance.wait_for_log("reloaded: bridge.actions")
+    watcher.subscribe(f"{WALK}/_result/+")
+    # The goal of before goes on; it is known to the route that it was sent through.
+    assert watcher.call(f"{WALK}/_cancel", {"goal_id": goal}) == {"goals_canceling": [goal]}
+    assert watcher.next(f"{WALK}/_result/{goal}")["status"] == "canceled"
+    goal = client.call(f"{WALK}/_goal", {"order": 302})["goal_id"]
+    client.drop()
+    assert watcher.next(f"{WALK}/_result/{goal}")["status"] == "canceled"
+    appliance.wait_for_log(f"goal {goal} of /turtle/walk is cancelled: client .* has gone")
+    # What it kept is gone in its time.
+    late = client_of(V5)
+
+    def is_kept():
+        late.subscribe(f"{WALK}/_result/{goal}")
+        late.call(f"{TURTLE}/pen/_call")
+        found = late.payloads(f"{WALK}/_result/{goal}")
+        late.received.clear()
+        return found
+
+    eventually(lambda: not is_kept(), "the result is kept no longer")
+
+
+# Parameters
+
+
+PARAM = f"{TURTLE}/_param"
+
+
+@both
+def test_parameters_are_shown_and_set(client_of, robot, version):
+    client = client_of(version)
+    client.subscribe(f"{PARAM}/+")
+    assert client.next(f"{PARAM}/serial") == "T-800"
+    assert client.next(f"{PARAM}/mode") == "calm"
+    robot.do("set", "speed", 1.5)
+    client.until(f"{PARAM}/speed", 1.5)
+    ok = {"successful": True, "reason": ""}
+    assert client.call(f"{PARAM}/speed/set", 1) == ok  # a double, as the node has declared it
+    client.until(f"{PARAM}/speed", 1.0)
+    assert client.error(f"{PARAM}/steps/set", 1.0) == (
+        "bad_request",
+        "steps: expected an integer, got 1.0",
+    )
+    code, message = client.error(f"{PARAM}/speed/set", 3)
+    assert code == "rejected" and "out of range" in message and "speed" in message
+    assert client.error(f"{PARAM}/mode/set", "lazy") == (
+        "rejected",
+        "/turtle does not set mode: there is no mode lazy",
+    )
+    assert client.error(f"{PARAM}/serial/set", "X") == ("rejected", "serial is read-only")
+    assert client.error(f"{PARAM}/nothing/set", 1)[0] == "rejected"
+    assert client.error(f"{PARAM}/gains/set", [1]) == (
+        "not_authorized",
+        "/turtle's parameter 'gains' is not among bridge.parameters",
+    )
+    # Several of them: all, or none.
+    code, message = client.error(f"{PARAM}/_set", {"speed": 0.5, "mode": "lazy"})
+    assert code == "rejected" and "there is no mode lazy" in message
+    assert client.call(f"{PARAM}/_set", {"speed": 0.75, "mode": "wild"}) == ok
+    client.until(f"{PARAM}/mode", "wild")
+    client.until(f"{PARAM}/speed", 0.75)
+    assert 0.5 not in client.payloads(f"{PARAM}/speed")[1:]
+    assert client.payloads(f"{PARAM}/gains") == []
+    robot.do("set", "speed", 0.5)
+    robot.do("set", "mode", "calm")
+    client.until(f"{PARAM}/mode", "calm")
+
+
+def test_parameters_come_and_go(client_of, robot):
+    client = client_of(V5)
+    client.subscribe(f"{PARAM}/+")
+    robot.do("declare", "whim", "tea")
+    client.until(f"{PARAM}/whim", "tea")
+    robot.do("set", "whim", 7)
+    client.until(f"{PARAM}/whim", 7)
+    robot.do("set", "whim", None)
+    client.until(f"{PARAM}/whim", None)
+
+
+def test_a_node_comes_and_goes(client_of, appliance):
+    client = client_of(V311)
+    client.subscribe("r2d2/visitor/_param/+")
+    visitor = subprocess.Popen(
+        [sys.executable, str(Path(__file__).parent / "peer.py"), "visitor"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        env=for_other_programs(),
+    )
+    try:
+        client.until("r2d2/visitor/_param/use_sim_time", False)
+        assert client.call("r2d2/visitor/_param/use_sim_time/set", True)["successful"]
+        client.until("r2d2/visitor/_param/use_sim_time", True)
+    finally:
+        visitor.stdin.close()
+        visitor.wait(DEADLINE)
+    client.until("r2d2/visitor/_param/use_sim_time", None)
+
+
+# The end
+
+
+def test_an_action_whose_server_ends(client_of, robot):
+    """The last test: there are no walks after it."""
+    client = client_of(V5)
+    client.subscribe(f"{WALK}/_result/+", f"{WALK}/_status")
+    goal = client.call(f"{WALK}/_goal", {"order": 303})["goal_id"]
+    robot.do("end_walks")
+    result = client.next(f"{WALK}/_result/{goal}")
+    assert (result["status"], result["error"]["code"]) == ("unknown", "vanished")
+    client.until(f"{WALK}/_status", None)
+    assert client.error(f"{WALK}/_goal", {"order": 1})[0] == "unavailable"
