@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -113,7 +114,11 @@ class Client:
         self._waiting = {}
         how = {} if version == V5 else {"clean_session": not keeps}
         self.paho = paho.Client(
-            paho.CallbackAPIVersion.VERSION2, self.name, protocol=version, **how
+            paho.CallbackAPIVersion.VERSION2,
+            self.name,
+            protocol=version,
+            reconnect_on_failure=False,
+            **how,
         )
         self.paho.username_pw_set(user, appliance.passwords[user])
         self.paho.on_message = self._on_message
@@ -231,8 +236,8 @@ class Client:
 
     def drop(self):
         """The network takes the connection away."""
+        self.paho.socket().shutdown(socket.SHUT_RDWR)
         self.paho.loop_stop()
-        self.paho.socket().close()
 
     def leave(self):
         self.paho.disconnect()
