@@ -123,11 +123,17 @@ class Listeners:
         Raises:
             OSError: an address cannot be listened on; nothing has changed then.
         """
-        known = {door.settings.place: door for door in self._doors}
+        known = list(self._doors)
         doors: list[_Door] = []
         try:
             for listener in settings:
-                door = known.pop(listener.place, None) or _Door(self, listener)
+                # The first of several: those whose ports the system chose are told apart by order.
+                same = (door for door in known if door.settings.place == listener.place)
+                door = next(same, None)
+                if door is None:
+                    door = _Door(self, listener)
+                else:
+                    known.remove(door)
                 doors.append(door)
         except BaseException:
             self.drop(doors)
