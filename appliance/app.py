@@ -125,10 +125,6 @@ class App:
         async def listen() -> None:
             wanted = wiring.listener_settings(settings, tls)
             self.addresses = await listeners.start(wanted)
-            for (host, port), listener in zip(self.addresses, wanted, strict=True):
-                kind = " for WebSocket" if listener.protocol == "websocket" else ""
-                where = host if listener.path else f"{host or '*'}:{port}"
-                log.info("listening%s on %s", kind, where)
 
         config = configuration(
             [(str(listener.bind), listener.tls) for listener in broker_settings.listeners],

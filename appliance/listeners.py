@@ -158,9 +158,13 @@ class Listeners:
         for door in before:
             if door not in doors:
                 door.close()
+                log.info("closed the listener on %s", door)
         for door, listener in zip(doors, settings, strict=True):
             door.use(listener)
             door.open()
+            if door not in before:
+                kind = " for WebSocket" if listener.protocol == "websocket" else ""
+                log.info("listening%s on %s", kind, door)
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Listen; returns the addresses, with the port that the system chose where it was 0.
@@ -278,6 +282,10 @@ class _Door:
         else:
             self._socket = listen(settings.host, settings.port)
             self.address = (settings.host, self._socket.getsockname()[1])
+
+    def __str__(self) -> str:
+        host, port = self.address
+        return host if self.settings.path is not None else f"{host or '*'}:{port}"
 
     def use(self, settings: ListenerSettings) -> None:
         """Let these settings hold for those who come from now on."""
