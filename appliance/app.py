@@ -26,7 +26,6 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
-from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -95,7 +94,7 @@ class App:
         if is_open_with_secrets(settings):
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         authenticating, _ = plugin_kinds(broker_settings.plugins)
-        tls = self._load_tls()
+        tls = wiring.tls(settings)
         access = FileAccess(
             *wiring.access_files(settings),
             settings.robot,
@@ -169,14 +168,6 @@ class App:
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
-
-    def _load_tls(self) -> TlsContexts | None:
-        """The TLS of the listeners, by their place in the configuration; None when none has it."""
-        broker = self.settings.broker
-        policies = tls_policies(broker)
-        if not policies:
-            return None
-        return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
 
     def _open_store(self) -> SqliteStore | None:
         wanted = self.settings.broker.store
