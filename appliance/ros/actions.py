@@ -33,7 +33,16 @@ import orjson
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import (
+    JSON,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    ErrorCode,
+    Offer,
+    Switchboard,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.mailbox import Counters, Lane, Mailbox
@@ -52,7 +61,7 @@ STATUS = "action_msgs/msg/GoalStatusArray"
 STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
 #: By the numbers of action_msgs/srv/CancelGoal.
-_NOT_CANCELLED = {
+_NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
     1: ("rejected", "the action's server does not cancel it"),
     2: ("unknown_goal", "the action's server knows of no such goal"),
     3: ("unknown_goal", "the goal has ended already"),
@@ -270,7 +279,8 @@ class Action:
         self._requests = routes._requests
         self._converters = routes._converters
         self._goals: dict[bytes, _Goal] = {}
-        self._kept: deque[str] = deque()
+        #: Topics of results that are retained, and until when; they all have the same time.
+        self._kept: deque[tuple[str, float]] = deque()
         # The ROS thread's.
         self._subscriptions: list[RosSubscription] = []
         self._subscribed: str | None = None
@@ -398,10 +408,13 @@ class Action:
             self._board.now() + keep if keep > 0 else None,
         )
         self._board.publish(message)
-        if keep > 0:
-            self._kept.append(topic)
-            if len(self._kept) > RESULTS:
-                self._board.publish(Message(self._kept.popleft(), b"", 0, True))
+        if message.expires_at is not None:
+            kept = self._kept
+            while kept and kept[0][1] <= self._board.now():
+                kept.popleft()  # the broker has let go of it by itself
+            kept.append((topic, message.expires_at))
+            if len(kept) > RESULTS:
+                self._board.publish(Message(kept.popleft()[0], b"", 0, True))
 
     def server_came(self) -> None:
         """Another server has come: it may have taken the place of one that was ended."""
@@ -440,7 +453,7 @@ class Action:
         canceling = [_id(info["goal_id"]).hex() for info in said["goals_canceling"]]
         if said["return_code"] in _NOT_CANCELLED:
             code, text = _NOT_CANCELLED[said["return_code"]]
-            raise CallError(code, text)  # type: ignore[arg-type]
+            raise CallError(code, text)
         if not canceling and any(id_):
             # rclpy's server says nothing worse of a goal that it refuses to cancel.
             raise CallError("rejected", "the action's server does not cancel it")
