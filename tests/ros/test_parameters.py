@@ -1,0 +1,186 @@
+"""Parameters on a FakeNode: what is hard to bring about with a real one."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+pytest.importorskip("rcl_interfaces.srv")
+from call_house import AllTypes, House, call_routes, parameters, until
+
+from appliance.ros import parameters as module
+from appliance.ros.calls import CallError
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import load_description
+from appliance.ros.node import FakeNode
+from appliance.ros.parameters import EVENT, EVENTS, to_value
+
+CONVERTERS = Converters(load_description)
+
+
+class Declaring:
+    """A node with parameters, all integers; it gives none of them when one is `unset`."""
+
+    def __init__(self, house, name="/arm", **values):
+        self.name = name
+        self.values = values
+        self.unset = set()
+        self.asked = []
+        self.holds = []
+        self.is_held = False
+        for verb, kind, answer in (
+            ("list_parameters", "ListParameters", self.on_list),
+            ("get_parameters", "GetParameters", self.on_get),
+        ):
+            type_name = f"rcl_interfaces/srv/{kind}"
+            house.node.add_service(f"{name}/{verb}", type_name, self._handler(type_name, answer))
+        self.events = house.node.add_publisher(EVENTS, EVENT)
+
+    def _handler(self, type_name, answer):
+        def handle(cdr, respond):
+            request = CONVERTERS.get(f"{type_name}_Request").to_dict(cdr)
+            response = CONVERTERS.get(f"{type_name}_Response").from_dict(answer(request))
+            if self.is_held:
+                self.holds.append(lambda: respond(response))
+            else:
+                respond(response)
+
+        return handle
+
+    def on_list(self, request):
+        self.asked.append("list")
+        return {"result": {"names": [*self.values, *self.unset]}}
+
+    def on_get(self, request):
+        names = request["names"]
+        if self.unset & set(names):
+            return {"values": []}
+        return {"values": [{"type": 2, "integer_value": self.values[name]} for name in names]}
+
+    def change(self, name, value):
+        self.values[name] = value
+        one = {"name": name, "value": {"type": 2, "integer_value": value}}
+        event = {"node": self.name, "changed_parameters": [one]}
+        self.events.publish(CONVERTERS.get(EVENT).from_dict(event))
+
+    def release(self):
+        self.is_held = False
+        while self.holds:
+            self.holds.pop(0)()
+
+
+@pytest.fixture
+async def house():
+    house = House(FakeNode(types=AllTypes()))
+    yield house
+    await house.stop()
+    watcher = house.client("watcher", "r2d2/+/_param/#")
+    assert watcher.received == []  # what was retained has gone with the appliance
+
+
+async def shown(house, name, value):
+    await until(lambda: house.retained(f"r2d2/arm/_param/{name}") == value, f"{name} {value}")
+
+
+async def test_a_change_while_the_values_are_read_is_not_lost(house):
+    house.start(parameters("/arm"))
+    arm = Declaring(house, speed=1)
+    arm.is_held = True
+    house.node.spin()
+    await until(lambda: arm.holds, "the values are asked for")
+    arm.change("speed", 2)
+    await asyncio.sleep(0)
+    arm.values["speed"] = 1  # what it had read before, and tells late
+    arm.release()
+    arm.values["speed"] = 2
+    await shown(house, "speed", 2)
+
+
+async def test_a_flood_of_changes_has_the_node_read_anew(house, monkeypatch):
+    monkeypatch.setattr(module, "WAITING_EVENTS", 20)
+    house.start(parameters("/arm"))
+    arm = Declaring(house, speed=1, other=1)
+    house.node.spin()
+    await shown(house, "speed", 1)
+    for number in range(50):  # the loop has no turn meanwhile
+        arm.change("speed", number)
+    arm.change("other", 7)
+    await shown(house, "speed", 49)
+    await shown(house, "other", 7)
+    assert arm.asked == ["list"] * 2
+
+
+async def test_one_parameter_that_cannot_be_given_hides_no_others(house):
+    house.start(parameters("/arm"))
+    arm = Declaring(house, speed=1, steps=2)
+    arm.unset.add("void")
+    house.node.spin()
+    await shown(house, "steps", 2)
+    await shown(house, "speed", 1)
+    assert house.retained("r2d2/arm/_param/void") is None
+
+
+async def test_routes_that_change_while_they_run(house):
+    house.start(parameters("/arm", "sp*"))
+    Declaring(house, speed=1, spin=3, steps=2)
+    house.node.spin()
+    await shown(house, "speed", 1)
+    assert house.retained("r2d2/arm/_param/steps") is None
+    routes = (parameters("/arm", "st*"), parameters("!/arm", "spin"))
+    house.bridge.calls.replace(call_routes(*routes))
+    await shown(house, "steps", 2)
+    assert house.retained("r2d2/arm/_param/speed") is None
+    assert house.retained("r2d2/arm/_param/spin") is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [
+        (1, True, {"bool_value": True}),
+        (2, -5, {"integer_value": -5}),
+        (3, 1, {"double_value": 1.0}),
+        (4, "a", {"string_value": "a"}),
+        (5, "AQI=", {"byte_array_value": b"\1\2"}),
+        (5, [1, 2], {"byte_array_value": b"\1\2"}),
+        (6, [True], {"bool_array_value": [True]}),
+        (7, [], {"integer_array_value": []}),
+        (8, [1, 2.5], {"double_array_value": [1.0, 2.5]}),
+        (9, ["a"], {"string_array_value": ["a"]}),
+    ],
+)
+def test_values_take_the_declared_type(kind, value, expected):
+    assert to_value("x", value, {"type": kind}) == {"type": kind, **expected}
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (1, 1),
+        (2, True),
+        (2, 1.5),
+        (2, 2**63),
+        (3, "1"),
+        (4, 1),
+        (5, "%"),
+        (5, [256]),
+        (6, [1]),
+        (7, 1),
+        (7, [1.5]),
+        (8, ["1"]),
+        (9, [None]),
+        (0, {}),
+        (0, []),
+        (0, None),
+    ],
+)
+def test_values_of_another_type_are_refused(kind, value):
+    with pytest.raises(CallError, match=r"^x: ") as raised:
+        to_value("x", value, {"type": kind})
+    assert raised.value.code == "bad_request"
+
+
+def test_what_may_have_any_type_takes_it_from_the_value():
+    free = {"type": 2, "dynamic_typing": True}
+    assert to_value("x", 1.5, free) == {"type": 3, "double_value": 1.5}
+    assert to_value("x", ["a"], {}) == {"type": 9, "string_array_value": ["a"]}
