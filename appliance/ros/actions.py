@@ -150,6 +150,7 @@ class ActionRoutes:
         self._post = post
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
+        self._excluded = Names(())
         self._actions: dict[str, Action] = {}
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.

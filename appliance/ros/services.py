@@ -116,6 +116,7 @@ class ServiceRoutes:
         self._loop = loop
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
+        self._excluded = Names(())
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
         self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
         self._provided: dict[ServiceSettings, Provided] = {}

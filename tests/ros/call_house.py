@@ -79,8 +79,8 @@ class Client:
 
     def publish(self, message, qos, packet_id, dup, retain, subscription_ids):
         self.received.append(message)
-        if qos:
-            self.session.puback(packet_id)
+        if qos:  # in a turn of its own, as it would come through a network
+            asyncio.get_running_loop().call_soon(self.session.puback, packet_id)
 
     def mirror(self, packet, version, payload_size):
         return False

@@ -88,13 +88,14 @@ async def test_a_change_while_the_values_are_read_is_not_lost(house):
     arm = Declaring(house, speed=1)
     arm.is_held = True
     house.node.spin()
+    await until(lambda: arm.holds, "the names are asked for")
+    arm.holds.pop(0)()
     await until(lambda: arm.holds, "the values are asked for")
     arm.change("speed", 2)
-    await asyncio.sleep(0)
-    arm.values["speed"] = 1  # what it had read before, and tells late
-    arm.release()
-    arm.values["speed"] = 2
+    arm.release()  # the value of before comes after the change
     await shown(house, "speed", 2)
+    await asyncio.sleep(0.01)
+    assert house.retained("r2d2/arm/_param/speed") == 2
 
 
 async def test_a_flood_of_changes_has_the_node_read_anew(house, monkeypatch):

@@ -1,0 +1,155 @@
+"""Actions on a FakeNode: what is hard to bring about with a real robot."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+pytest.importorskip("test_msgs.action")
+from call_house import AllTypes, House, action, until
+
+from appliance.ros import actions as module
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import load_description
+from appliance.ros.node import FakeNode
+
+FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
+CONVERTERS = Converters(load_description)
+GOAL, STOP = "r2d2/walk/_goal", "r2d2/walk/_cancel"
+
+
+class Walks:
+    """An action's server, which answers when it is told to."""
+
+    def __init__(self, house):
+        self.house = house
+        self.accepting = True
+        self.late = []
+        self.cancelled = []
+        self.results = {}
+        self.services = [
+            self._serve("send_goal", f"{FIBONACCI}_SendGoal", self.on_goal),
+            self._serve("get_result", f"{FIBONACCI}_GetResult", self.on_result),
+            self._serve("cancel_goal", CANCEL, self.on_cancel),
+        ]
+        self.status = house.node.add_publisher("/walk/_action/status", module.STATUS)
+
+    def _serve(self, name, type_name, handle):
+        def on_request(cdr, respond):
+            request = CONVERTERS.get(f"{type_name}_Request").to_dict(cdr)
+
+            def answer(response):
+                respond(CONVERTERS.get(f"{type_name}_Response").from_dict(response))
+
+            handle(request, answer)
+
+        return self.house.node.add_service(f"/walk/_action/{name}", type_name, on_request)
+
+    def on_goal(self, request, answer):
+        if self.accepting:
+            answer({"accepted": True})
+        else:
+            self.late.append(answer)
+
+    def on_result(self, request, answer):
+        self.results[request["goal_id"]["uuid"]] = answer
+
+    def on_cancel(self, request, answer):
+        self.cancelled.append(request["goal_info"]["goal_id"]["uuid"])
+        answer({"goals_canceling": [request["goal_info"]]})
+
+    def finish(self, status=4):
+        for answer in self.results.values():
+            answer({"status": status, "result": {"sequence": [1]}})
+        self.results.clear()
+
+    def vanish(self):
+        for one in (*self.services, self.status):
+            one.remove()
+
+
+@pytest.fixture
+async def house():
+    house = House(FakeNode(types=AllTypes()))
+    yield house
+    await house.stop()
+    assert house.node.clients == [] and house.node.subscriptions == []
+
+
+async def begin(house, **route):
+    house.start(action("/walk", **route))
+    walks = Walks(house)
+    await asyncio.sleep(0)
+    house.node.spin()
+    client = house.client("alice", "r2d2/walk/_result/+")
+    return walks, client
+
+
+def results(client):
+    return [m for m in client.received if m.topic.startswith("r2d2/walk/_result/")]
+
+
+async def test_a_goal_that_is_accepted_too_late_is_cancelled(house):
+    walks, client = await begin(house, timeout=0.05)
+    walks.accepting = False
+    assert (await client.error(GOAL, {"order": 3}))[0] == "timeout"
+    await until(lambda: walks.cancelled, "the goal is cancelled")
+    walks.late.pop()({"accepted": True})
+    await asyncio.sleep(0.01)
+    assert walks.results == {}
+    assert house.counters().under_way == 0
+
+
+async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
+    walks, client = await begin(house)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: walks.results, "the result is asked for")
+    walks.results.clear()
+    # Another takes its place at once: its services were never seen to be away.
+    house.node.add_publisher("/walk/_action/status", module.STATUS)
+    await until(lambda: walks.results, "the other is asked")
+    walks.finish(status=0)
+    await until(lambda: results(client), "the result")
+    (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
+    assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
+
+
+async def test_ros_ends_while_goals_are_under_way(house):
+    _, client = await begin(house)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    house.node.fail("the node ended")
+    await until(lambda: results(client), "the result")
+    (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
+    assert (answer["status"], answer["error"]["code"]) == ("unknown", "ros_error")
+
+
+async def test_goals_are_bounded_and_so_are_kept_results(house, monkeypatch):
+    monkeypatch.setattr(module, "RESULTS", 3)
+    walks, client = await begin(house)
+    for _ in range(20):
+        assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
+    assert (await client.error(GOAL, {"order": 3}))[0] == "too_many"
+    await until(lambda: len(walks.results) == 20, "the results are asked for")
+    walks.finish()
+    await until(lambda: len(results(client)) >= 20, "the results")
+    await asyncio.sleep(0.01)
+    late = house.client("late", "r2d2/walk/_result/+")
+    assert len(late.received) == 3
+    assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
+
+
+async def test_results_that_are_not_kept(house):
+    walks, client = await begin(house, keep_result=0)
+    await client.call(GOAL, {"order": 3})
+    await until(lambda: walks.results, "the result is asked for")
+    walks.finish()
+    await until(lambda: results(client), "the result")
+    assert house.client("late", "r2d2/walk/_result/+").received == []
+
+
+async def test_the_appliance_stops_with_goals_under_way(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await house.bridge.stop()
+    assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
