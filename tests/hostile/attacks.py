@@ -641,7 +641,7 @@ async def topic_aliases(fight: Fight) -> None:
 # --- retained messages
 
 
-@attack(r"no room to retain")
+@attack(r"no room to retain", said_after=3.0)
 async def retained_flood(fight: Fight) -> None:
     """Retained messages, small ones to ever new topics and large ones, beyond the limit."""
 
