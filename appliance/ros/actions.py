@@ -156,6 +156,11 @@ class ActionRoutes:
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
 
+    def start(self) -> None:
+        """Nothing is known of the bus yet."""
+        for route in self._counters:
+            self._board.clear(route.mqtt, "{ros}", "_status")
+
     def replace(self, routes: Sequence[ActionSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
         self._counters = {

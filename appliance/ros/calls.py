@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -259,6 +260,19 @@ class Switchboard:
         code = self._broker.publish(message, self._session)
         self._broker.flush()
         return code
+
+    def clear(self, base: str, name: str, below: str) -> None:
+        """Take back what was left retained by a run that was killed.
+
+        That is what is below `base`, where `name` stands for any ROS name, and there matches the
+        regular expression `below`.
+        """
+        start, _, end = base.partition(name)
+        names = r"(/\w+)+" if name in base else ""
+        left = re.compile(f"{re.escape(start)}{names}{re.escape(end)}/{below}")
+        for topic, _ in list(self._broker.retained.find(f"{start}/#")):
+            if left.fullmatch(topic):
+                self.publish(Message(topic, b"", 0, True))
 
     def now(self) -> float:
         """Seconds of the broker's clock."""

@@ -101,6 +101,8 @@ class Calls:
     def start(self) -> None:
         """Let calls come in."""
         self.board.start()
+        self._actions.start()
+        self._parameters.start()
         self._broker.departures.append(self._actions.departed)
 
     async def leave(self) -> None:

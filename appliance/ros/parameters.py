@@ -120,6 +120,11 @@ class ParameterRoutes:
         self._subscription: RosSubscription | None = None
         self._is_refused = False
 
+    def start(self) -> None:
+        """Nothing is known of the bus yet."""
+        for route in self._counters:
+            self._board.clear(route.mqtt, "{node}", ".+")
+
     def replace(self, routes: Sequence[ParameterSettings]) -> None:
         """Have these routes from now on."""
         if list(routes) == list(self._routes):

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 pytest.importorskip("rcl_interfaces.srv")
-from call_house import AllTypes, House, call_routes, parameters, until
+from call_house import AllTypes, House, action, call_routes, parameters, until
 
 from appliance.ros import parameters as module
 from appliance.ros.calls import CallError
@@ -133,6 +133,17 @@ async def test_routes_that_change_while_they_run(house):
     await shown(house, "steps", 2)
     assert house.retained("r2d2/arm/_param/speed") is None
     assert house.retained("r2d2/arm/_param/spin") is None
+
+
+async def test_what_a_run_that_was_killed_has_left_is_taken_back(house):
+    before = house.client("before")
+    left = ["r2d2/arm/_param/speed", "r2d2/arm/left/_param/a/b", "r2d2/walk/_status"]
+    others = ["r2d2/arm/speed", "r2d2/_param/x", "r2d2/walk/_result/1", "r2d2/run/_status"]
+    for topic in (*left, *others):
+        before.send(topic, 1, retain=True)
+    house.start(parameters("/**"), action("/walk", mqtt="r2d2/walk"))
+    assert [topic for topic in left if house.retained(topic) is not None] == []
+    assert [topic for topic in others if house.retained(topic) is None] == []
 
 
 @pytest.mark.parametrize(
