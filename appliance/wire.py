@@ -601,6 +601,10 @@ class ClientProtocol:
         """Begin an enhanced authentication; None when the method is not offered."""
         return self._network.exchange(method)
 
+    def now(self) -> float:
+        """Seconds of the event loop's clock."""
+        return self._loop.time()
+
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""
         self._timeout.cancel()
@@ -688,6 +692,10 @@ class _Gone:
     def exchange(self, method: str) -> Exchange | None:
         """There is none to be had."""
         return None
+
+    def now(self) -> float:
+        """No time passes."""
+        return 0.0
 
     def accepted(self) -> None:
         """Nobody waits for it."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
-from appliance.broker.message import Message
+from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
     Access,
     Action,
@@ -60,6 +60,9 @@ CACHED_TOPIC = 512
 #: Entries and targets in the caches of all sessions together, some 80 bytes each.
 CACHED_IN_ALL = 500_000
 
+#: Seconds that a QoS 2 exchange may take before its message counts as late.
+LATE = 0.1
+
 #: The effort to find a route, see `Counters.effort`; each match comes on top.
 ROUTE_EFFORT = 20
 
@@ -70,6 +73,9 @@ EXPIRED_A_TURN = 1024
 ENDINGS_A_TURN = 128
 
 _ALLOWED = Decision(True, "the appliance itself")
+
+#: Who may publish to a topic, beside the access rules.
+Guard: TypeAlias = Callable[[Session], Decision]
 
 
 class Ticking(Protocol):
@@ -131,6 +137,11 @@ class Broker:
         self.retained: TopicTree[Message] = TopicTree()
         self.retained_bytes = 0
         self.observer: Observer | None = None
+        #: By topic, what parts of the appliance have to say about who publishes to it. What they
+        #: say holds until `guards_changed`.
+        self.guards: dict[str, list[Guard]] = {}
+        #: Called with each session whose connection has ended, before its will is published.
+        self.departures: list[Callable[[Session], None]] = []
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
         #: Network clients with bytes to write.
@@ -234,18 +245,26 @@ class Broker:
         session.unchecked = True
         session.resend()
 
-    def attach(self, client_id: str, link: Link) -> Session:
-        """A session inside the appliance, with all rights and kept until `detach`."""
+    def attach(
+        self, client_id: str, link: Link, link_for: Callable[[Session], Link] | None = None
+    ) -> Session:
+        """A session inside the appliance, with all rights and kept until `detach`.
+
+        `link_for` gives the link for what a session publishes; retained messages of a new
+        subscription go to `link`.
+        """
         if client_id in self.sessions:
             raise ValueError(f"there is a session '{client_id}' already")
         session = Session(client_id, None, self.ledger)
         session.link = link
+        session.link_for = link_for
         self.sessions[client_id] = session
         return session
 
     def detach(self, session: Session) -> None:
         """End a session made by `attach`."""
         session.link = None
+        self._tell_departure(session)
         self._end(session)
 
     def disconnect(
@@ -261,6 +280,7 @@ class Broker:
             self._set_expiry(session, min(expiry, self.limits.session_expiry))
         if self.observer is not None:
             self.observer.disconnected(session)
+        self._tell_departure(session)
         if not publish_will:
             session.set_will(None)
         will = session.will
@@ -275,6 +295,10 @@ class Broker:
                 self._schedule(session.will_at, session)
             else:
                 self._publish_will(session)
+
+    def _tell_departure(self, session: Session) -> None:
+        for told in tuple(self.departures):
+            told(session)
 
     def _end(self, session: Session) -> None:
         """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
@@ -380,6 +404,9 @@ class Broker:
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision = self._may_publish(session, topic)
+        if decision and topic in self.guards:
+            verdicts = [guard(session) for guard in self.guards[topic]]
+            decision = next((verdict for verdict in verdicts if not verdict), decision)
         matches = self._subscriptions.match(topic) if decision else []
         self.counters.effort += ROUTE_EFFORT + len(matches)
         targets, shares = self._targets(session, topic, matches)
@@ -422,11 +449,12 @@ class Broker:
             session, subscription = match
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
                 continue
-            _, qos, as_published, ids = merged.get(session.client_id, (session, 0, False, None))
+            known = merged.get(session.client_id)
+            receiver, qos, as_published, ids = known or (session.hearing(origin), 0, False, None)
             if subscription.identifier:  # [MQTT-3.3.4-4]
                 ids = [*(ids or []), subscription.identifier]
             merged[session.client_id] = (
-                session,
+                receiver,
                 max(qos, subscription.qos),
                 as_published or subscription.retain_as_published,
                 ids,
@@ -544,13 +572,17 @@ class Broker:
                     full.add(share)
         return frozenset(full), bool(receivers) and len(full) == receivers
 
-    def release(self, held: Held, origin: Session) -> None:
+    def release(self, held: Held, origin: Session, age: float) -> None:
         """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
+
+        `age` is in seconds from its coming.
 
         Raises:
             ProtocolError: the topic is not valid.
         """
-        message, full = held
+        message, full, _ = held
+        if age > LATE:
+            message = Late(message, age)
         if self.ledger.has_expired(message):
             return
         route = self.route(origin, message.topic_wire)
@@ -759,6 +791,10 @@ class Broker:
         self.features = features
         self.ledger.use(limits)
         self.epoch += 1  # topics that were too long may not be so any more
+
+    def guards_changed(self) -> None:
+        """Guards were set, or would decide otherwise now."""
+        self.epoch += 1
 
     def rules_changed(self) -> None:
         """The access rules changed: nothing cached holds, and what waits is checked again."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -122,6 +123,8 @@ class Held(NamedTuple):
 
     message: Message
     full: frozenset[Session | Share]
+    #: When it came, in seconds of `Wire.now`; not known when it was sent on another connection.
+    since: float = -math.inf
 
 
 class PendingWill(NamedTuple):
@@ -155,6 +158,7 @@ class Session:
         "latest",
         "ledger",
         "link",
+        "link_for",
         "queue",
         "readable",
         "readable_epoch",
@@ -175,6 +179,8 @@ class Session:
         self.identity = identity
         self.ledger = ledger
         self.link: Link | None = None
+        #: For a session inside the appliance that wants to know who published what it receives.
+        self.link_for: Callable[[Session], Link] | None = None
         self.expiry = 0
         self.ends_at: float | None = None
         self.will: PendingWill | None = None
@@ -216,6 +222,14 @@ class Session:
         return self.expiry > 0
 
     # --- towards the client -------------------------------------------------------------------
+
+    def hearing(self, origin: Session) -> Session:
+        """Itself, as it receives what `origin` publishes."""
+        if self.link_for is None:
+            return self
+        session = Session(self.client_id, None, self.ledger)
+        session.link = self.link_for(origin)
+        return session
 
     @property
     def ready(self) -> bool:
@@ -555,6 +569,11 @@ class Session:
         self.received[packet_id] = held
         self._count(held.message)
         return True
+
+    def reconnected(self) -> None:
+        """What is held was sent on another connection, whose time means nothing any more."""
+        for packet_id, held in self.received.items():
+            self.received[packet_id] = held._replace(since=-math.inf)
 
     def unhold(self, packet_id: int) -> Held | None:
         """The message that PUBREL releases, once."""
