@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import functools
 import gc
+import json
 import logging
 import os
 import signal
@@ -27,6 +28,7 @@ from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
+from appliance.ros.rules import CommandRules, OnSilence
 from appliance.store import MemoryStore
 
 log = logging.getLogger(__name__)
@@ -307,6 +309,22 @@ def _route_settings(route: TopicRoute, robot: str) -> RouteSettings:
         qos=route.qos,
         retain=route.retain,
         keep=route.keep,
+        rules=_command_rules(route) if route.command_keys else None,
+    )
+
+
+def _command_rules(route: TopicRoute) -> CommandRules:
+    silence = route.on_silence
+    return CommandRules(
+        expire=route.expire,
+        take_retained=route.take_retained,
+        exclusive=route.exclusive,
+        lease=route.lease,
+        on_silence=OnSilence(silence.after, json.dumps(silence.publish), silence.disconnect)
+        if silence
+        else None,
+        clamp=tuple((path, low, high) for path, (low, high) in route.clamp.items()),
+        allow=tuple((path, tuple(values)) for path, values in route.allow.items()),
     )
 
 

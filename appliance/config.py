@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import difflib
 import ipaddress
+import json
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,6 +48,17 @@ _QUANTITY = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]+)")
 _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
 _URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
 MASK = "********"
+
+COMMAND_KEYS = (
+    "expire",
+    "take_retained",
+    "exclusive",
+    "lease",
+    "on_silence",
+    "clamp",
+    "allow",
+)
+"""The keys of a route that say when a command may reach ROS, and with what in it."""
 
 
 # Errors
@@ -258,6 +271,41 @@ def _check_response_information(value: str) -> str:
     return value
 
 
+def _check_field(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*", value, re.ASCII):
+        raise ValueError(f"{value!r} is not the path of a field, such as linear.x")
+    return value
+
+
+def _check_clamp(value: object) -> object:
+    for path, bounds in value.items() if isinstance(value, dict) else ():
+        is_pair = isinstance(bounds, (list, tuple)) and len(bounds) == 2
+        if not is_pair or any(
+            isinstance(x, bool) or not isinstance(x, (int, float)) for x in bounds
+        ):
+            raise ValueError(f"{path} must have its least and its most, such as [-0.5, 0.5]")
+        if not -math.inf < bounds[0] <= bounds[1] < math.inf:
+            raise ValueError(f"{path} must have its least before its most")
+    return value
+
+
+def _check_allow(value: object) -> object:
+    for path, values in value.items() if isinstance(value, dict) else ():
+        if not isinstance(values, list) or not values:
+            raise ValueError(f"{path} must have a list of the values that are allowed")
+        if not all(isinstance(x, (bool, int, float, str)) for x in values):
+            raise ValueError(f"{path} can have only text, numbers, true and false")
+    return value
+
+
+def _check_message(value: object) -> object:
+    try:
+        json.dumps(value)
+    except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
+        raise ValueError("has a value that JSON does not know; put text in quotes") from None
+    return value
+
+
 def _check_plugins(value: object) -> object:
     if not isinstance(value, dict):
         return value
@@ -298,6 +346,7 @@ Retain = Annotated[
 ]
 Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
 Count = Annotated[int, Field(ge=1)]
+FieldPath = Annotated[str, AfterValidator(_check_field)]
 Encoding = Literal["json", "text", "cdr"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
@@ -407,13 +456,39 @@ class RouteDefaults(_Section):
     keep: Keep = "latest"
 
 
+class OnSilence(_Section):
+    """The stop message of a route to ROS, and when it is published; `after` in seconds."""
+
+    after: Annotated[Duration, Field(gt=0)]
+    publish: Annotated[dict[str, Any], BeforeValidator(_check_message)] = {}
+    disconnect: bool = True
+
+
 class TopicRoute(RouteDefaults):
-    """One ROS topic that is carried to MQTT, from MQTT, or both ways."""
+    """One ROS topic that is carried to MQTT, from MQTT, or both ways.
+
+    What is under COMMAND_KEYS holds for what goes to ROS; times in seconds.
+    """
 
     ros: Annotated[str, AfterValidator(_check_ros_pattern)]
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+    expire: Annotated[Duration, Field(gt=0)] | None = None
+    take_retained: bool = False
+    exclusive: bool = False
+    lease: Annotated[Duration, Field(gt=0)] = 2.0
+    on_silence: OnSilence | None = None
+    clamp: Annotated[dict[FieldPath, list[float]], BeforeValidator(_check_clamp)] = {}
+    allow: Annotated[
+        dict[FieldPath, list[bool | int | float | str]], BeforeValidator(_check_allow)
+    ] = {}
+
+    @property
+    def command_keys(self) -> list[str]:
+        """Those of COMMAND_KEYS that say something else than their default."""
+        fields = TopicRoute.model_fields
+        return [key for key in COMMAND_KEYS if getattr(self, key) != fields[key].default]
 
     @property
     def is_pattern(self) -> bool:
@@ -534,6 +609,11 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if route.is_pattern and "{ros}" not in route.mqtt:
             problem = "needs {ros} in it, or all topics of the pattern would be one"
             yield ("bridge", "topics", number, "mqtt"), problem
+        if route.to == "mqtt":
+            for key in route.command_keys:
+                yield ("bridge", "topics", number, key), "is for routes to ROS only"
+        elif "lease" in route.command_keys and not route.exclusive:
+            yield ("bridge", "topics", number, "lease"), "needs exclusive: true beside it"
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
 

@@ -101,7 +101,11 @@ bridge:
   topics:
     - {ros: odom, to: mqt}
     - {to: mqtt, type: std_msgs/String, mqtt: "{foo}/x"}
-    - {ros: /a, to: both, expire: 500 ms}
+    - {ros: /a, to: both, expires: 500 ms}
+    - ros: /b
+      to: ros
+      clamp: {linear.x: [1, 0]}
+      on_silence: {after: 500}
 log: {level: warn}
 """
     found = problems(text)
@@ -122,8 +126,10 @@ log: {level: warn}
         "18: bridge.topics[1].ros: is needed",
         "18: bridge.topics[1].type: must be package/msg/Type",
         "18: bridge.topics[1].mqtt: knows the placeholders",
-        "19: bridge.topics[2].expire: unknown key",
-        "20: log.level: must be debug, info, warning or error; did you mean 'warning'?",
+        "19: bridge.topics[2].expires: unknown key; did you mean 'expire'?",
+        "22: bridge.topics[3].clamp: linear.x must have its least before its most",
+        "23: bridge.topics[3].on_silence.after: must be a duration such as",
+        "24: log.level: must be debug, info, warning or error; did you mean 'warning'?",
     ]
     assert len(found) == len(expected)
     for problem, start in zip(found, expected, strict=True):
@@ -145,6 +151,49 @@ log: {level: warn}
 )
 def test_what_is_not_a_configuration_at_all(text: str, place: str) -> None:
     assert place in problems(text)[0]
+
+
+def test_rules_of_commands() -> None:
+    text = """\
+bridge:
+  topics:
+    - ros: /cmd_vel
+      to: ros
+      type: geometry_msgs/msg/Twist
+      expire: 500 ms
+      exclusive: true
+      lease: 1 s
+      on_silence: {after: 250 ms, publish: {linear: {x: 0}}}
+      clamp: {linear.x: [-0.5, 1]}
+      allow: {linear.z: [0, 1.5], linear.y: [a, true]}
+"""
+    (route,) = loads(text).bridge.topics
+    assert (route.expire, route.exclusive, route.lease) == (0.5, True, 1.0)
+    assert route.on_silence == config.OnSilence(after=0.25, publish={"linear": {"x": 0}})
+    assert route.clamp == {"linear.x": [-0.5, 1.0]}
+    assert route.allow == {"linear.z": [0, 1.5], "linear.y": ["a", True]}
+    again = config.loads(yaml.safe_dump(config.describe(loads(text))), HERE)
+    assert again.bridge.topics == [route]
+
+
+@pytest.mark.parametrize(
+    ("route", "problem"),
+    [
+        ("to: mqtt, expire: 1 s", ".expire: is for routes to ROS only"),
+        ("to: ros, lease: 1 s", ".lease: needs exclusive: true"),
+        ("to: ros, clamp: {x: 3}", ".clamp: x must have its least and its most"),
+        ("to: ros, clamp: {x: [.nan, 1]}", ".clamp: x must have its least before its most"),
+        ("to: ros, clamp: {x: [true, 1]}", ".clamp: x must have its least and its most"),
+        ("to: ros, clamp: {a..b: [0, 1]}", "'a..b' is not the path of a field"),
+        ("to: ros, allow: {x: []}", ".allow: x must have a list"),
+        ("to: ros, allow: {x: [{}]}", ".allow: x can have only text"),
+        ("to: ros, on_silence: {publish: {}}", ".on_silence.after: is needed"),
+        ("to: ros, on_silence: {after: 1 s, publish: {x: 2024-01-01}}", "JSON does not know"),
+    ],
+)
+def test_rules_of_commands_that_cannot_be(route: str, problem: str) -> None:
+    (found,) = problems(f"bridge: {{topics: [{{ros: /a, {route}}}]}}")
+    assert problem in found
 
 
 def test_routes_take_what_they_do_not_say_from_the_defaults() -> None:

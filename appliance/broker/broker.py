@@ -21,6 +21,7 @@ from appliance.broker.ports import (
     Action,
     Decision,
     Features,
+    Guard,
     Identity,
     Limits,
     Link,
@@ -73,9 +74,6 @@ EXPIRED_A_TURN = 1024
 ENDINGS_A_TURN = 128
 
 _ALLOWED = Decision(True, "the appliance itself")
-
-#: Who may publish to a topic, beside the access rules.
-Guard: TypeAlias = Callable[[Session], Decision]
 
 
 class Ticking(Protocol):
@@ -405,7 +403,7 @@ class Broker:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision = self._may_publish(session, topic)
         if decision and topic in self.guards:
-            verdicts = [guard(session) for guard in self.guards[topic]]
+            verdicts = [guard.decide(session) for guard in self.guards[topic]]
             decision = next((verdict for verdict in verdicts if not verdict), decision)
         matches = self._subscriptions.match(topic) if decision else []
         self.counters.effort += ROUTE_EFFORT + len(matches)
@@ -608,6 +606,8 @@ class Broker:
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
+        for guard in self.guards.get(route.topic, ()):
+            guard.refused(session)
         if self.observer is not None:
             self.observer.refused(session, message)
         self.complain(session, "may not publish to %s: %s", quote(route.topic), route.reason)

@@ -154,6 +154,16 @@ class Store(Protocol):
         """A message that was owed is acknowledged, expired or dropped."""
 
 
+class Guard(Protocol):
+    """A part of the appliance that has a say in who publishes to its topic."""
+
+    def decide(self, session: Session) -> Decision:
+        """Whether the session may; it holds until `Broker.guards_changed`."""
+
+    def refused(self, session: Session) -> None:
+        """A message of the session was refused, by this guard, another or the access rules."""
+
+
 class Observer(Protocol):
     """Told of what happens in the broker: amqtt's plugins listen here."""
 

@@ -23,6 +23,7 @@ from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import describe
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, RouteSettings, ToMqtt, ToRos
@@ -48,7 +49,7 @@ class RouteStatus:
     """What a route carries in one direction, and what it has counted since the start.
 
     `bytes` are payload on MQTT; `dropped` did not fit into the mailbox, `throttled` were above the
-    rate, `errors` could not be converted or published.
+    rate, `errors` could not be converted or published. For commands see `Counters`.
     """
 
     settings: RouteSettings
@@ -60,6 +61,10 @@ class RouteStatus:
     throttled: int
     errors: int
     last_error: str | None
+    expired: int
+    refused: int
+    clamped: int
+    stops: int
 
 
 @dataclass(eq=False, slots=True)
@@ -141,34 +146,49 @@ class Bridge:
     def _receive_for(self, routes: Sequence[_Route]) -> None:
         flows: dict[tuple[str, str], ToRos] = {}
         for route in routes:
-            settings = route.settings
-            flow = ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
+            flow = self._new_to_ros(route)
             key = flow.ros, flow.mqtt
-            before = self._to_ros.get(key)
+            known = self._to_ros.get(key)
             if key in flows:
                 log.warning("%s has a route already; the later one is left out", flow)
-            elif before is not None and before.counters is route.counters:
-                flows[key] = before
+            elif known is not None and known.counters is route.counters:
+                flows[key] = known
             else:
                 flows[key] = flow
-        self._leaving.extend(flow for key, flow in self._to_ros.items() if flows.get(key) != flow)
-        self._to_ros = flows
+        before, self._to_ros = self._to_ros, flows
+        for key, flow in before.items():
+            if flows.get(key) is not flow:
+                flow.leave()
+                self._leaving.append(flow)
+        for key, flow in flows.items():
+            if before.get(key) is not flow:
+                flow.enter()
         receivers: dict[str, list[ToRos]] = {}
         for flow in flows.values():
             receivers.setdefault(flow.mqtt, []).append(flow)
         before_topics, self._receivers = self._receivers.keys(), receivers
         self._subscribe(receivers.keys() - before_topics, before_topics - receivers.keys())
 
+    def _new_to_ros(self, route: _Route) -> ToRos:
+        settings = route.settings
+        if settings.rules is None:
+            return ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
+        around = Surroundings(self._loop, self._post, self._broker)
+        return Commands(
+            settings, settings.ros, route.counters, self._converters, self._tell, around
+        )
+
     def _subscribe(self, topics: Iterable[str], no_longer: Iterable[str] = ()) -> None:
         if self._session is None:
             return
         for topic in topics:
             # No Local stops the echo on a topic that is bridged both ways. A retained message may
-            # be an old command: it does not reach ROS. QoS 0 loses nothing here, as the link takes
-            # each message at once.
-            self._broker.subscribe(
-                self._session, Subscription(topic, 0, no_local=True, retain_handling=2)
-            )
+            # be an old command: it does not reach ROS, unless a route asks for it. QoS 0 loses
+            # nothing here, as the link takes each message at once.
+            asks = any(flow.takes_retained for flow in self._receivers[topic])
+            subscription = Subscription(topic, 0, no_local=True, retain_handling=0 if asks else 2)
+            self._broker.subscribe(self._session, subscription)
+            self._broker.send_retained(self._session, subscription, True)
         for topic in no_longer:
             self._broker.unsubscribe(self._session, topic)
 
@@ -194,13 +214,19 @@ class Bridge:
 
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
-        self._session = self._broker.attach(CLIENT_ID, _Link(self._receive))
+        self._session = self._broker.attach(
+            CLIENT_ID,
+            _Link(self._receive, None),
+            lambda origin: _Link(self._receive, origin),
+        )
         self._subscribe(self._receivers)
         self._announce(())
         self._node.start(self._look, self._failed)
 
     async def stop(self) -> None:
         """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        for command in self._to_ros.values():
+            command.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session
         if session is None:
@@ -231,15 +257,17 @@ class Bridge:
                 route.counters.throttled,
                 route.counters.errors,
                 route.counters.last_error,
+                route.counters.expired,
+                route.counters.refused,
+                route.counters.clamped,
+                route.counters.stops,
             )
             for route in self._routes
         ]
 
-    def _receive(self, message: Message, retain: bool) -> None:
-        if retain:
-            return
+    def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         for receiver in self._receivers.get(message.topic, ()):
-            receiver.on_message(message.payload)
+            receiver.receive(message, retain, origin)
 
     def _drain(self) -> None:
         if self._deliver():
@@ -357,12 +385,15 @@ class Bridge:
 
 
 class _Link:
-    """The bridge as the link of its session: it takes everything at once."""
+    """The bridge as the link of its session: it takes everything at once, of one publisher."""
 
     writable = True
 
-    def __init__(self, receive: Callable[[Message, bool], None]) -> None:
+    def __init__(
+        self, receive: Callable[[Message, bool, Session | None], None], origin: Session | None
+    ) -> None:
         self._receive = receive
+        self._origin = origin
 
     def publish(
         self,
@@ -374,7 +405,7 @@ class _Link:
         subscription_ids: list[int] | None,
     ) -> None:
         """A message for ROS."""
-        self._receive(message, retain)
+        self._receive(message, retain, self._origin)
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         """It takes messages, not packets."""

@@ -17,6 +17,7 @@ from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message
+from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, encode_string
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
@@ -30,6 +31,7 @@ from appliance.ros.node import (
     RosSubscription,
 )
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
+from appliance.ros.rules import CommandRules
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 Encoding: TypeAlias = Literal["json", "text", "cdr"]
@@ -63,6 +65,8 @@ class RouteSettings:
     qos: int | None = None
     retain: bool | None = None
     keep: int | Literal["latest"] = "latest"
+    #: What holds for what goes to ROS; None for no rules but the types.
+    rules: CommandRules | None = None
 
     @property
     def samples(self) -> int:
@@ -371,7 +375,7 @@ class ToMqtt(Flow):
 
 
 class ToRos(Flow):
-    """From MQTT to ROS: a publisher. `on_message` and `fail` are for the loop's thread."""
+    """From MQTT to ROS: a publisher. `receive` and `fail` are for the loop's thread."""
 
     direction = "to_ros"
 
@@ -428,13 +432,31 @@ class ToRos(Flow):
         super().lost()
         self._out = None
 
-    def on_message(self, payload: bytes) -> None:
-        """A message from MQTT."""
+    @property
+    def takes_retained(self) -> bool:
+        """Whether retained messages from before the route are wanted."""
+        rules = self.settings.rules
+        return rules is not None and rules.take_retained
+
+    def enter(self) -> None:
+        """Messages are going to be received from now on."""
+
+    def leave(self) -> None:
+        """None will be received any more."""
+
+    def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+        """A message from MQTT, of that session; `retain` when it is from before the route.
+
+        It may then be an old command, and does not reach ROS.
+        """
+        if retain:
+            return
         out = self._out
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
             return
         convert, publisher = out
+        payload = message.payload
         try:
             cdr = convert(payload)
             if self.echo is not None:

@@ -16,13 +16,21 @@ MAX_BYTES = 64 * 1024 * 1024
 
 @dataclass(eq=False, slots=True)
 class Counters:
-    """What a route counts in one direction, all from its start; `bytes` are payload on MQTT."""
+    """What a route counts in one direction, all from its start; `bytes` are payload on MQTT.
+
+    Of commands, `expired` came too late, `refused` were against the rules, `clamped` went on with
+    other numbers; `stops` are stop messages that the route published by itself.
+    """
 
     messages: int = 0
     bytes: int = 0
     dropped: int = 0
     throttled: int = 0
     errors: int = 0
+    expired: int = 0
+    refused: int = 0
+    clamped: int = 0
+    stops: int = 0
     last_error: str | None = None
 
 

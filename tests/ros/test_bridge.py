@@ -419,7 +419,7 @@ async def test_retained_commands_do_not_reach_ros(house):
     house.start(to_ros("/say"))
     await house.settle()
     assert listener.received == []
-    house.bridge._receive(Message("r2d2/say", b'{"data":"old"}'), True)
+    house.bridge._receive(Message("r2d2/say", b'{"data":"old"}'), True, None)
     assert listener.received == []
 
 
