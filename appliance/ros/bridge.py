@@ -115,6 +115,7 @@ class Bridge:
         self._leaving: deque[ToRos] = deque()
         #: Those to ROS by MQTT topic.
         self._receivers: dict[str, list[ToRos]] = {}
+        self._subscribed: dict[str, Subscription] = {}
         self._looks = 0
         self.replace(routes)
 
@@ -166,8 +167,8 @@ class Bridge:
         receivers: dict[str, list[ToRos]] = {}
         for flow in flows.values():
             receivers.setdefault(flow.mqtt, []).append(flow)
-        before_topics, self._receivers = self._receivers.keys(), receivers
-        self._subscribe(receivers.keys() - before_topics, before_topics - receivers.keys())
+        self._receivers = receivers
+        self._subscribe()
 
     def _new_to_ros(self, route: _Route) -> ToRos:
         settings = route.settings
@@ -178,19 +179,25 @@ class Bridge:
             settings, settings.ros, route.counters, self._converters, self._tell, around
         )
 
-    def _subscribe(self, topics: Iterable[str], no_longer: Iterable[str] = ()) -> None:
-        if self._session is None:
+    def _subscribe(self) -> None:
+        """Subscribe to what the flows to ROS receive, and to nothing else."""
+        session = self._session
+        if session is None:
             return
-        for topic in topics:
+        wanted: dict[str, Subscription] = {}
+        for topic, flows in self._receivers.items():
             # No Local stops the echo on a topic that is bridged both ways. A retained message may
             # be an old command: it does not reach ROS, unless a route asks for it. QoS 0 loses
             # nothing here, as the link takes each message at once.
-            asks = any(flow.takes_retained for flow in self._receivers[topic])
-            subscription = Subscription(topic, 0, no_local=True, retain_handling=0 if asks else 2)
-            self._broker.subscribe(self._session, subscription)
-            self._broker.send_retained(self._session, subscription, True)
-        for topic in no_longer:
-            self._broker.unsubscribe(self._session, topic)
+            asks = any(flow.takes_retained for flow in flows)
+            wanted[topic] = Subscription(topic, 0, no_local=True, retain_handling=0 if asks else 2)
+        before, self._subscribed = self._subscribed, wanted
+        for topic, subscription in wanted.items():
+            if before.get(topic) != subscription:
+                self._broker.subscribe(session, subscription)
+                self._broker.send_retained(session, subscription, True)
+        for topic in before.keys() - wanted.keys():
+            self._broker.unsubscribe(session, topic)
 
     def _add_to_mqtt(self, route: _Route, ros: str) -> None:
         flow = ToMqtt(
@@ -219,7 +226,7 @@ class Bridge:
             _Link(self._receive, None),
             lambda origin: _Link(self._receive, origin),
         )
-        self._subscribe(self._receivers)
+        self._subscribe()
         self._announce(())
         self._node.start(self._look, self._failed)
 

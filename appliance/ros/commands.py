@@ -93,6 +93,8 @@ class Commands(ToRos):
         self._is_driven = False
         self._last = b""
         self._has_stopped = False
+        #: Who has sent old commands, and until when its others are taken for such.
+        self._behind: tuple[Session | None, float] | None = None
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
         #: A retained message from before there was anybody on ROS to have it.
@@ -189,6 +191,15 @@ class Commands(ToRos):
         # handed over when its client connected.
         is_will = origin is not None and origin.link is None
         is_old = message.age > rules.oldest or (rules.oldest < math.inf and is_will)
+        if is_old and not is_will:
+            # What its client queued while it had no connection comes behind what it sends again,
+            # and looks like new.
+            self._behind = origin, self._around.loop.time() + rules.oldest
+        elif self._behind is not None:
+            late, until = self._behind
+            if self._around.loop.time() >= until:
+                self._behind = None
+            is_old |= origin is late and self._behind is not None
         if is_old or (retain and rules.expire is not None and expires_at is None):
             return self._count_expired("it was sent some time before", origin)
         return True
