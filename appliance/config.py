@@ -244,6 +244,36 @@ def _check_ros_pattern(value: str) -> str:
     return value
 
 
+def _parse_ros_names(value: object) -> str | tuple[str, ...]:
+    """A name or pattern, or a list of them in which `!` leaves some out."""
+    if isinstance(value, str) and not value.startswith("!"):
+        return _check_ros_pattern(value)
+    if isinstance(value, str) or (
+        isinstance(value, (list, tuple))
+        and value
+        and all(isinstance(name, str) and name.startswith("!") for name in value)
+    ):
+        raise ValueError("only leaves topics out: put before it, in a list, those that are wanted")
+    if not isinstance(value, (list, tuple)) or not value:
+        raise ValueError("must be a ROS name, a pattern, or a list of them")
+    for name in value:
+        if not isinstance(name, str):
+            raise ValueError(f"{name!r} must be a ROS name or a pattern")
+        try:
+            _check_ros_pattern(name.removeprefix("!"))
+        except ValueError as error:
+            raise ValueError(f"{name!r} {error}") from None
+    return str(value[0]) if len(value) == 1 else tuple(value)
+
+
+def _check_ros_arguments(value: list[str]) -> list[str]:
+    if value[:1] == ["--ros-args"]:
+        value = value[1:]
+    if "--" in value:
+        raise ValueError("must have ROS arguments only, without --")
+    return value
+
+
 def _check_node(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
         raise ValueError("must be a letter or '_', then letters, digits or '_'")
@@ -255,7 +285,8 @@ def _check_namespace(value: str) -> str:
 
 
 def _check_ros_type(value: str) -> str:
-    if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", value):
+    """The name of a message type, or a pattern of such: sensor_msgs/msg/*."""
+    if re.fullmatch(r"[A-Za-z*][\w*]*/msg/[A-Za-z*][\w*]*", value) and "**" not in value:
         return value
     short = re.fullmatch(r"([A-Za-z]\w*)/([A-Za-z]\w*)", value)
     hint = f"; did you mean '{short[1]}/msg/{short[2]}'?" if short else ""
@@ -367,6 +398,11 @@ ClientCertificates = Annotated[
 ]
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
+RosNames = Annotated[
+    str | tuple[str, ...],
+    PlainValidator(_parse_ros_names),
+    PlainSerializer(lambda names: names if isinstance(names, str) else list(names)),
+]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
 Encoding = Literal["json", "text", "cdr"]
 Direction = Literal["mqtt", "ros", "both"]
@@ -543,7 +579,7 @@ class TopicRoute(RouteDefaults):
     What is under COMMAND_KEYS holds for what goes to ROS; times in seconds.
     """
 
-    ros: Annotated[str, AfterValidator(_check_ros_pattern)]
+    ros: RosNames
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
@@ -566,21 +602,28 @@ class TopicRoute(RouteDefaults):
     @property
     def is_pattern(self) -> bool:
         """Whether `ros` names many topics."""
-        return "*" in self.ros
+        return not isinstance(self.ros, str) or "*" in self.ros
 
     def topic(self, robot: str) -> str:
         """The MQTT topic of this route on that robot; a pattern keeps `{ros}` in it."""
         topic = self.mqtt.replace("{robot}", robot)
-        return topic if self.is_pattern else topic.replace("{ros}", self.ros)
+        return (
+            topic.replace("{ros}", self.ros)
+            if isinstance(self.ros, str) and not self.is_pattern
+            else topic
+        )
 
 
 class Bridge(_Section):
-    """The way between the robot's bus and the broker."""
+    """The way between the robot's bus and the broker; `diagnostics` in seconds, 0 for none."""
 
     bus: Annotated[Literal["ros2", "none"], BeforeValidator(_check_bus)] = "ros2"
     node: Annotated[str, AfterValidator(_check_node)] = "appliance"
     namespace: Annotated[str, AfterValidator(_check_namespace)] = "/"
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    ros_arguments: Annotated[list[str], AfterValidator(_check_ros_arguments)] = []
+    use_sim_time: bool = False
+    diagnostics: Annotated[Duration, Field(ge=0)] = 1.0
     defaults: RouteDefaults = _section()
     topics: list[TopicRoute] = []
 
@@ -669,6 +712,11 @@ def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -
     return settings
 
 
+def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | None, str]:
+    """What two routes must not have in common; patterns may differ in the type alone."""
+    return route.ros, route.type if route.is_pattern else None, route.topic(robot)
+
+
 def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     seen: dict[Bind, int] = {}
     for number, listener in enumerate(settings.broker.listeners):
@@ -683,11 +731,9 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     ):
         problem = "needs a listener with tls: true that asks for client certificates"
         yield ("broker", "tls", "username_from"), problem
-    routes: dict[tuple[str, str], int] = {}
+    routes: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
-        first = routes.setdefault((route.ros, route.topic(settings.robot)), number)
-        if route.is_pattern and route.to != "mqtt":
-            yield ("bridge", "topics", number, "to"), "must be mqtt when ros is a pattern"
+        first = routes.setdefault(_way(route, settings.robot), number)
         if route.is_pattern and "{ros}" not in route.mqtt:
             problem = "needs {ros} in it, or all topics of the pattern would be one"
             yield ("bridge", "topics", number, "mqtt"), problem

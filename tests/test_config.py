@@ -76,7 +76,12 @@ def test_the_example_routes_of_the_reference_load() -> None:
     text = re.sub(r"(?m)^  topics: \[\].*", "  topics:", REFERENCE.read_text())
     example = re.sub(r"(?m)^  #  ", "    ", text)
     routes = config.loads(example, HERE).bridge.topics
-    assert [(route.ros, route.to) for route in routes] == [("/odom", "mqtt"), ("/cmd_vel", "ros")]
+    assert [(route.ros, route.to) for route in routes] == [
+        ("/odom", "mqtt"),
+        ("/cmd_vel", "ros"),
+        (("/camera/**", "!/camera/*/raw"), "mqtt"),
+        ("/**", "mqtt"),
+    ]
     assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
     assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
 
@@ -315,16 +320,12 @@ def test_the_file_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         config.load()
 
 
-def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
+def test_a_pattern_names_many_topics() -> None:
     settings = loads("robot: r2\nbridge: {topics: [{ros: '/camera/**', to: mqtt}]}")
     route = settings.bridge.topics[0]
     assert route.is_pattern
     assert route.topic("r2") == "r2{ros}"
 
-    assert any(
-        "must be mqtt when ros is a pattern" in problem
-        for problem in problems("bridge: {topics: [{ros: '/camera/*', to: both}]}")
-    )
     assert any(
         "needs {ros} in it" in problem
         for problem in problems("bridge: {topics: [{ros: '/a/*', to: mqtt, mqtt: '{robot}/a'}]}")
@@ -332,6 +333,38 @@ def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
     assert any(
         "***" in problem for problem in problems("bridge: {topics: [{ros: /a/***, to: mqtt}]}")
     )
+
+
+def test_lists_of_names_and_patterns() -> None:
+    def route(ros: str, more: str = "") -> config.TopicRoute:
+        return loads(f"bridge: {{topics: [{{ros: {ros}, to: both{more}}}]}}").bridge.topics[0]
+
+    some = route("['/camera/**', '!/camera/raw']")
+    assert some.ros == ("/camera/**", "!/camera/raw")
+    assert some.is_pattern
+    assert some.topic("r2") == "r2{ros}"
+    assert route("[/odom]").ros == "/odom"
+    assert route("'/**'", ", type: sensor_msgs/msg/*Image").type == "sensor_msgs/msg/*Image"
+    twice = "bridge: {topics: [{ros: '/**', to: mqtt, type: a/msg/*}, "
+    loads(twice + "{ros: '/**', to: mqtt, type: b/msg/*}]}")
+    assert any("same way" in p for p in problems(twice + "{ros: '/**', to: mqtt, type: a/msg/*}]}"))
+    for wrong, what in {
+        "'!/a'": "only leaves topics out",
+        "['!/a', '!/b']": "only leaves topics out",
+        "[]": "must be a ROS name",
+        "[/a, 7]": "7 must be a ROS name",
+        "[/a, camera]": "'camera' must be a full ROS name",
+        "['/a', '!/b c']": "'!/b c' is not a ROS name",
+    }.items():
+        assert any(what in p for p in problems(f"bridge: {{topics: [{{ros: {wrong}, to: mqtt}}]}}"))
+    text = config.describe(loads("bridge: {topics: [{ros: ['/a/*', '!/a/b'], to: mqtt}]}"))
+    assert config.loads(yaml.safe_dump(text), HERE).bridge.topics[0].ros == ("/a/*", "!/a/b")
+
+
+def test_ros_arguments() -> None:
+    text = 'bridge: {ros_arguments: [--ros-args, -r, "/a:=/b"]}'
+    assert loads(text).bridge.ros_arguments == ["-r", "/a:=/b"]
+    assert any("without --" in p for p in problems("bridge: {ros_arguments: [-r, 'a:=b', --]}"))
 
 
 # TLS

@@ -20,8 +20,7 @@ from appliance.broker.ports import Decision
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.convert import ConversionError, Converter, Converters
-from appliance.ros.flows import REPORT_INTERVAL, RouteSettings, Tell, ToRos
-from appliance.ros.mailbox import Counters
+from appliance.ros.flows import REPORT_INTERVAL, Route, Tell, ToRos
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.rules import CommandRules, FieldLimits
 
@@ -68,16 +67,15 @@ class Commands(ToRos):
 
     def __init__(
         self,
-        settings: RouteSettings,
+        route: Route,
         ros: str,
-        counters: Counters,
         converters: Converters,
         tell: Tell,
         around: Surroundings,
     ) -> None:
-        super().__init__(settings, ros, counters, converters, tell)
-        assert settings.rules is not None
-        self.rules: CommandRules = settings.rules
+        super().__init__(route, ros, converters, tell)
+        assert route.settings.rules is not None
+        self.rules: CommandRules = route.settings.rules
         self._around = around
         #: Both replaced as one by the ROS thread.
         self._limits: FieldLimits | None = None
@@ -239,6 +237,11 @@ class Commands(ToRos):
             self._arm()
 
     # Leases
+
+    @property
+    def commanding(self) -> str | None:
+        holder = self._holder
+        return None if holder is None else holder.client_id
 
     def decide(self, session: Session) -> Decision:
         """Whether the session may publish a command now: a Guard of the broker's."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -103,6 +104,10 @@ class RosNode(Protocol):
     def stop(self) -> None:
         """Leave the bus and wait until the ROS thread has ended; may be called twice."""
 
+    def now(self) -> int:
+        """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
+        the node is told so, and the computer's before there is any."""
+
     def topics(self) -> dict[str, list[str]]:
         """The types of each topic that has an endpoint, this node's own included."""
 
@@ -119,9 +124,11 @@ class RosNode(Protocol):
         """The message class of `std_msgs/msg/String`. Raises UnknownTypeError."""
 
     def subscribe_raw(
-        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[..., None]
     ) -> RosSubscription:
-        """Call `callback` with each message, as CDR. Raises BusError, UnknownTypeError."""
+        """Call `callback` with each message, as CDR, and with a few also with the time at which
+        they were published, in nanoseconds since the epoch. Raises BusError, UnknownTypeError.
+        """
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
@@ -161,7 +168,7 @@ class FakeSubscription:
     bus: FakeNode
     topic: str
     endpoint: Endpoint
-    callback: Callable[[bytes], None]
+    callback: Callable[..., None]
 
     def destroy(self) -> None:
         self.bus.subscriptions.remove(self)
@@ -274,6 +281,9 @@ class FakeNode:
         for publisher in list(self.own_publishers):
             publisher.destroy()
 
+    def now(self) -> int:
+        return time.time_ns()
+
     def topics(self) -> dict[str, list[str]]:
         found: dict[str, set[str]] = {}
         for topic, endpoint in (*self._all_publishers(), *self._all_subscribers()):
@@ -311,7 +321,7 @@ class FakeNode:
         return self.types[type_name]
 
     def subscribe_raw(
-        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[..., None]
     ) -> FakeSubscription:
         self.load(type_name)
         own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback)
