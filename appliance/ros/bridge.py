@@ -40,9 +40,9 @@ CLIENT_ID = "_bridge"
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
 
-#: Every so many looks at the graph (some 2 s) the number of endpoints is not trusted: one may have
-#: been replaced by another.
-THOROUGH_LOOK = 13
+#: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
+#: one may have been replaced by another. At each look it is the turn of some topics.
+THOROUGH_LOOK = 6
 
 #: Seconds between two looks at the counters, for the rates; and how many of these it takes until
 #: what is bridged is told again for the figures in it.
@@ -339,12 +339,11 @@ class Bridge:
         """Follow what has come and gone on the graph."""
         if self._looks == 0:
             self._tell(logging.INFO, "on ROS as %s", self._node.name)
-        is_thorough = self._looks % THOROUGH_LOOK == 0
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
-        for flow in self._flows():
-            has_changed |= flow.look(self._node, is_thorough)
+        for turn, flow in enumerate(self._flows(), self._looks):
+            has_changed |= flow.look(self._node, turn % THOROUGH_LOOK == 0)
         ready = [flow for flow in self._found.values() if flow.bridged is not None]
         if ready != self._ready:
             self._ready = ready

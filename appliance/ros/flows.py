@@ -187,6 +187,8 @@ class Flow(ABC):
         self._wanted: tuple[str, QosProfile, str | None] | None = None
         #: Why the last set-up failed.
         self._problem: str | None = None
+        #: Whether the next look must set up what this one could not.
+        self._is_due = False
         self._foreign: set[str] = set()
         self._report_at = 0.0
 
@@ -196,8 +198,9 @@ class Flow(ABC):
         The endpoints are asked for only when their number has changed, or the look is thorough.
         """
         count = node.count(self.ros)
-        if count == self._count and not thorough:
+        if count == self._count and not thorough and not self._is_due:
             return False
+        self._is_due = False
         self._count = count
         endpoints = self._find(node)
         found = {endpoint.type for endpoint in endpoints}
@@ -222,11 +225,16 @@ class Flow(ABC):
             return False  # they have left; all stays as it is for their return
         hashes = [endpoint.type_hash for endpoint in endpoints if endpoint.type_hash]
         wanted = (type_name, self._choose_qos(endpoints), min(hashes, default=None))
-        if wanted == self._wanted:
+        before = self.bridged
+        if wanted == self._wanted and (before is not None or self._problem is None):
             return False
         self._wanted = wanted
-        before = self.bridged
-        self._set_up(node, *wanted)
+        if before is not None and before.type != type_name:
+            # The middleware knows one type a topic, until the executor has let go of the last end.
+            self.close()
+            self._wanted, self._is_due = None, True
+        else:
+            self._set_up(node, *wanted)
         return self.bridged != before
 
     def _set_up(
@@ -237,6 +245,7 @@ class Flow(ABC):
             detail = self._open(node, type_name, qos, type_hash)
         except (BusError, UnknownTypeError, ConversionError) as error:
             self.close()
+            self._is_due = isinstance(error, BusError)
             problem = self.counters.last_error = str(error)
             if problem != self._problem:
                 self._problem = problem

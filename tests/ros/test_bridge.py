@@ -230,7 +230,9 @@ async def test_type_changes_with_the_publishers(house):
     await house.settle()
     assert house.routes()[0]["type"] == STRING
     old.remove()
-    house.node.add_publisher("/a", INT).publish(b"\0\1\0\0" + struct.pack("<i", 7))
+    new = house.node.add_publisher("/a", INT)
+    house.node.spin()
+    new.publish(b"\0\1\0\0" + struct.pack("<i", 7))
     await house.settle()
     (route,) = house.routes()
     assert (
