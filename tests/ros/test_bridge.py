@@ -16,7 +16,7 @@ from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge, Bridged, RouteSettings
 from appliance.ros.flows import Echo, Route
-from appliance.ros.node import Durability, FakeNode, QosProfile, Reliability
+from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
@@ -688,6 +688,45 @@ async def test_the_same_route_twice_is_told_and_left_out(house, caplog):
     assert len(house.node.subscriptions) == len(house.node.own_publishers) == 1
     await house.settle()
     assert len([r for r in caplog.records if "already" in r.getMessage()]) == 2
+
+
+async def test_an_end_that_the_bus_refuses_for_now_is_tried_again(house, caplog):
+    subscribe = house.node.subscribe_raw
+
+    def refuse(*_):
+        raise BusError("known with another type")
+
+    house.node.subscribe_raw = refuse
+    house.start(to_mqtt("/a"))
+    publisher = house.node.add_publisher("/a", STRING)
+    for _ in range(5):
+        house.node.spin()
+    assert house.status().last_error == "known with another type"
+    house.node.subscribe_raw = subscribe
+    house.node.spin()
+    publisher.publish(string("x"))
+    await house.settle()
+    assert house.client.payloads("r2d2/a") == [b'{"data":"x"}']
+    assert len([r for r in caplog.records if "another type" in r.getMessage()]) == 1
+
+
+async def test_a_publisher_of_another_type_waits_until_the_old_one_has_gone(house):
+    house.start(to_ros("/**"))
+    old = house.node.add_subscriber("/a", STRING)
+    create, types = house.node.create_publisher, []
+
+    def note(topic, type_name, qos):
+        types.append([own.endpoint.type for own in house.node.own_publishers])
+        return create(topic, type_name, qos)
+
+    house.node.create_publisher = note
+    house.node.remote_subscribers.remove(old)
+    new = house.node.add_subscriber("/a", INT)
+    house.node.spin()
+    await house.settle()
+    house.client.send("r2d2/a", b'{"data":7}')
+    assert types == [[]]
+    assert len(new.received) == 1
 
 
 # Routes that change while they run
