@@ -42,7 +42,7 @@ BATCH = 64
 
 #: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
 #: one may have been replaced by another. At each look it is the turn of some topics.
-THOROUGH_LOOK = 6
+THOROUGH_LOOK = 5
 
 #: Seconds between two looks at the counters, for the rates; and how many of these it takes until
 #: what is bridged is told again for the figures in it.
@@ -342,8 +342,9 @@ class Bridge:
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
-        for turn, flow in enumerate(self._flows(), self._looks):
-            has_changed |= flow.look(self._node, turn % THOROUGH_LOOK == 0)
+        for flow in self._flows():
+            is_thorough = (flow.turn + self._looks) % THOROUGH_LOOK == 0
+            has_changed |= flow.look(self._node, is_thorough)
         ready = [flow for flow in self._found.values() if flow.bridged is not None]
         if ready != self._ready:
             self._ready = ready

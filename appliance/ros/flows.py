@@ -6,6 +6,7 @@ endpoints that are there, and sets up or sets anew what carries the messages.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 from abc import ABC, abstractmethod
@@ -45,6 +46,8 @@ REPORT_INTERVAL = 60.0
 #: Seconds that a sample of our own may take to come back; in one process it is microseconds.
 ECHO_TIME = 2.0
 ECHO_SAMPLES = 1000
+
+_TURNS = itertools.count()
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +181,8 @@ class Flow(ABC):
         #: For the loop's thread.
         self.meter = Meter()
         self.bridged: Bridged | None = None
+        #: A number of its own: of so many flows, not all take their time at the same look.
+        self.turn = next(_TURNS)
         #: Whether a pattern found the topic: it is then bridged while it has other ends.
         self.is_matched = route.is_pattern
         self._converters = converters
