@@ -8,7 +8,8 @@ import gc
 import logging
 import os
 import signal
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 
 import psutil
@@ -62,9 +63,10 @@ CERTIFICATE_WARNING = 86400.0
 class App:
     """The whole appliance, on the running event loop."""
 
-    def __init__(self, settings: Settings) -> None:
-        """Assign only; `start` reads files and opens ports."""
+    def __init__(self, settings: Settings, ros_arguments: Sequence[str] = ()) -> None:
+        """Assign only; `start` reads files and opens ports. For the arguments see `run`."""
         self.settings = settings
+        self._ros_arguments = ros_arguments
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
         self.audit: Audit | None = None
@@ -219,12 +221,19 @@ class App:
         bridge = settings.bridge
         use_fastdds_profile(os.environ)
         self.bridge = Bridge(
-            Ros2Node(bridge.node, bridge.namespace, bridge.domain_id),
+            Ros2Node(
+                bridge.node,
+                bridge.namespace,
+                bridge.domain_id,
+                (*bridge.ros_arguments, *self._ros_arguments),
+                bridge.use_sim_time,
+            ),
             self.broker,
             wiring.routes(settings),
             loop,
             settings.robot,
             wiring.call_routes(settings),
+            diagnostics=bridge.diagnostics,
         )
         self._stack.push_async_callback(self.bridge.stop)
         self.bridge.start()
@@ -290,11 +299,19 @@ class App:
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
 
+    async def _answer_routes(self) -> list[dict[str, object]]:
+        if self.bridge is None:
+            raise ControlError("there is no bridge (bridge.bus is none)")
+        if self.bridge.problem is not None:
+            raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
+        return [asdict(topic) for topic in self.bridge.topics()]
+
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        control = Control(settings.control, {"reload": self._answer_reload})
+        commands = {"reload": self._answer_reload, "routes": self._answer_routes}
+        control = Control(settings.control, commands)
         await control.start()
         self._stack.push_async_callback(control.stop)
         if settings.reload_on_change:
@@ -327,10 +344,13 @@ class _Deaf:
         """There is no connection to close."""
 
 
-def run(settings: Settings) -> int:
-    """Run the appliance until it is told to stop; returns the exit code of the command."""
+def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
+    """Run the appliance until it is told to stop; returns the exit code of the command.
+
+    `ros_arguments` are those that stood behind `--ros-args`; they come after the configuration's.
+    """
     _spare_the_old()
-    uvloop.run(_main(settings))
+    uvloop.run(_main(settings, ros_arguments))
     return 0
 
 
@@ -346,5 +366,5 @@ def _spare_the_old() -> None:
     gc.set_threshold(YOUNG_OBJECTS, 10, NEVER)
 
 
-async def _main(settings: Settings) -> None:
-    await App(settings).run()
+async def _main(settings: Settings, ros_arguments: Sequence[str]) -> None:
+    await App(settings, ros_arguments).run()

@@ -49,8 +49,10 @@ app.add_typer(cert_app, name="cert")
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Runs the command and exits with its code; what a user can mend is told in plain words."""
+    given = sys.argv[1:] if arguments is None else arguments
+    given, ros_arguments = _split_ros_arguments(given)
     try:
-        app(args=arguments, prog_name="appliance")
+        app(args=given, prog_name="appliance", obj=ros_arguments)
     except CommandError as error:
         typer.secho(f"appliance: {error}", fg="red", err=True)
     except BrokenPipeError:  # `appliance sub … | head`: the reader has enough
@@ -63,6 +65,21 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         what = f"{error.filename}: {what}" if error.filename else what
         typer.secho(f"appliance: {what}", fg="red", err=True)
     sys.exit(1)
+
+
+def _split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Those of the command, and those between `--ros-args` and `--`, as ROS tools add them."""
+    ours: list[str] = []
+    ros: list[str] = []
+    to = ours
+    for argument in arguments:
+        if argument == "--ros-args":
+            to = ros
+        elif argument == "--" and to is ros:
+            to = ours
+        else:
+            to.append(argument)
+    return ours, ros
 
 
 # Setting up, running, checking
@@ -104,6 +121,7 @@ def init(
 
 @app.command()
 def run(
+    context: typer.Context,
     config: ConfigOption = None,
     log_format: Annotated[
         Literal["human", "json"] | None, typer.Option(help="In place of log.format.")
@@ -113,14 +131,14 @@ def run(
         typer.Option(help="In place of log.level."),
     ] = None,
 ) -> None:
-    """Run the appliance until SIGINT or SIGTERM."""
+    """Run the appliance until SIGINT or SIGTERM; ROS arguments come behind `--ros-args`."""
     settings = _load(config)
     from appliance import app, logs
 
     log = settings.log
     logs.setup(log_level or log.level, log.levels, log_format or log.format)
     with _start_errors():
-        raise typer.Exit(app.run(settings))
+        raise typer.Exit(app.run(settings, context.obj or ()))
 
 
 @contextmanager
@@ -155,6 +173,50 @@ def reload(config: ConfigOption = None) -> None:
     except ControlError as error:
         raise CommandError(str(error)) from None
     typer.echo("\n".join(changed) if changed else "nothing has changed")
+
+
+@app.command()
+def routes(
+    config: ConfigOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a topic.")] = False,
+) -> None:
+    """Show what the running appliance carries between ROS and MQTT now."""
+    settings = _load(config)
+    import json
+
+    from appliance.control import ControlError, ask
+
+    try:
+        topics = ask(settings.control, "routes")
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    if as_json:
+        typer.echo("".join(f"{json.dumps(topic)}\n" for topic in topics), nl=False)
+        return
+    if not topics:
+        typer.echo("nothing is bridged now")
+        return
+    rows = [("ROS", "", "MQTT", "TYPE", "AS", "HZ", "BYTES", "LOST", "ERRORS", "MS")]
+    for topic in sorted(topics, key=lambda topic: (topic["ros"], topic["direction"])):
+        latency = topic["latency_ms"]
+        rows.append(
+            (
+                topic["ros"],
+                "→" if topic["direction"] == "to_mqtt" else "←",
+                topic["mqtt"],
+                topic["type"],
+                topic["encoding"],
+                f"{topic['rate']:g}",
+                str(topic["size"]),
+                str(topic["dropped"]),
+                str(topic["errors"]),
+                f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        typer.echo(line.rstrip())
 
 
 @app.command()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import ipaddress
 import json
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,6 +49,16 @@ _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|ap
 _URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
 MASK = "********"
 
+COMMAND_KEYS = (
+    "expire",
+    "take_retained",
+    "exclusive",
+    "lease",
+    "on_silence",
+    "clamp",
+    "allow",
+)
+"""The keys of a route that say when a command may reach ROS, and with what in it."""
 OPEN_WITH_SECRETS = (
     "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
     "take them from environment variables, ${NAME}"
@@ -233,6 +244,36 @@ def _check_ros_pattern(value: str) -> str:
     return value
 
 
+def _parse_ros_names(value: object) -> str | tuple[str, ...]:
+    """A name or pattern, or a list of them in which `!` leaves some out."""
+    if isinstance(value, str) and not value.startswith("!"):
+        return _check_ros_pattern(value)
+    if isinstance(value, str) or (
+        isinstance(value, (list, tuple))
+        and value
+        and all(isinstance(name, str) and name.startswith("!") for name in value)
+    ):
+        raise ValueError("only leaves topics out: put before it, in a list, those that are wanted")
+    if not isinstance(value, (list, tuple)) or not value:
+        raise ValueError("must be a ROS name, a pattern, or a list of them")
+    for name in value:
+        if not isinstance(name, str):
+            raise ValueError(f"{name!r} must be a ROS name or a pattern")
+        try:
+            _check_ros_pattern(name.removeprefix("!"))
+        except ValueError as error:
+            raise ValueError(f"{name!r} {error}") from None
+    return str(value[0]) if len(value) == 1 else tuple(value)
+
+
+def _check_ros_arguments(value: list[str]) -> list[str]:
+    if value[:1] == ["--ros-args"]:
+        value = value[1:]
+    if "--" in value:
+        raise ValueError("must have ROS arguments only, without --")
+    return value
+
+
 def _check_node(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
         raise ValueError("must be a letter or '_', then letters, digits or '_'")
@@ -244,7 +285,8 @@ def _check_namespace(value: str) -> str:
 
 
 def _check_ros_type(value: str) -> str:
-    if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", value):
+    """The name of a message type, or a pattern of such: sensor_msgs/msg/*."""
+    if re.fullmatch(r"[A-Za-z*][\w*]*/msg/[A-Za-z*][\w*]*", value) and "**" not in value:
         return value
     short = re.fullmatch(r"([A-Za-z]\w*)/([A-Za-z]\w*)", value)
     hint = f"; did you mean '{short[1]}/msg/{short[2]}'?" if short else ""
@@ -318,6 +360,41 @@ def _check_response_information(value: str) -> str:
     return value
 
 
+def _check_field(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*", value, re.ASCII):
+        raise ValueError(f"{value!r} is not the path of a field, such as linear.x")
+    return value
+
+
+def _check_clamp(value: object) -> object:
+    for path, bounds in value.items() if isinstance(value, dict) else ():
+        is_pair = isinstance(bounds, (list, tuple)) and len(bounds) == 2
+        if not is_pair or any(
+            isinstance(x, bool) or not isinstance(x, (int, float)) for x in bounds
+        ):
+            raise ValueError(f"{path} must have its least and its most, such as [-0.5, 0.5]")
+        if not -math.inf < bounds[0] <= bounds[1] < math.inf:
+            raise ValueError(f"{path} must have its least before its most")
+    return value
+
+
+def _check_allow(value: object) -> object:
+    for path, values in value.items() if isinstance(value, dict) else ():
+        if not isinstance(values, list) or not values:
+            raise ValueError(f"{path} must have a list of the values that are allowed")
+        if not all(isinstance(x, (bool, int, float, str)) for x in values):
+            raise ValueError(f"{path} can have only text, numbers, true and false")
+    return value
+
+
+def _check_message(value: object) -> object:
+    try:
+        json.dumps(value)
+    except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
+        raise ValueError("has a value that JSON does not know; put text in quotes") from None
+    return value
+
+
 def _check_plugins(value: object) -> object:
     if not isinstance(value, dict):
         return value
@@ -371,6 +448,12 @@ ClientCertificates = Annotated[
 ]
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
+RosNames = Annotated[
+    str | tuple[str, ...],
+    PlainValidator(_parse_ros_names),
+    PlainSerializer(lambda names: names if isinstance(names, str) else list(names)),
+]
+FieldPath = Annotated[str, AfterValidator(_check_field)]
 Encoding = Literal["json", "text", "cdr"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
@@ -532,23 +615,53 @@ class RouteDefaults(_Section):
     keep: Keep = "latest"
 
 
-class TopicRoute(RouteDefaults):
-    """One ROS topic that is carried to MQTT, from MQTT, or both ways."""
+class OnSilence(_Section):
+    """The stop message of a route to ROS, and when it is published; `after` in seconds."""
 
-    ros: Annotated[str, AfterValidator(_check_ros_pattern)]
+    after: Annotated[Duration, Field(gt=0)]
+    publish: Annotated[dict[str, Any], BeforeValidator(_check_message)] = {}
+    disconnect: bool = True
+
+
+class TopicRoute(RouteDefaults):
+    """One ROS topic that is carried to MQTT, from MQTT, or both ways.
+
+    What is under COMMAND_KEYS holds for what goes to ROS; times in seconds.
+    """
+
+    ros: RosNames
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+    expire: Annotated[Duration, Field(gt=0)] | None = None
+    take_retained: bool = False
+    exclusive: bool = False
+    lease: Annotated[Duration, Field(gt=0)] = 2.0
+    on_silence: OnSilence | None = None
+    clamp: Annotated[dict[FieldPath, list[float]], BeforeValidator(_check_clamp)] = {}
+    allow: Annotated[
+        dict[FieldPath, list[bool | int | float | str]], BeforeValidator(_check_allow)
+    ] = {}
+
+    @property
+    def command_keys(self) -> list[str]:
+        """Those of COMMAND_KEYS that say something else than their default."""
+        fields = TopicRoute.model_fields
+        return [key for key in COMMAND_KEYS if getattr(self, key) != fields[key].default]
 
     @property
     def is_pattern(self) -> bool:
         """Whether `ros` names many topics."""
-        return "*" in self.ros
+        return not isinstance(self.ros, str) or "*" in self.ros
 
     def topic(self, robot: str) -> str:
         """The MQTT topic of this route on that robot; a pattern keeps `{ros}` in it."""
         topic = self.mqtt.replace("{robot}", robot)
-        return topic if self.is_pattern else topic.replace("{ros}", self.ros)
+        return (
+            topic.replace("{ros}", self.ros)
+            if isinstance(self.ros, str) and not self.is_pattern
+            else topic
+        )
 
 
 class _CalledRoute(_Section):
@@ -618,12 +731,15 @@ class BridgeLimits(_Section):
 
 
 class Bridge(_Section):
-    """The way between the robot's bus and the broker."""
+    """The way between the robot's bus and the broker; `diagnostics` in seconds, 0 for none."""
 
     bus: Annotated[Literal["ros2", "none"], BeforeValidator(_check_bus)] = "ros2"
     node: Annotated[str, AfterValidator(_check_node)] = "appliance"
     namespace: Annotated[str, AfterValidator(_check_namespace)] = "/"
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    ros_arguments: Annotated[list[str], AfterValidator(_check_ros_arguments)] = []
+    use_sim_time: bool = False
+    diagnostics: Annotated[Duration, Field(ge=0)] = 1.0
     defaults: RouteDefaults = _section()
     topics: list[TopicRoute] = []
     services: list[Annotated[ServiceRoute, BeforeValidator(_from_name)]] = []
@@ -716,6 +832,11 @@ def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -
     return settings
 
 
+def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | None, str]:
+    """What two routes must not have in common; patterns may differ in the type alone."""
+    return route.ros, route.type if route.is_pattern else None, route.topic(robot)
+
+
 def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     seen: dict[Bind, int] = {}
     for number, listener in enumerate(settings.broker.listeners):
@@ -730,14 +851,17 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     ):
         problem = "needs a listener with tls: true that asks for client certificates"
         yield ("broker", "tls", "username_from"), problem
-    routes: dict[tuple[str, str], int] = {}
+    routes: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
-        first = routes.setdefault((route.ros, route.topic(settings.robot)), number)
-        if route.is_pattern and route.to != "mqtt":
-            yield ("bridge", "topics", number, "to"), "must be mqtt when ros is a pattern"
+        first = routes.setdefault(_way(route, settings.robot), number)
         if route.is_pattern and "{ros}" not in route.mqtt:
             problem = "needs {ros} in it, or all topics of the pattern would be one"
             yield ("bridge", "topics", number, "mqtt"), problem
+        if route.to == "mqtt":
+            for key in route.command_keys:
+                yield ("bridge", "topics", number, key), "is for routes to ROS only"
+        elif "lease" in route.command_keys and not route.exclusive:
+            yield ("bridge", "topics", number, "lease"), "needs exclusive: true beside it"
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)

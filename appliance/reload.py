@@ -40,6 +40,9 @@ NEEDS_RESTART: Final = (
     "bridge.node",
     "bridge.namespace",
     "bridge.domain_id",
+    "bridge.ros_arguments",
+    "bridge.use_sim_time",
+    "bridge.diagnostics",
 )
 
 

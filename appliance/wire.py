@@ -657,6 +657,10 @@ class ClientProtocol:
         stranger = self._client.session is None
         return self._network.exchange(method, self.address if stranger else None)
 
+    def now(self) -> float:
+        """Seconds of the event loop's clock."""
+        return self._loop.time()
+
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""
         self._timeout.cancel()
@@ -751,6 +755,10 @@ class _Gone:
     def exchange(self, method: str) -> Exchange | None:
         """There is none to be had."""
         return None
+
+    def now(self) -> float:
+        """No time passes."""
+        return 0.0
 
     def accepted(self) -> None:
         """Nobody waits for it."""

@@ -9,7 +9,7 @@ from appliance.amqtt_broker import plugin_kinds
 from appliance.broker.ports import Features, Limits
 from appliance.certs import TlsContexts
 from appliance.certs.settings import listener_name, tls_files, tls_policies
-from appliance.config import Settings
+from appliance.config import Settings, TopicRoute
 from appliance.listeners import Admission, ListenerSettings
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.graph import (
@@ -19,6 +19,7 @@ from appliance.ros.graph import (
     ParameterSettings,
     ServiceSettings,
 )
+from appliance.ros.rules import CommandRules, OnSilence
 
 
 def access_files(settings: Settings) -> tuple[Path | None, Path | None]:
@@ -117,6 +118,7 @@ def routes(settings: Settings) -> list[RouteSettings]:
             qos=route.qos,
             retain=route.retain,
             keep=route.keep,
+            rules=_command_rules(route) if route.command_keys else None,
         )
         for route in settings.bridge.topics
     ]
@@ -159,4 +161,19 @@ def call_routes(settings: Settings) -> CallRoutes:
             for route in bridge.parameters
         ),
         limits=CallLimits(bridge.limits.calls_per_client, bridge.limits.calls),
+    )
+
+
+def _command_rules(route: TopicRoute) -> CommandRules:
+    silence = route.on_silence
+    return CommandRules(
+        expire=route.expire,
+        take_retained=route.take_retained,
+        exclusive=route.exclusive,
+        lease=route.lease,
+        on_silence=OnSilence(silence.after, json.dumps(silence.publish), silence.disconnect)
+        if silence
+        else None,
+        clamp=tuple((path, low, high) for path, (low, high) in route.clamp.items()),
+        allow=tuple((path, tuple(values)) for path, values in route.allow.items()),
     )

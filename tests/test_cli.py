@@ -279,3 +279,11 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
     assert target(port=3) == Target("h", 3, None, "alice", "secret")
     config = here / "appliance.yaml"
     assert target(port=3, config=config) == Target("h", 3, here / "certs/ca.crt", "alice", "secret")
+
+
+def test_ros_arguments_stand_behind_ros_args() -> None:
+    given = ["run", "--ros-args", "-r", "/a:=/b", "--", "-c", "x.yaml", "--ros-args", "-p", "p:=1"]
+    ours, ros = cli._split_ros_arguments(given)
+    assert ours == ["run", "-c", "x.yaml"]
+    assert ros == ["-r", "/a:=/b", "-p", "p:=1"]
+    assert cli._split_ros_arguments(["pub", "--", "-x"]) == (["pub", "--", "-x"], [])

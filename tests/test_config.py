@@ -79,7 +79,12 @@ def test_the_example_routes_of_the_reference_load() -> None:
     example = re.sub(r"(?m)^  #  ", "    ", text)
     bridge = config.loads(example, HERE).bridge
     routes = bridge.topics
-    assert [(route.ros, route.to) for route in routes] == [("/odom", "mqtt"), ("/cmd_vel", "ros")]
+    assert [(route.ros, route.to) for route in routes] == [
+        ("/odom", "mqtt"),
+        ("/cmd_vel", "ros"),
+        (("/camera/**", "!/camera/*/raw"), "mqtt"),
+        ("/**", "mqtt"),
+    ]
     assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
     assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
     for called, model in (
@@ -116,7 +121,11 @@ bridge:
   topics:
     - {ros: odom, to: mqt}
     - {to: mqtt, type: std_msgs/String, mqtt: "{foo}/x"}
-    - {ros: /a, to: both, expire: 500 ms}
+    - {ros: /a, to: both, expires: 500 ms}
+    - ros: /b
+      to: ros
+      clamp: {linear.x: [1, 0]}
+      on_silence: {after: 500}
 log: {level: warn}
 """
     found = problems(text)
@@ -137,8 +146,10 @@ log: {level: warn}
         "18: bridge.topics[1].ros: is needed",
         "18: bridge.topics[1].type: must be package/msg/Type",
         "18: bridge.topics[1].mqtt: knows the placeholders",
-        "19: bridge.topics[2].expire: unknown key",
-        "20: log.level: must be debug, info, warning or error; did you mean 'warning'?",
+        "19: bridge.topics[2].expires: unknown key; did you mean 'expire'?",
+        "22: bridge.topics[3].clamp: linear.x must have its least before its most",
+        "23: bridge.topics[3].on_silence.after: must be a duration such as",
+        "24: log.level: must be debug, info, warning or error; did you mean 'warning'?",
     ]
     assert len(found) == len(expected)
     for problem, start in zip(found, expected, strict=True):
@@ -160,6 +171,49 @@ log: {level: warn}
 )
 def test_what_is_not_a_configuration_at_all(text: str, place: str) -> None:
     assert place in problems(text)[0]
+
+
+def test_rules_of_commands() -> None:
+    text = """\
+bridge:
+  topics:
+    - ros: /cmd_vel
+      to: ros
+      type: geometry_msgs/msg/Twist
+      expire: 500 ms
+      exclusive: true
+      lease: 1 s
+      on_silence: {after: 250 ms, publish: {linear: {x: 0}}}
+      clamp: {linear.x: [-0.5, 1]}
+      allow: {linear.z: [0, 1.5], linear.y: [a, true]}
+"""
+    (route,) = loads(text).bridge.topics
+    assert (route.expire, route.exclusive, route.lease) == (0.5, True, 1.0)
+    assert route.on_silence == config.OnSilence(after=0.25, publish={"linear": {"x": 0}})
+    assert route.clamp == {"linear.x": [-0.5, 1.0]}
+    assert route.allow == {"linear.z": [0, 1.5], "linear.y": ["a", True]}
+    again = config.loads(yaml.safe_dump(config.describe(loads(text))), HERE)
+    assert again.bridge.topics == [route]
+
+
+@pytest.mark.parametrize(
+    ("route", "problem"),
+    [
+        ("to: mqtt, expire: 1 s", ".expire: is for routes to ROS only"),
+        ("to: ros, lease: 1 s", ".lease: needs exclusive: true"),
+        ("to: ros, clamp: {x: 3}", ".clamp: x must have its least and its most"),
+        ("to: ros, clamp: {x: [.nan, 1]}", ".clamp: x must have its least before its most"),
+        ("to: ros, clamp: {x: [true, 1]}", ".clamp: x must have its least and its most"),
+        ("to: ros, clamp: {a..b: [0, 1]}", "'a..b' is not the path of a field"),
+        ("to: ros, allow: {x: []}", ".allow: x must have a list"),
+        ("to: ros, allow: {x: [{}]}", ".allow: x can have only text"),
+        ("to: ros, on_silence: {publish: {}}", ".on_silence.after: is needed"),
+        ("to: ros, on_silence: {after: 1 s, publish: {x: 2024-01-01}}", "JSON does not know"),
+    ],
+)
+def test_rules_of_commands_that_cannot_be(route: str, problem: str) -> None:
+    (found,) = problems(f"bridge: {{topics: [{{ros: /a, {route}}}]}}")
+    assert problem in found
 
 
 def test_routes_take_what_they_do_not_say_from_the_defaults() -> None:
@@ -281,16 +335,12 @@ def test_the_file_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         config.load()
 
 
-def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
+def test_a_pattern_names_many_topics() -> None:
     settings = loads("robot: r2\nbridge: {topics: [{ros: '/camera/**', to: mqtt}]}")
     route = settings.bridge.topics[0]
     assert route.is_pattern
     assert route.topic("r2") == "r2{ros}"
 
-    assert any(
-        "must be mqtt when ros is a pattern" in problem
-        for problem in problems("bridge: {topics: [{ros: '/camera/*', to: both}]}")
-    )
     assert any(
         "needs {ros} in it" in problem
         for problem in problems("bridge: {topics: [{ros: '/a/*', to: mqtt, mqtt: '{robot}/a'}]}")
@@ -298,6 +348,38 @@ def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
     assert any(
         "***" in problem for problem in problems("bridge: {topics: [{ros: /a/***, to: mqtt}]}")
     )
+
+
+def test_lists_of_names_and_patterns() -> None:
+    def route(ros: str, more: str = "") -> config.TopicRoute:
+        return loads(f"bridge: {{topics: [{{ros: {ros}, to: both{more}}}]}}").bridge.topics[0]
+
+    some = route("['/camera/**', '!/camera/raw']")
+    assert some.ros == ("/camera/**", "!/camera/raw")
+    assert some.is_pattern
+    assert some.topic("r2") == "r2{ros}"
+    assert route("[/odom]").ros == "/odom"
+    assert route("'/**'", ", type: sensor_msgs/msg/*Image").type == "sensor_msgs/msg/*Image"
+    twice = "bridge: {topics: [{ros: '/**', to: mqtt, type: a/msg/*}, "
+    loads(twice + "{ros: '/**', to: mqtt, type: b/msg/*}]}")
+    assert any("same way" in p for p in problems(twice + "{ros: '/**', to: mqtt, type: a/msg/*}]}"))
+    for wrong, what in {
+        "'!/a'": "only leaves topics out",
+        "['!/a', '!/b']": "only leaves topics out",
+        "[]": "must be a ROS name",
+        "[/a, 7]": "7 must be a ROS name",
+        "[/a, camera]": "'camera' must be a full ROS name",
+        "['/a', '!/b c']": "'!/b c' is not a ROS name",
+    }.items():
+        assert any(what in p for p in problems(f"bridge: {{topics: [{{ros: {wrong}, to: mqtt}}]}}"))
+    text = config.describe(loads("bridge: {topics: [{ros: ['/a/*', '!/a/b'], to: mqtt}]}"))
+    assert config.loads(yaml.safe_dump(text), HERE).bridge.topics[0].ros == ("/a/*", "!/a/b")
+
+
+def test_ros_arguments() -> None:
+    text = 'bridge: {ros_arguments: [--ros-args, -r, "/a:=/b"]}'
+    assert loads(text).bridge.ros_arguments == ["-r", "/a:=/b"]
+    assert any("without --" in p for p in problems("bridge: {ros_arguments: [-r, 'a:=b', --]}"))
 
 
 # TLS

@@ -16,12 +16,13 @@ from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
 from appliance.broker.kept import Kept, Owed
-from appliance.broker.message import Message
+from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
     Access,
     Action,
     Decision,
     Features,
+    Guard,
     Identity,
     Journal,
     Limits,
@@ -61,6 +62,9 @@ CACHED_TOPIC = 512
 
 #: Entries and targets in the caches of all sessions together, some 80 bytes each.
 CACHED_IN_ALL = 500_000
+
+#: Seconds that a QoS 2 exchange may take before its message counts as late.
+LATE = 0.1
 
 #: The effort to find a route, see `Counters.effort`; each match comes on top.
 ROUTE_EFFORT = 20
@@ -142,6 +146,9 @@ class Broker:
         self.retained: TopicTree[Message] = TopicTree()
         self.retained_bytes = 0
         self.observer: Observer | None = None
+        #: By topic, what parts of the appliance have to say about who publishes to it. What they
+        #: say holds until `guards_changed`.
+        self.guards: dict[str, list[Guard]] = {}
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
         self.journal: Journal | None = None
@@ -468,6 +475,9 @@ class Broker:
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision = self._may_publish(session, topic)
+        if decision and topic in self.guards:
+            verdicts = [guard.decide(session) for guard in self.guards[topic]]
+            decision = next((verdict for verdict in verdicts if not verdict), decision)
         matches = self._subscriptions.match(topic) if decision else []
         self.counters.effort += ROUTE_EFFORT + len(matches)
         targets, shares = self._targets(session, topic, matches)
@@ -655,13 +665,17 @@ class Broker:
             or any(qos and session.persistent for _, m in route.shares for session, qos, _, _ in m)
         )
 
-    def release(self, held: Held, origin: Session) -> None:
+    def release(self, held: Held, origin: Session, age: float) -> None:
         """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
+
+        `age` is in seconds from its coming.
 
         Raises:
             ProtocolError: the topic is not valid.
         """
-        message, full = held
+        message, full, _ = held
+        if age > LATE:
+            message = Late(message, age)
         if self.ledger.has_expired(message):
             return
         route = self.route(origin, message.topic_wire)
@@ -689,6 +703,8 @@ class Broker:
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
+        for guard in self.guards.get(route.topic, ()):
+            guard.refused(session)
         if self.observer is not None:
             self.observer.refused(session, message)
         self._tell_denied(session, Action.PUBLISH, route.topic, route.reason)
@@ -880,6 +896,10 @@ class Broker:
         self.features = features
         self.ledger.use(limits)
         self.epoch += 1  # topics that were too long may not be so any more
+
+    def guards_changed(self) -> None:
+        """Guards were set, or would decide otherwise now."""
+        self.epoch += 1
 
     def rules_changed(self) -> None:
         """The access rules changed: nothing cached holds, and what waits is checked again."""

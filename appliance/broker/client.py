@@ -6,6 +6,7 @@ Pure like the rest of the broker: bytes come in at `receive`, and go out at `flu
 from __future__ import annotations
 
 import logging
+import math
 import uuid
 from collections import deque
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from appliance.broker.handshake import (
     maximum_packet_size,
     pending_will,
 )
-from appliance.broker.message import Message
+from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.broker.session import Held, Session
 from appliance.mqtt.codec import Properties, Property, quote
@@ -91,6 +92,9 @@ class Wire(Protocol):
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
+
+    def now(self) -> float:
+        """Seconds of a clock that never goes back, finer than the broker's."""
 
     def accepted(self) -> None:
         """The client has logged in: the time limit for that is over."""
@@ -251,6 +255,8 @@ class Client:
             # its bytes are taken over instead of being encoded again.
             message.wire_key = self._version << 8 | first
             message.wire_head = head
+        else:
+            message = Late(message, math.inf)
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
@@ -275,6 +281,8 @@ class Client:
             self._expires_at(packet.properties),
             passed_on=packet.passed_on,
         )
+        if packet.dup:
+            message = Late(message, math.inf)
         route = broker.route(session, message.topic_wire)
         packet_id = packet.packet_id or 0
         if broker.features.check_payload_format and not is_text(message.payload, packet.properties):
@@ -331,7 +339,7 @@ class Client:
             if everybody and refuses:
                 code = ReasonCode.QUOTA_EXCEEDED
                 self._counters.publish_dropped += 1
-            elif not session.hold(packet_id, Held(message, full)):
+            elif not session.hold(packet_id, Held(message, full, self.wire.now())):
                 code = ReasonCode.QUOTA_EXCEEDED
                 if self._version != 5:
                     raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
@@ -357,7 +365,7 @@ class Client:
                 return
             held = session.unhold(packet_id)
             if held is not None:
-                self.broker.release(held, session)
+                self.broker.release(held, session, self.wire.now() - held.since)
             self._acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
@@ -608,6 +616,7 @@ class Client:
         session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
+        session.reconnected()
         self.session = session
         self._alias_maximum = agreement.aliases
         self._aliases = {} if agreement.aliases else None

@@ -98,6 +98,11 @@ class Message:
         return head
 
     @property
+    def age(self) -> float:
+        """Seconds from its arrival until it was published, see `Late`."""
+        return 0.0
+
+    @property
     def properties_wire(self) -> bytes:
         """The properties as they stand in an MQTT 5 packet, between packet id and payload."""
         if self._properties_wire is None:
@@ -159,3 +164,30 @@ class Message:
             body += packet_id.to_bytes(2, "big")
         body += encode_varint(len(properties)) + properties + self.payload
         return bytes((first,)) + encode_varint(len(body)) + body
+
+
+class Late(Message):
+    """A message that was published some time after its client had sent it for the first time.
+
+    `age` is that time in seconds, infinity where it is not known: what is sent again after a lost
+    connection, a QoS 2 message that waited for its PUBREL. For most receivers it is as any other.
+    """
+
+    __slots__ = ("_age",)
+
+    def __init__(self, message: Message, age: float) -> None:
+        super().__init__(
+            message.topic,
+            message.payload,
+            message.qos,
+            message.retain,
+            message.properties,
+            message.expires_at,
+            message.topic_wire,
+            message._passed_on,
+        )
+        self._age = age
+
+    @property
+    def age(self) -> float:
+        return self._age

@@ -187,6 +187,16 @@ class Store(Protocol):
         """It does not any more."""
 
 
+class Guard(Protocol):
+    """A part of the appliance that has a say in who publishes to its topic."""
+
+    def decide(self, session: Session) -> Decision:
+        """Whether the session may; it holds until `Broker.guards_changed`."""
+
+    def refused(self, session: Session) -> None:
+        """A message of the session was refused, by this guard, another or the access rules."""
+
+
 class Observer(Protocol):
     """Told of what happens in the broker: amqtt's plugins listen here."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -140,6 +141,8 @@ class Held(NamedTuple):
 
     message: Message
     full: frozenset[Session | Share]
+    #: When it came, in seconds of `Wire.now`; not known when it was sent on another connection.
+    since: float = -math.inf
 
 
 class PendingWill(NamedTuple):
@@ -657,6 +660,11 @@ class Session:
         if self.expiry:
             self.ledger.store.held(self, packet_id, held)
         return True
+
+    def reconnected(self) -> None:
+        """What is held was sent on another connection, whose time means nothing any more."""
+        for packet_id, held in self.received.items():
+            self.received[packet_id] = held._replace(since=-math.inf)
 
     def unhold(self, packet_id: int) -> Held | None:
         """The message that PUBREL releases, once."""

@@ -45,7 +45,8 @@ from appliance.ros.calls import (
 )
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
-from appliance.ros.mailbox import Counters, Lane, Mailbox
+from appliance.ros.figures import Counters
+from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.requests import Key, Requests

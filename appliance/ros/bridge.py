@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from time import time_ns
 
 import orjson
 
@@ -23,14 +22,17 @@ from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import describe
-from appliance.ros.flows import Bridged, Direction, Echo, Flow, RouteSettings, ToMqtt, ToRos
+from appliance.ros.diagnostics import Diagnostics
+from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
 from appliance.ros.graph import CallRoutes, Calls
-from appliance.ros.mailbox import Counters, Mailbox
+from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
-__all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus"]
+__all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus", "TopicStatus"]
 
 log = logging.getLogger(__name__)
 
@@ -39,38 +41,14 @@ CLIENT_ID = "_bridge"
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
 
-#: Every so many looks at the graph (some 2 s) the number of endpoints is not trusted: one may have
-#: been replaced by another.
-THOROUGH_LOOK = 13
+#: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
+#: one may have been replaced by another. At each look it is the turn of some topics.
+THOROUGH_LOOK = 5
 
-
-@dataclass(frozen=True, slots=True)
-class RouteStatus:
-    """What a route carries in one direction, and what it has counted since the start.
-
-    `bytes` are payload on MQTT; `dropped` did not fit into the mailbox, `throttled` were above the
-    rate, `errors` could not be converted or published.
-    """
-
-    settings: RouteSettings
-    direction: Direction
-    topics: tuple[Bridged, ...]
-    messages: int
-    bytes: int
-    dropped: int
-    throttled: int
-    errors: int
-    last_error: str | None
-
-
-@dataclass(eq=False, slots=True)
-class _Route:
-    """A route in one direction; `pattern` is None when it is of one topic."""
-
-    settings: RouteSettings
-    direction: Direction
-    counters: Counters
-    pattern: re.Pattern[str] | None = None
+#: Seconds between two looks at the counters, for the rates; and how many of these it takes until
+#: what is bridged is told again for the figures in it.
+METER_INTERVAL = 1.0
+METERS_TO_ANNOUNCE = 10
 
 
 class Bridge:
@@ -87,10 +65,11 @@ class Bridge:
         loop: asyncio.AbstractEventLoop,
         robot: str,
         calls: CallRoutes | None = None,
+        *,
+        diagnostics: float = 0.0,
     ) -> None:
-        """What is bridged is told on `{robot}/_appliance/routes`.
-
-        Raises ValueError for a pattern in a route to ROS.
+        """What is bridged is told on `{robot}/_appliance/routes`, and every so many seconds how it
+        goes on `/diagnostics`, not at all for 0.
         """
         self.problem: str | None = None
         self._node = node
@@ -99,92 +78,126 @@ class Bridge:
         self._topic = f"{robot}/_appliance/routes"
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
-        self._converters = Converters(lambda name: describe(node.load(name), node.load))
+        self._converters = Converters(lambda name: describe(node.load(name), node.load), node.now)
+        self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
+        self._meter_timer: asyncio.TimerHandle | None = None
+        self._metered = 0
+        #: What was last told of what is bridged.
+        self._announced = b""
         #: Replaced as one by the loop's thread; the ROS thread follows at its next look.
-        self._routes: list[_Route] = []
-        self._followed: list[_Route] | None = None
+        self._routes: list[Route] = []
+        self._followed: list[Route] | None = None
         #: Topics that have a route by name, which goes before patterns.
-        self._named: set[str] = set()
-        #: By what they carry. The first belongs to the ROS thread, the second to the loop's thread,
-        #: which replaces it as one and leaves to the ROS thread what is to be closed.
+        self._named: dict[Direction, set[str]] = {"to_mqtt": set(), "to_ros": set()}
+        #: The topics when patterns were last matched.
+        self._topics: dict[str, list[str]] | None = None
+        #: By what they carry. These belong to the ROS thread; those to ROS only as far as patterns
+        #: found them, of which the loop's thread is told when they can be received for.
         self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
+        self._found: dict[tuple[str, str], ToRos] = {}
+        self._ready: list[ToRos] = []
+        #: All to ROS that are received for. They belong to the loop's thread, which replaces them
+        #: as one and leaves to the ROS thread what is to be closed.
         self._to_ros: dict[tuple[str, str], ToRos] = {}
+        self._matched: list[ToRos] = []
         self._leaving: deque[ToRos] = deque()
         #: Those to ROS by MQTT topic.
         self._receivers: dict[str, list[ToRos]] = {}
+        self._subscribed: dict[str, Subscription] = {}
         self._looks = 0
-        #: What of the topics was last announced.
-        self._announced: Sequence[Bridged] = ()
         #: Services, actions and parameters.
         self.calls = Calls(
-            node, broker, loop, self._converters, self._mailbox, self._post, self._announce_again
+            node, broker, loop, self._converters, self._mailbox, self._post, self._announce
         )
         self.replace(routes)
         self.calls.replace(calls or CallRoutes())
 
     def replace(self, routes: Iterable[RouteSettings]) -> None:
-        """Carry these routes from now on; one that was there before does not notice.
-
-        Raises ValueError for a pattern in a route to ROS; nothing has changed then.
-        """
+        """Carry these routes from now on; one that was there before does not notice."""
         known = {(route.settings, route.direction): route for route in self._routes}
-        wanted: list[_Route] = []
+        wanted: list[Route] = []
+        directions: tuple[tuple[Direction, str], ...] = (("to_ros", "mqtt"), ("to_mqtt", "ros"))
         for settings in routes:
-            pattern = settings.pattern()
-            if pattern is not None and settings.to != "mqtt":
-                raise ValueError(f"{settings.ros}: a pattern can only go to MQTT")
-            if settings.to != "mqtt":
-                route = _Route(settings, "to_ros", Counters())
-                wanted.append(known.get((settings, "to_ros"), route))
-            if settings.to != "ros":
-                route = _Route(settings, "to_mqtt", Counters(), pattern)
-                wanted.append(known.get((settings, "to_mqtt"), route))
-        self._receive_for([route for route in wanted if route.direction == "to_ros"])
+            for direction, other in directions:
+                if settings.to != other:
+                    route = known.get((settings, direction))
+                    wanted.append(route or Route(settings, direction))
         self._named = {
-            route.settings.ros
-            for route in wanted
-            if route.direction == "to_mqtt" and route.pattern is None
+            direction: {
+                route.settings.names[0]
+                for route in wanted
+                if route.direction == direction and not route.is_pattern
+            }
+            for direction, _ in directions
         }
+        self._receive_for(wanted)
         self._routes = wanted
 
-    def _receive_for(self, routes: Sequence[_Route]) -> None:
+    def _receive_for(self, routes: list[Route]) -> None:
         flows: dict[tuple[str, str], ToRos] = {}
         for route in routes:
-            settings = route.settings
-            flow = ToRos(settings, settings.ros, route.counters, self._converters, self._tell)
+            if route.direction != "to_ros" or route.is_pattern:
+                continue
+            flow = self._new_to_ros(route, route.settings.names[0])
             key = flow.ros, flow.mqtt
-            before = self._to_ros.get(key)
+            known = self._to_ros.get(key)
             if key in flows:
                 log.warning("%s has a route already; the later one is left out", flow)
-            elif before is not None and before.counters is route.counters:
-                flows[key] = before
+            elif known is not None and known.route is route:
+                flows[key] = known
             else:
                 flows[key] = flow
-        self._leaving.extend(flow for key, flow in self._to_ros.items() if flows.get(key) != flow)
-        self._to_ros = flows
+        for found in self._matched:
+            if found.route in routes and found.ros not in self._named["to_ros"]:
+                flows[found.ros, found.mqtt] = found
+        before, self._to_ros = self._to_ros, flows
+        for key, flow in before.items():
+            if flows.get(key) is not flow:
+                flow.leave()
+                if not flow.is_matched:
+                    self._leaving.append(flow)
+                    flow.route.past.add(flow.counters)
+        for key, flow in flows.items():
+            if before.get(key) is not flow:
+                flow.enter()
         receivers: dict[str, list[ToRos]] = {}
         for flow in flows.values():
             receivers.setdefault(flow.mqtt, []).append(flow)
-        before_topics, self._receivers = self._receivers.keys(), receivers
-        self._subscribe(receivers.keys() - before_topics, before_topics - receivers.keys())
+        self._receivers = receivers
+        self._subscribe()
 
-    def _subscribe(self, topics: Iterable[str], no_longer: Iterable[str] = ()) -> None:
-        if self._session is None:
+    def _receive_for_matched(self, flows: list[ToRos]) -> None:
+        self._matched = flows
+        self._receive_for(self._routes)
+
+    def _new_to_ros(self, route: Route, ros: str) -> ToRos:
+        if route.settings.rules is None:
+            return ToRos(route, ros, self._converters, self._tell)
+        around = Surroundings(self._loop, self._post, self._broker)
+        return Commands(route, ros, self._converters, self._tell, around)
+
+    def _subscribe(self) -> None:
+        """Subscribe to what the flows to ROS receive, and to nothing else."""
+        session = self._session
+        if session is None:
             return
-        for topic in topics:
+        wanted: dict[str, Subscription] = {}
+        for topic, flows in self._receivers.items():
             # No Local stops the echo on a topic that is bridged both ways. A retained message may
-            # be an old command: it does not reach ROS. QoS 0 loses nothing here, as the link takes
-            # each message at once.
-            self._broker.subscribe(
-                self._session, Subscription(topic, 0, no_local=True, retain_handling=2)
-            )
-        for topic in no_longer:
-            self._broker.unsubscribe(self._session, topic)
+            # be an old command: it does not reach ROS, unless a route asks for it. QoS 0 loses
+            # nothing here, as the link takes each message at once.
+            asks = any(flow.takes_retained for flow in flows)
+            wanted[topic] = Subscription(topic, 0, no_local=True, retain_handling=0 if asks else 2)
+        before, self._subscribed = self._subscribed, wanted
+        for topic, subscription in wanted.items():
+            if before.get(topic) != subscription:
+                self._broker.subscribe(session, subscription)
+                self._broker.send_retained(session, subscription, True)
+        for topic in before.keys() - wanted.keys():
+            self._broker.unsubscribe(session, topic)
 
-    def _add_to_mqtt(self, route: _Route, ros: str) -> None:
-        flow = ToMqtt(
-            route.settings, ros, route.counters, self._converters, self._tell, self._mailbox
-        )
+    def _add_to_mqtt(self, route: Route, ros: str) -> None:
+        flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox)
         key = flow.ros, flow.mqtt
         if key in self._to_mqtt:
             text = "%s has a route already; the later one is left out"
@@ -193,9 +206,16 @@ class Bridge:
         self._to_mqtt[key] = flow
         self._pair(key)
 
+    def _add_to_ros(self, route: Route, ros: str) -> None:
+        flow = self._new_to_ros(route, ros)
+        key = flow.ros, flow.mqtt
+        self._found[key] = flow
+        self._pair(key)
+
     def _pair(self, key: tuple[str, str]) -> None:
         """Let the two flows of a topic that goes both ways know their echo."""
-        there, back = self._to_mqtt.get(key), self._to_ros.get(key)
+        there = self._to_mqtt.get(key)
+        back = self._found.get(key) or self._to_ros.get(key)
         if there is not None and back is not None and (back.echo is None or there.echo is None):
             there.echo = back.echo = Echo()
 
@@ -203,14 +223,27 @@ class Bridge:
 
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
-        self._session = self._broker.attach(CLIENT_ID, _Link(self._receive))
-        self._subscribe(self._receivers)
+        self._session = self._broker.attach(
+            CLIENT_ID,
+            _Link(self._receive, None),
+            lambda origin: _Link(self._receive, origin),
+        )
+        self._subscribe()
         self.calls.start()
-        self._announce(())
+        self._announce()
+        self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
+        if self._diagnostics is not None:
+            self._diagnostics.start(self._loop)
         self._node.start(self._look, self._failed)
 
     async def stop(self) -> None:
         """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        if self._meter_timer is not None:
+            self._meter_timer.cancel()
+        if self._diagnostics is not None:
+            self._diagnostics.stop()
+        for command in self._to_ros.values():
+            command.leave()
         await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session
@@ -221,37 +254,31 @@ class Bridge:
         while self._deliver():
             pass
         await self.calls.stop()
-        self._announce(())
+        self._announce()
         self._session = None
         self._broker.detach(session)
 
     def status(self) -> list[RouteStatus]:
         """Every route's state and counters, one entry a direction."""
-        flows = self._flows()
+        flows: dict[Route, list[Flow]] = {}
+        for flow in self._flows():
+            flows.setdefault(flow.route, []).append(flow)
+        return [route_status(route, flows.get(route, [])) for route in self._routes]
+
+    def topics(self) -> list[TopicStatus]:
+        """What is bridged now, with its figures."""
         return [
-            RouteStatus(
-                route.settings,
-                route.direction,
-                tuple(
-                    flow.bridged
-                    for flow in flows
-                    if flow.counters is route.counters and flow.bridged is not None
-                ),
-                route.counters.messages,
-                route.counters.bytes,
-                route.counters.dropped,
-                route.counters.throttled,
-                route.counters.errors,
-                route.counters.last_error,
-            )
-            for route in self._routes
+            topic_status(flow.bridged, flow) for flow in self._flows() if flow.bridged is not None
         ]
 
-    def _receive(self, message: Message, retain: bool) -> None:
-        if retain:
-            return
+    @property
+    def node_name(self) -> str:
+        """The full name of the bridge's node."""
+        return self._node.name
+
+    def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         for receiver in self._receivers.get(message.topic, ()):
-            receiver.on_message(message.payload)
+            receiver.receive(message, retain, origin)
 
     def _drain(self) -> None:
         if self._deliver():
@@ -266,21 +293,32 @@ class Bridge:
         publish = self._broker.publish
         for lane, message in batch:
             counters = lane.counters
+            timed = lane.timed
+            if timed is not None and timed[0] is message:
+                lane.timed = None
+                counters.latency.observe((time_ns() - timed[1]) / 1e9)
             counters.messages += 1
             counters.bytes += len(message.payload)
             publish(message, session)
         self._broker.flush()
         return len(batch) == BATCH
 
-    def _announce(self, bridged: Sequence[Bridged]) -> None:
-        self._announced = bridged
-        if self._session is not None:
-            payload = orjson.dumps([*bridged, *self.calls.bridged()])
+    def _announce(self) -> None:
+        """Tell what is bridged, if that or a figure in it has changed."""
+        payload = orjson.dumps([*self.topics(), *self.calls.bridged()])
+        if self._session is not None and payload != self._announced:
+            self._announced = payload
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
             self._broker.flush()
 
-    def _announce_again(self) -> None:
-        self._announce(self._announced)
+    def _meter(self) -> None:
+        now = self._loop.time()
+        for flow in self._flows():
+            flow.meter.tick(now, flow.counters.messages, flow.counters.bytes)
+        self._metered += 1
+        if self._metered % METERS_TO_ANNOUNCE == 0:
+            self._announce()
+        self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
 
     def _stopped(self, reason: str) -> None:
         self.problem = reason
@@ -302,7 +340,9 @@ class Bridge:
             log.debug("the event loop is closed")
 
     def _flows(self) -> list[Flow]:
-        return [*self._to_mqtt.copy().values(), *self._to_ros.values()]
+        found = self._found.copy().values()
+        named = [flow for flow in self._to_ros.values() if not flow.is_matched]
+        return [*self._to_mqtt.copy().values(), *named, *found]
 
     # The ROS thread
 
@@ -310,15 +350,21 @@ class Bridge:
         """Follow what has come and gone on the graph."""
         if self._looks == 0:
             self._tell(logging.INFO, "on ROS as %s", self._node.name)
-        is_thorough = self._looks % THOROUGH_LOOK == 0
         self._looks += 1
         has_changed = self._follow_routes()
-        self._match_patterns()
+        has_changed |= self._match_patterns()
         for flow in self._flows():
+            is_thorough = (flow.turn + self._looks) % THOROUGH_LOOK == 0
             has_changed |= flow.look(self._node, is_thorough)
         self.calls.look()
+        ready = [flow for flow in self._found.values() if flow.bridged is not None]
+        if ready != self._ready:
+            self._ready = ready
+            self._post(self._receive_for_matched, ready)
+        if self._diagnostics is not None:
+            self._diagnostics.look(self._node, self._converters, self._tell)
         if has_changed:
-            self._post(self._announce, self._bridged())
+            self._post(self._announce)
 
     def _follow_routes(self) -> bool:
         """Begin and end flows as the routes have changed; True when what is bridged has changed."""
@@ -326,61 +372,82 @@ class Bridge:
         if routes is self._followed:
             return False
         self._followed = routes
+        self._topics = None
         has_changed = False
         while self._leaving:
             has_changed = True
             self._leaving.popleft().close()
-        kept = {id(route.counters) for route in routes}
-        for key, flow in list(self._to_mqtt.items()):
-            if id(flow.counters) not in kept or (flow.is_matched and flow.ros in self._named):
+        for flow in (*self._to_mqtt.values(), *self._found.values()):
+            is_taken = flow.is_matched and flow.ros in self._named[flow.direction]
+            if flow.route not in routes or is_taken:
                 has_changed = True
-                flow.close()
-                del self._to_mqtt[key]
-        there = {id(flow.counters) for flow in self._to_mqtt.values()}
+                self._end(flow)
+        there = {flow.route for flow in self._to_mqtt.values()}
         for route in routes:
-            is_named = route.direction == "to_mqtt" and route.pattern is None
-            if is_named and id(route.counters) not in there:
-                self._add_to_mqtt(route, route.settings.ros)
+            is_named = route.direction == "to_mqtt" and not route.is_pattern
+            if is_named and route not in there:
+                self._add_to_mqtt(route, route.settings.names[0])
         for key in self._to_ros:
             self._pair(key)
         return has_changed
 
-    def _match_patterns(self) -> None:
-        """Begin flows for topics that have come, end those of topics that have gone."""
-        patterns = [route for route in self._routes if route.pattern is not None]
+    def _match_patterns(self) -> bool:
+        """Begin flows for topics that have come, end those of topics that have gone; True when what
+        is bridged has changed."""
+        patterns = [route for route in self._routes if route.is_pattern]
         if not patterns:
-            return
-        names = self._node.topics()
-        for key, flow in list(self._to_mqtt.items()):
-            if flow.is_matched and flow.ros not in names:
-                flow.close()
-                del self._to_mqtt[key]
-        taken = self._named | {flow.ros for flow in self._to_mqtt.values()}
+            return False
+        topics = self._node.topics()
+        if topics == self._topics:
+            return False
+        self._topics = topics
+        has_changed = False
+        for flow in (*self._to_mqtt.values(), *self._found.values()):
+            if flow.is_matched and not flow.route.matches(flow.ros, topics.get(flow.ros, ())):
+                has_changed |= flow.bridged is not None
+                self._end(flow)
+        taken = {
+            "to_mqtt": self._named["to_mqtt"] | {flow.ros for flow in self._to_mqtt.values()},
+            "to_ros": self._named["to_ros"] | {flow.ros for flow in self._found.values()},
+        }
         for route in patterns:
-            assert route.pattern is not None
-            for ros in names:
-                if ros not in taken and route.pattern.fullmatch(ros):
-                    taken.add(ros)
-                    self._add_to_mqtt(route, ros)
+            mine = taken[route.direction]
+            for ros, types in topics.items():
+                if ros not in mine and route.matches(ros, types):
+                    mine.add(ros)
+                    add = self._add_to_mqtt if route.direction == "to_mqtt" else self._add_to_ros
+                    add(route, ros)
+        return has_changed
+
+    def _end(self, flow: Flow) -> None:
+        flow.close()
+        key = flow.ros, flow.mqtt
+        if flow.direction == "to_mqtt":
+            del self._to_mqtt[key]
+        else:
+            del self._found[key]
+        self._post(flow.route.past.add, flow.counters)
 
     def _failed(self, reason: str) -> None:
         for flow in self._flows():
             flow.lost()
         self.calls.lost()
+        if self._diagnostics is not None:
+            self._diagnostics.lost()
         self._post(self._stopped, reason)
-        self._post(self._announce, ())
-
-    def _bridged(self) -> list[Bridged]:
-        return [flow.bridged for flow in self._flows() if flow.bridged is not None]
+        self._post(self._announce)
 
 
 class _Link:
-    """The bridge as the link of its session: it takes everything at once."""
+    """The bridge as the link of its session: it takes everything at once, of one publisher."""
 
     writable = True
 
-    def __init__(self, receive: Callable[[Message, bool], None]) -> None:
+    def __init__(
+        self, receive: Callable[[Message, bool, Session | None], None], origin: Session | None
+    ) -> None:
         self._receive = receive
+        self._origin = origin
 
     def publish(
         self,
@@ -392,7 +459,7 @@ class _Link:
         subscription_ids: list[int] | None,
     ) -> None:
         """A message for ROS."""
-        self._receive(message, retain)
+        self._receive(message, retain, self._origin)
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         """It takes messages, not packets."""

@@ -6,21 +6,23 @@ endpoints that are there, and sets up or sets anew what carries the messages.
 
 from __future__ import annotations
 
+import itertools
 import logging
-import re
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message
+from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, encode_string
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
-from appliance.ros.mailbox import Counters, Lane, Mailbox
+from appliance.ros.figures import Counters, Meter
+from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import (
     BusError,
     Endpoint,
@@ -29,7 +31,9 @@ from appliance.ros.node import (
     RosPublisher,
     RosSubscription,
 )
+from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
+from appliance.ros.rules import CommandRules
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 Encoding: TypeAlias = Literal["json", "text", "cdr"]
@@ -43,18 +47,21 @@ REPORT_INTERVAL = 60.0
 ECHO_TIME = 2.0
 ECHO_SAMPLES = 1000
 
+_TURNS = itertools.count()
+
 
 @dataclass(frozen=True, slots=True)
 class RouteSettings:
-    """A route. `ros` may be a pattern when it only goes `to` MQTT: `*` is part of a name, `**` of a
-    path. `mqtt` is a topic; a `{ros}` in it stands for the ROS name.
+    """A route. `ros` is the name of a topic, or a pattern, or several of both: `*` is part of a
+    name, `**` of a path, and what begins with `!` is left out again. `mqtt` is a topic; a `{ros}`
+    in it stands for the ROS name.
 
-    None is: no limit (`rate`, in Hz), found from the graph (`type`), as the publishers' QoS says
-    (`qos`, `retain`). `keep` is how many messages of a topic wait for a busy broker: the latest,
-    or so many.
+    None is: no limit (`rate`, in Hz), found from the graph (`type`, which may have a `*` in it
+    too), as the publishers' QoS says (`qos`, `retain`). `keep` is how many messages of a topic wait
+    for a busy broker: the latest, or so many.
     """
 
-    ros: str
+    ros: str | tuple[str, ...]
     to: Literal["mqtt", "ros", "both"]
     mqtt: str
     type: str | None = None
@@ -63,28 +70,49 @@ class RouteSettings:
     qos: int | None = None
     retain: bool | None = None
     keep: int | Literal["latest"] = "latest"
+    #: What holds for what goes to ROS; None for no rules but the types.
+    rules: CommandRules | None = None
 
     @property
     def samples(self) -> int:
         """`keep` as a number."""
         return 1 if self.keep == "latest" else self.keep
 
-    def pattern(self) -> re.Pattern[str] | None:
-        """What the names of this route's topics match, None when `ros` is a name.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """`ros`, as many as there are."""
+        return (self.ros,) if isinstance(self.ros, str) else self.ros
 
-        Hidden names, with a token that begins with `_`, have to be spelt out in the pattern.
-        """
-        if "*" not in self.ros:
-            return None
-        parts = re.split(r"(\*\*|\*)", self.ros)
-        wild = {"**": ".*", "*": "[^/]*"}
-        visible = "" if "/_" in self.ros else r"(?!.*/_)"
-        return re.compile(visible + "".join(wild.get(part, re.escape(part)) for part in parts))
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the topics of this route are found on the graph."""
+        return not isinstance(self.ros, str) or "*" in self.ros or "*" in (self.type or "")
+
+
+class Route:
+    """A route in one direction."""
+
+    def __init__(self, settings: RouteSettings, direction: Direction) -> None:
+        self.settings = settings
+        self.direction: Direction = direction
+        self.is_pattern = settings.is_pattern
+        #: What those of its flows have counted that have ended.
+        self.past = Counters()
+        self._names = Names(settings.names)
+        self._types = compile_pattern(settings.type) if settings.type else None
+
+    def matches(self, ros: str, types: Iterable[str]) -> bool:
+        """Whether a topic that carries these types is one of this route's."""
+        return ros in self._names and any(map(self.fits, types))
+
+    def fits(self, type_name: str) -> bool:
+        """Whether it is what the route says of the type, if it says something."""
+        return self._types is None or self._types.fullmatch(type_name) is not None
 
 
 @dataclass(frozen=True, slots=True)
 class Bridged:
-    """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`."""
+    """What a flow carries now."""
 
     ros: str
     mqtt: str
@@ -140,19 +168,23 @@ class Flow(ABC):
 
     def __init__(
         self,
-        settings: RouteSettings,
+        route: Route,
         ros: str,
-        counters: Counters,
         converters: Converters,
         tell: Tell,
     ) -> None:
-        self.settings = settings
+        self.route = route
+        self.settings = settings = route.settings
         self.ros = ros
         self.mqtt = settings.mqtt.replace("{ros}", ros)
-        self.counters = counters
+        self.counters = Counters()
+        #: For the loop's thread.
+        self.meter = Meter()
         self.bridged: Bridged | None = None
-        #: Whether a pattern found the topic: it is then bridged while it has publishers.
-        self.is_matched = settings.ros != ros
+        #: A number of its own: of so many flows, not all take their time at the same look.
+        self.turn = next(_TURNS)
+        #: Whether a pattern found the topic: it is then bridged while it has other ends.
+        self.is_matched = route.is_pattern
         self._converters = converters
         self._tell = tell
         self._count: tuple[int, int] | None = None
@@ -160,6 +192,8 @@ class Flow(ABC):
         self._wanted: tuple[str, QosProfile, str | None] | None = None
         #: Why the last set-up failed.
         self._problem: str | None = None
+        #: Whether the next look must set up what this one could not.
+        self._is_due = False
         self._foreign: set[str] = set()
         self._report_at = 0.0
 
@@ -169,21 +203,26 @@ class Flow(ABC):
         The endpoints are asked for only when their number has changed, or the look is thorough.
         """
         count = node.count(self.ros)
-        if count == self._count and not thorough:
+        if count == self._count and not thorough and not self._is_due:
             return False
+        self._is_due = False
         self._count = count
         endpoints = self._find(node)
-        if self.is_matched and not endpoints:
+        found = {endpoint.type for endpoint in endpoints}
+        fitting = set(filter(self.route.fits, found))
+        if self.is_matched and not fitting:
             was_bridged = self.bridged is not None
             self.close()
             self._wanted = None
             return was_bridged
-        found = {endpoint.type for endpoint in endpoints}
-        type_name = self.settings.type
-        if type_name is None:
-            known = self._wanted[0] if self._wanted else None
-            type_name = known if known in found or not found else min(found)
-        if type_name is None:
+        known = self._wanted[0] if self._wanted else None
+        if not self.is_matched and self.settings.type is not None:
+            type_name = self.settings.type
+        elif fitting:
+            type_name = known if known in fitting else min(fitting)
+        elif known is not None:
+            type_name = known
+        else:
             return False
         self._tell_foreign(found - {type_name}, type_name)
         endpoints = [endpoint for endpoint in endpoints if endpoint.type == type_name]
@@ -191,11 +230,16 @@ class Flow(ABC):
             return False  # they have left; all stays as it is for their return
         hashes = [endpoint.type_hash for endpoint in endpoints if endpoint.type_hash]
         wanted = (type_name, self._choose_qos(endpoints), min(hashes, default=None))
-        if wanted == self._wanted:
+        before = self.bridged
+        if wanted == self._wanted and (before is not None or self._problem is None):
             return False
         self._wanted = wanted
-        before = self.bridged
-        self._set_up(node, *wanted)
+        if before is not None and before.type != type_name:
+            # The middleware knows one type a topic, until the executor has let go of the last end.
+            self.close()
+            self._wanted, self._is_due = None, True
+        else:
+            self._set_up(node, *wanted)
         return self.bridged != before
 
     def _set_up(
@@ -206,6 +250,7 @@ class Flow(ABC):
             detail = self._open(node, type_name, qos, type_hash)
         except (BusError, UnknownTypeError, ConversionError) as error:
             self.close()
+            self._is_due = isinstance(error, BusError)
             problem = self.counters.last_error = str(error)
             if problem != self._problem:
                 self._problem = problem
@@ -265,6 +310,11 @@ class Flow(ABC):
         """The bus is gone, and with it all that was set up."""
         self.bridged = self._count = self._wanted = None
 
+    @property
+    def commanding(self) -> str | None:
+        """The client that may command alone, None where there is none."""
+        return None
+
 
 class ToMqtt(Flow):
     """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
@@ -273,17 +323,17 @@ class ToMqtt(Flow):
 
     def __init__(
         self,
-        settings: RouteSettings,
+        route: Route,
         ros: str,
-        counters: Counters,
         converters: Converters,
         tell: Tell,
         mailbox: Mailbox,
     ) -> None:
-        super().__init__(settings, ros, counters, converters, tell)
+        super().__init__(route, ros, converters, tell)
+        settings = route.settings
         self.echo: Echo | None = None
         self._mailbox = mailbox
-        self._lane = Lane(settings.samples, counters)
+        self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
         self._due = 0.0
         self._subscription: RosSubscription | None = None
@@ -321,7 +371,9 @@ class ToMqtt(Flow):
             Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
             Property.USER_PROPERTY: about,
         }
-        self._subscription = node.subscribe_raw(self.ros, type_name, qos, self.on_message)
+        self._subscription = node.subscribe_raw(
+            self.ros, type_name, qos, self.on_message, timed=True
+        )
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
     def close(self) -> None:
@@ -334,8 +386,11 @@ class ToMqtt(Flow):
         super().lost()
         self._subscription = None
 
-    def on_message(self, cdr: bytes) -> None:
-        """A message from ROS. Nothing may be logged by ROS here: it would feed /rosout."""
+    def on_message(self, cdr: bytes, published_at: int = 0) -> None:
+        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch.
+
+        Nothing may be logged by ROS here: it would feed /rosout.
+        """
         if self.echo is not None and self.echo.is_own(cdr):
             return
         if self._interval and not self._admit(monotonic()):
@@ -347,18 +402,18 @@ class ToMqtt(Flow):
             except ConversionError as error:
                 self.fail(f"cannot be converted: {error}")
                 return
-        self._mailbox.put(
-            self._lane,
-            Message(
-                self.mqtt,
-                payload,
-                self._qos,
-                self._retain,
-                self._properties,
-                None,
-                self._topic_wire,
-            ),
+        message = Message(
+            self.mqtt,
+            payload,
+            self._qos,
+            self._retain,
+            self._properties,
+            None,
+            self._topic_wire,
         )
+        if published_at:
+            self._lane.timed = message, published_at
+        self._mailbox.put(self._lane, message)
 
     def _admit(self, now: float) -> bool:
         """Whether a message at that time keeps to the rate, as an average over uneven ones."""
@@ -371,19 +426,18 @@ class ToMqtt(Flow):
 
 
 class ToRos(Flow):
-    """From MQTT to ROS: a publisher. `on_message` and `fail` are for the loop's thread."""
+    """From MQTT to ROS: a publisher. `receive` and `fail` are for the loop's thread."""
 
     direction = "to_ros"
 
     def __init__(
         self,
-        settings: RouteSettings,
+        route: Route,
         ros: str,
-        counters: Counters,
         converters: Converters,
         tell: Tell,
     ) -> None:
-        super().__init__(settings, ros, counters, converters, tell)
+        super().__init__(route, ros, converters, tell)
         self.echo: Echo | None = None
         #: Replaced as one, because the loop's thread reads it.
         self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
@@ -393,7 +447,9 @@ class ToRos(Flow):
 
     def _find(self, node: RosNode) -> list[Endpoint]:
         found = node.subscribers(self.ros)
-        if not found and self.settings.type is None and self.settings.to == "both":
+        if found or self.is_matched:
+            return found
+        if self.settings.type is None and self.settings.to == "both":
             return node.publishers(self.ros)  # whoever is there knows the type
         return found
 
@@ -428,13 +484,31 @@ class ToRos(Flow):
         super().lost()
         self._out = None
 
-    def on_message(self, payload: bytes) -> None:
-        """A message from MQTT."""
+    @property
+    def takes_retained(self) -> bool:
+        """Whether retained messages from before the route are wanted."""
+        rules = self.settings.rules
+        return rules is not None and rules.take_retained
+
+    def enter(self) -> None:
+        """Messages are going to be received from now on."""
+
+    def leave(self) -> None:
+        """None will be received any more."""
+
+    def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+        """A message from MQTT, of that session; `retain` when it is from before the route.
+
+        It may then be an old command, and does not reach ROS.
+        """
+        if retain:
+            return
         out = self._out
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
             return
         convert, publisher = out
+        payload = message.payload
         try:
             cdr = convert(payload)
             if self.echo is not None:

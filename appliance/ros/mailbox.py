@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from appliance.broker.message import Message
+from appliance.ros.figures import Counters
 
 #: The most that waits in all: a loop that was busy for a second with 10 kHz on the bus.
 MAX_MESSAGES = 10_000
@@ -15,23 +16,15 @@ MAX_BYTES = 64 * 1024 * 1024
 
 
 @dataclass(eq=False, slots=True)
-class Counters:
-    """What a route counts in one direction, all from its start; `bytes` are payload on MQTT."""
-
-    messages: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    throttled: int = 0
-    errors: int = 0
-    last_error: str | None = None
-
-
-@dataclass(eq=False, slots=True)
 class Lane:
-    """The messages of one topic that wait; of more than `keep` the oldest is dropped."""
+    """The messages of one topic that wait; of more than `keep` the oldest is dropped.
+
+    `timed` is one of which it is known when it was published, in nanoseconds since the epoch.
+    """
 
     keep: int
     counters: Counters
+    timed: tuple[Message, int] | None = None
     waiting: deque[Message] = field(default_factory=deque)
 
 

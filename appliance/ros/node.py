@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -134,6 +135,10 @@ class RosNode(Protocol):
     def call_soon(self, callback: Callable[[], None]) -> None:
         """Call it on the ROS thread. Raises BusError when there is none."""
 
+    def now(self) -> int:
+        """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
+        the node is told so, and the computer's before there is any."""
+
     def topics(self) -> dict[str, list[str]]:
         """The types of each topic that has an endpoint, this node's own included."""
 
@@ -156,9 +161,19 @@ class RosNode(Protocol):
         """The message class of `std_msgs/msg/String`. Raises UnknownTypeError."""
 
     def subscribe_raw(
-        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        *,
+        timed: bool = False,
     ) -> RosSubscription:
-        """Call `callback` with each message, as CDR. Raises BusError, UnknownTypeError."""
+        """Call `callback` with each message, as CDR; when it is `timed`, with a few also with the
+        time at which they were published, in nanoseconds since the epoch.
+
+        Raises BusError, UnknownTypeError.
+        """
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
@@ -210,7 +225,7 @@ class FakeSubscription:
     bus: FakeNode
     topic: str
     endpoint: Endpoint
-    callback: Callable[[bytes], None]
+    callback: Callable[..., None]
 
     def destroy(self) -> None:
         self.bus.subscriptions.remove(self)
@@ -405,6 +420,9 @@ class FakeNode:
             found.setdefault(service.name, set()).add(service.type)
         return {name: sorted(types) for name, types in found.items()}
 
+    def now(self) -> int:
+        return time.time_ns()
+
     def topics(self) -> dict[str, list[str]]:
         found: dict[str, set[str]] = {}
         for topic, endpoint in (*self._all_publishers(), *self._all_subscribers()):
@@ -442,7 +460,13 @@ class FakeNode:
         return self.types[type_name]
 
     def subscribe_raw(
-        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        *,
+        timed: bool = False,
     ) -> FakeSubscription:
         self.load(type_name)
         own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, MutableMapping
+import time
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,6 +29,10 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
+
+#: How many messages of a subscription are timed first, and of how many one is then.
+FIRST_TIMED = 100
+ONE_TIMED_OF = 16
 
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -87,9 +93,15 @@ class Ros2Node:
     """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
 
     def __init__(
-        self, name: str = "appliance", namespace: str = "/", domain_id: int | None = None
+        self,
+        name: str = "appliance",
+        namespace: str = "/",
+        domain_id: int | None = None,
+        arguments: Sequence[str] = (),
+        use_sim_time: bool = False,
     ) -> None:
-        """`domain_id` None takes ROS_DOMAIN_ID, as every ROS node does.
+        """`domain_id` None takes ROS_DOMAIN_ID, as every ROS node does. `arguments` are those that
+        stand behind `--ros-args` on a command line; they go before name and namespace.
 
         Other nodes are told from this one by their full name, which ROS wants to be unique.
         """
@@ -97,12 +109,16 @@ class Ros2Node:
         self._base_name = name
         self._namespace = namespace
         self._domain_id = domain_id
+        self._arguments = list(arguments)
+        self._use_sim_time = use_sim_time
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._rclpy: Any = None
         self._context: Any = None
         self._node: Any = None
         self._executor: Any = None
+        self._is_event_driven = False
+        self._clock: Any = None
 
     def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
         is_available, reason = available()
@@ -138,12 +154,13 @@ class Ros2Node:
         import rclpy
         from rclpy.context import Context
         from rclpy.node import Node
+        from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
         self._rclpy = rclpy
         self._context = Context()
         rclpy.init(
-            args=[],
+            args=["--ros-args", *self._arguments] if self._arguments else [],
             context=self._context,
             domain_id=self._domain_id,
             signal_handler_options=SignalHandlerOptions.NO,
@@ -155,8 +172,13 @@ class Ros2Node:
             # What this node logs would be a message on a topic that may itself be bridged.
             enable_rosout=False,
             start_parameter_services=False,
+            parameter_overrides=[Parameter("use_sim_time", value=True)]
+            if self._use_sim_time
+            else [],
         )
-        self._executor = _new_executor(self._context)
+        self.name = self._node.get_fully_qualified_name()
+        self._clock = self._node.get_clock()
+        self._executor, self._is_event_driven = _new_executor(self._context)
         self._executor.add_node(self._node)
 
     def _spin(self, poll: Callable[[], None]) -> None:
@@ -181,7 +203,7 @@ class Ros2Node:
             self._node.destroy_node()
         if self._context is not None:
             self._rclpy.try_shutdown(context=self._context)
-        self._executor = self._node = self._context = None
+        self._executor = self._node = self._context = self._clock = None
 
     def call_soon(self, callback: Callable[[], None]) -> None:
         executor = self._executor
@@ -190,6 +212,10 @@ class Ros2Node:
         executor.create_task(callback)
 
     # The graph
+
+    def now(self) -> int:
+        clock = self._clock
+        return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
 
     def topics(self) -> dict[str, list[str]]:
         return dict(self._node.get_topic_names_and_types())
@@ -205,6 +231,8 @@ class Ros2Node:
         return found
 
     def count(self, topic: str) -> tuple[int, int]:
+        if self._arguments:
+            topic = self._node.resolve_topic_name(topic)
         handle = self._node.handle  # the node's own methods would expand and check the name again
         with handle:
             return handle.get_count_publishers(topic), handle.get_count_subscribers(topic)
@@ -225,14 +253,25 @@ class Ros2Node:
     # Subscriptions and publishers
 
     def subscribe_raw(
-        self, topic: str, type_name: str, qos: QosProfile, callback: Callable[[bytes], None]
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        *,
+        timed: bool = False,
     ) -> _Subscription:
         message_class = import_message(type_name)
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
+        if timed and not self._is_event_driven:
+            callback = _with_time(callback)
         with _as_bus_error():
             own = self._node.create_subscription(
                 message_class, topic, callback, _to_rclpy(qos), raw=True, event_callbacks=events
             )
+        if timed and self._is_event_driven:
+            own.__class__ = _timed_subscription()
+            own.since = time.time_ns()
         return _Subscription(self._node, own)
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
@@ -388,15 +427,73 @@ def _as_bus_error() -> Iterator[None]:
         raise BusError(str(error)) from error
 
 
-def _new_executor(context: Any) -> Any:
-    """EventsExecutor costs an eighth of the others, and exists from ROS 2 Jazzy on."""
+def _new_executor(context: Any) -> tuple[Any, bool]:
+    """The best that there is, and whether that is EventsExecutor: it costs an eighth of the others,
+    and exists from ROS 2 Jazzy on."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor
 
-        return SingleThreadedExecutor(context=context)
-    return EventsExecutor(context=context)
+        return SingleThreadedExecutor(context=context), False
+    return EventsExecutor(context=context), True
+
+
+def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
+    """What calls the callback with some messages' time; rclpy tells it of all that it is given."""
+    since = time.time_ns()
+    until_timed = ONE_TIMED_OF
+
+    def timed(cdr: bytes, info: Any) -> None:
+        nonlocal until_timed
+        until_timed -= 1
+        if until_timed:
+            callback(cdr)
+            return
+        until_timed = ONE_TIMED_OF
+        callback(cdr, _published_at(info, since))
+
+    return timed
+
+
+def _published_at(info: Any, since: int) -> int:
+    """0 for what was published before `since`, and kept for late subscribers."""
+    published_at = int(info["source_timestamp"])
+    return published_at if published_at > since else 0
+
+
+@functools.cache
+def _timed_subscription() -> Any:
+    """The class of a subscription that tells its callback when some of its messages were published,
+    those `since` a time.
+
+    With EventsExecutor, in Kilted, the callback cannot ask for that: what the middleware tells of a
+    message ends the executor. But it looks up the callback just before it takes a message, and one
+    that is taken here instead comes with its time.
+    """
+    from rclpy.subscription import Subscription
+
+    class TimedSubscription(Subscription):  # type: ignore[type-arg]  # not in all is it generic
+        _callback: Any
+        _until_timed = 1
+        _timed = 0
+        since = 0
+
+        @property  # type: ignore[misc]  # it is set before a subscription becomes one of these
+        def callback(self) -> Any:
+            self._until_timed -= 1
+            if not self._until_timed:
+                self._take_one()
+            return self._callback
+
+        def _take_one(self) -> None:
+            self._timed += 1
+            self._until_timed = 1 if self._timed < FIRST_TIMED else ONE_TIMED_OF
+            taken = self.handle.take_message(self.msg_type, True)
+            if taken is not None:
+                self._callback(taken[0], _published_at(taken[1], self.since))
+
+    return TimedSubscription
 
 
 def _event_callbacks() -> Any:

@@ -163,6 +163,9 @@ class FakeWire:
     def exchange(self, method: str) -> Exchange | None:
         return self.exchanges.pop(method, None)
 
+    def now(self) -> float:
+        return 0.0
+
     def accepted(self) -> None:
         assert not self.closed
 

@@ -2,7 +2,7 @@
 
 A line is a JSON list: a method of Peer and its arguments. A line on stdout is a JSON list too:
 `["ok"]` for each command, and `["received", topic, hex]` for each message, of which the bytes are
-given as they are up to 1000, else as their number.
+given as they are up to 10000, else as their number.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Peer:
 
     def subscribe(self, topic, type_name, reliability="reliable", durability="volatile"):
         def received(cdr):
-            say("received", topic, cdr.hex() if len(cdr) <= 1000 else len(cdr))
+            say("received", topic, cdr.hex() if len(cdr) <= 10_000 else len(cdr))
 
         qos = profile(reliability, durability)
         self.node.create_subscription(load(type_name), topic, received, qos, raw=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 
 from appliance.broker.message import Message
-from appliance.ros.mailbox import Counters, Lane, Mailbox
+from appliance.ros.figures import Counters
+from appliance.ros.mailbox import Lane, Mailbox
 
 
 def payloads(taken):

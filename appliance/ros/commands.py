@@ -1,0 +1,355 @@
+"""From MQTT to ROS for what moves a robot: old commands expire, one client commands at a time, and
+who falls silent or leaves is followed by a stop message.
+
+All of it happens on the loop's thread, but for the look at the graph and what that sets up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import orjson
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Decision
+from appliance.broker.session import Session
+from appliance.mqtt.reason import ReasonCode
+from appliance.ros.convert import ConversionError, Converter, Converters
+from appliance.ros.flows import REPORT_INTERVAL, Route, Tell, ToRos
+from appliance.ros.node import BusError, QosProfile, RosNode
+from appliance.ros.rules import CommandRules, FieldLimits
+
+#: Seconds until a stop message that ROS would not take is published again.
+RETRY = 0.05
+
+#: Looks at the graph from the first that finds a subscription until the stop message of the start:
+#: the two ends have found each other by then.
+LOOKS_TO_MATCH = 2
+
+_FREE = Decision(True, "nobody commands it")
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What commands need beside a flow: the loop, a way to it from any thread, and the broker."""
+
+    loop: asyncio.AbstractEventLoop
+    post: Callable[..., None]
+    broker: Broker
+
+
+class _Stop:
+    """The stop message of a route, for one type."""
+
+    def __init__(self, converter: Converter, payload: str) -> None:
+        """Raises ConversionError when the type has no such message."""
+        self._converter = converter
+        self._value = orjson.loads(payload)
+        self.example = self.cdr()
+
+    def cdr(self) -> bytes:
+        """The message, made anew: it may say "now"."""
+        return self._converter.from_dict(self._value)
+
+    def is_like(self, cdr: bytes) -> bool:
+        """Whether a message says the same, at another time or in another frame."""
+        one, other = (self._converter.to_dict(message) for message in (cdr, self.example))
+        return all(one[name] == other[name] for name in one if name != "header")
+
+
+class Commands(ToRos):
+    """A flow to ROS with rules."""
+
+    def __init__(
+        self,
+        route: Route,
+        ros: str,
+        converters: Converters,
+        tell: Tell,
+        around: Surroundings,
+    ) -> None:
+        super().__init__(route, ros, converters, tell)
+        assert route.settings.rules is not None
+        self.rules: CommandRules = route.settings.rules
+        self._around = around
+        #: Both replaced as one by the ROS thread.
+        self._limits: FieldLimits | None = None
+        self._stop: _Stop | None = None
+        #: Looks that have found a subscription.
+        self._looks = 0
+        #: Who may command alone, None while nobody does.
+        self._holder: Session | None = None
+        #: Who sent the last command, and when.
+        self._source: Session | None = None
+        self._heard_at = -math.inf
+        #: Whether something else than the stop message was published last.
+        self._is_driven = False
+        self._last = b""
+        self._has_stopped = False
+        #: Who has sent old commands, and until when its others are taken for such.
+        self._behind: tuple[Session | None, float] | None = None
+        #: Whether a stop message is overdue, which ROS would not take.
+        self._must_stop = False
+        #: A retained message from before there was anybody on ROS to have it.
+        self._waiting: Message | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_left = True
+        self._told: dict[str, float] = {}
+
+    # The ROS thread
+
+    def look(self, node: RosNode, thorough: bool) -> bool:
+        has_changed = super().look(node, thorough)
+        if self._looks < LOOKS_TO_MATCH and self._out is not None and node.count(self.ros)[1]:
+            self._looks += 1
+            if self._looks == LOOKS_TO_MATCH:
+                self._around.post(self._begin)
+        return has_changed
+
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        rules = self.rules
+        converter = self._converters.get(type_name)
+        limits = FieldLimits(rules, converter) if rules.clamp or rules.allow else None
+        stop = None
+        if rules.on_silence is not None:
+            try:
+                stop = _Stop(converter, rules.on_silence.publish)
+            except ConversionError as error:
+                raise ConversionError("on_silence.publish", str(error)) from None
+        self._limits, self._stop = limits, stop
+        return super()._open(node, type_name, qos, type_hash)
+
+    # The loop's thread
+
+    def enter(self) -> None:
+        broker = self._around.broker
+        self._is_left = False
+        broker.departures.append(self._departed)
+        if self.rules.exclusive:
+            broker.guards.setdefault(self.mqtt, []).append(self)
+            broker.guards_changed()
+
+    def leave(self) -> None:
+        if self._is_left:
+            return
+        self._is_left = True
+        if self._is_driven:
+            self._publish_stop("the route ends")
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        broker = self._around.broker
+        broker.departures.remove(self._departed)
+        if self.rules.exclusive:
+            guards = broker.guards[self.mqtt]
+            guards.remove(self)
+            if not guards:
+                del broker.guards[self.mqtt]
+            broker.guards_changed()
+        self._holder = self._source = None
+
+    def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+        if self._is_left or not self._is_in_time(message, retain, origin):
+            return
+        out = self._out
+        if retain and (out is None or self._looks < LOOKS_TO_MATCH):
+            self._waiting = message
+            return
+        if out is None:
+            self.fail(f"was refused: {self._why_not()}")
+            return
+        convert, publisher = out
+        try:
+            cdr = self._limited(convert(message.payload), origin)
+            if self.echo is not None:
+                self.echo.sent(cdr)
+            publisher.publish(cdr)
+        except ConversionError as error:
+            self.fail(f"cannot be converted: {error}")
+        except BusError as error:
+            self.fail(f"could not be published: {error}")
+        else:
+            self.counters.messages += 1
+            self.counters.bytes += len(message.payload)
+            self._commanded(cdr, origin)
+
+    def _is_in_time(self, message: Message, retain: bool, origin: Session | None) -> bool:
+        rules = self.rules
+        if retain and not rules.take_retained:
+            return False
+        expires_at = message.expires_at
+        if expires_at is not None and expires_at <= self._around.broker.now:
+            return self._count_expired("its message expiry is over", origin)
+        # Without a Message Expiry Interval nobody knows how old a retained message is. A will was
+        # handed over when its client connected.
+        is_will = origin is not None and origin.link is None
+        is_old = message.age > rules.oldest or (rules.oldest < math.inf and is_will)
+        if is_old and not is_will:
+            # What its client queued while it had no connection comes behind what it sends again,
+            # and looks like new.
+            self._behind = origin, self._around.loop.time() + rules.oldest
+        elif self._behind is not None:
+            late, until = self._behind
+            if self._around.loop.time() >= until:
+                self._behind = None
+            is_old |= origin is late and self._behind is not None
+        if is_old or (retain and rules.expire is not None and expires_at is None):
+            return self._count_expired("it was sent some time before", origin)
+        return True
+
+    def _count_expired(self, why: str, origin: Session | None) -> bool:
+        self.counters.expired += 1
+        self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
+        return False
+
+    def _limited(self, cdr: bytes, origin: Session | None) -> bytes:
+        if self._limits is None:
+            return cdr
+        try:
+            limited, has_changed = self._limits.apply(cdr)
+        except ConversionError as error:
+            self.counters.refused += 1
+            raise ConversionError("", f"it is against the route's rules: {error}") from None
+        if has_changed:
+            self.counters.clamped += 1
+            self._mention("clamped", "%s: numbers in a command of %s were clamped", origin)
+        return limited
+
+    def _commanded(self, cdr: bytes, origin: Session | None) -> None:
+        now = self._around.loop.time()
+        self._heard_at = now
+        self._source = origin
+        self._last = cdr
+        self._is_driven = self._stop is not None and cdr != self._stop.example
+        self._has_stopped = True  # the stop message of the start would come late
+        self._must_stop = False
+        self._waiting = None
+        if self.rules.exclusive and self._holder is None and origin is not None and origin.link:
+            self._holder = origin
+            self._around.broker.guards_changed()
+            self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)
+        if self._timer is None and (self._is_driven or self._holder is not None):
+            self._arm()
+
+    # Leases
+
+    @property
+    def commanding(self) -> str | None:
+        holder = self._holder
+        return None if holder is None else holder.client_id
+
+    def decide(self, session: Session) -> Decision:
+        """Whether the session may publish a command now: a Guard of the broker's."""
+        holder = self._holder
+        # What the bridge itself publishes there is what it heard on ROS.
+        if holder is None or session is holder or session.link_for is not None:
+            return _FREE
+        return Decision(False, f"{holder} commands {self.ros}, and the route is exclusive")
+
+    def refused(self, session: Session) -> None:
+        """A message of the session was refused, by this guard or another."""
+        if not self.decide(session):
+            self.counters.refused += 1
+
+    def _release(self, why: str) -> None:
+        holder, self._holder = self._holder, None
+        self._around.broker.guards_changed()
+        self._tell(logging.INFO, "%s: %s %s and commands no more", self, holder, why)
+
+    # Silence
+
+    def _departed(self, session: Session) -> None:
+        if session is self._holder:
+            self._release("has left")
+        if session is self._source:
+            self._source = None
+            if self._is_driven:
+                self._publish_stop(f"{session} has left")
+
+    def _arm(self) -> None:
+        due = math.inf
+        if self._is_driven and self.rules.on_silence is not None:
+            due = self.rules.on_silence.after
+        if self._holder is not None:
+            due = min(due, self.rules.lease)
+        if due < math.inf:
+            loop = self._around.loop
+            self._timer = loop.call_at(max(self._heard_at + due, loop.time()), self._check)
+
+    def _check(self) -> None:
+        self._timer = None
+        silence = self._around.loop.time() - self._heard_at
+        on_silence = self.rules.on_silence
+        is_over = self._holder is not None and silence >= self.rules.lease
+        if is_over:
+            self._release(f"was silent for {self.rules.lease:g} s")
+        if self._is_driven and on_silence is not None:
+            if self._must_stop:
+                self._publish_stop("at last")
+            elif is_over or silence >= on_silence.after:
+                self._fell_silent(min(silence, on_silence.after), on_silence.disconnect)
+        if self._timer is None:
+            self._arm()
+
+    def _fell_silent(self, after: float, disconnects: bool) -> None:
+        source = self._source
+        why = f"{source or 'a retained command'} fell silent for {after:g} s"
+        has_stopped_itself = self._stop is not None and self._stop.is_like(self._last)
+        self._publish_stop(why)
+        if source is None or has_stopped_itself or not disconnects:
+            return
+        # The network may have it, and a heap of its commands on their way: they are old when they
+        # come, and nothing in them says so. On a new connection there are none of them.
+        source.close_link(
+            ReasonCode.ADMINISTRATIVE_ACTION,
+            f"it drove {self.ros} and fell silent (on_silence.disconnect)",
+        )
+        self._around.broker.flush()
+
+    def _begin(self) -> None:
+        """There is somebody on ROS to have a message."""
+        if self._is_left:
+            return
+        if not self._has_stopped:
+            self._publish_stop("the route begins")
+        message, self._waiting = self._waiting, None
+        if message is not None:
+            self.receive(message, True, None)
+
+    def _publish_stop(self, why: str) -> None:
+        """Publish the stop message now, or as soon as ROS takes it."""
+        out, stop = self._out, self._stop
+        if out is None or stop is None:
+            self._is_driven = False
+            return
+        cdr = stop.cdr()
+        try:
+            if self.echo is not None:
+                self.echo.sent(cdr)
+            out[1].publish(cdr)
+        except BusError as error:
+            self.fail(f"that stops could not be published: {error}")
+            if not self._is_left:
+                self._is_driven = self._must_stop = True
+                if self._timer is not None:
+                    self._timer.cancel()
+                self._timer = self._around.loop.call_later(RETRY, self._check)
+            return
+        self._is_driven = self._must_stop = False
+        self._has_stopped = True
+        self.counters.stops += 1
+        self._mention("stopped", "%s: the stop message was published: %s", why)
+
+    # The log
+
+    def _mention(self, what: str, text: str, *args: object) -> None:
+        """Log what may happen with every message once a minute."""
+        now = self._around.loop.time()
+        if now >= self._told.get(what, -math.inf):
+            self._told[what] = now + REPORT_INTERVAL
+            self._tell(logging.WARNING, text, self, *args)

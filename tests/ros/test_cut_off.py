@@ -1,0 +1,204 @@
+"""Clients are cut off while they drive: a real appliance, ROS and TLS, in a process each."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from appliance.environment import for_other_programs
+
+pytest.importorskip("rclpy")
+from appliance_process import ROBOT, ApplianceProcess
+from test_ros2 import TWIST, Peer, domain, until
+
+__all__ = ["domain"]  # a fixture for all tests here
+
+AFTER = 0.3
+
+#: What the stop message may take beyond it, and what a busy computer may add to that.
+TOLERANCE = 0.05
+PATIENCE = float(os.environ.get("CUT_OFF_PATIENCE", "0.25"))
+
+
+class Times(list):
+    """A list that knows when each item came."""
+
+    def __init__(self):
+        super().__init__()
+        self.at = []
+
+    def append(self, item):
+        self.at.append(time.monotonic())
+        super().append(item)
+
+
+def number(received):
+    """The command's number; 0 for the stop message."""
+    return struct.unpack_from("<d", bytes.fromhex(received[1]), 4)[0]
+
+
+class Robot:
+    """The appliance, and a node on ROS that subscribes to /cmd_vel."""
+
+    def __init__(self, directory):
+        self.appliance = ApplianceProcess(directory, acl=f"user alice\ntopic {ROBOT}/#\n")
+        config = self.appliance.config
+        settings = yaml.safe_load(config.read_text())
+        route = {
+            "ros": "/cmd_vel",
+            "to": "ros",
+            "type": TWIST,
+            "exclusive": True,
+            "expire": "500 ms",
+            "on_silence": {"after": f"{AFTER * 1000:.0f} ms"},
+        }
+        settings["bridge"] = {"topics": [route]}
+        config.write_text(yaml.safe_dump(settings))
+        self.peer = Peer()
+        self.peer.received = Times()
+
+    async def start(self):
+        self.appliance.start()
+        await self.peer.start("robot")
+        await self.peer.do("subscribe", "/cmd_vel", TWIST)
+        await until(lambda: self.numbers() == [0], "the stop message of the start")
+
+    async def stop(self):
+        await self.peer.stop()
+        self.appliance.stop()
+
+    def numbers(self):
+        return [number(received) for received in self.peer.received]
+
+    async def stopped_after(self, moment):
+        """Seconds from the last command, or that moment if it is later, to the stop message."""
+        await until(lambda: self.numbers()[-1] == 0, "the stop message")
+        at = self.peer.received.at
+        await asyncio.sleep(0.2)
+        assert self.numbers()[-1] == 0
+        last = max(i for i, value in enumerate(self.numbers()) if value)
+        return at[last + 1] - max(at[last], moment)
+
+
+@pytest.fixture
+async def robot(tmp_path):
+    robot = Robot(tmp_path)
+    try:
+        await robot.start()
+        yield robot
+    finally:
+        await robot.stop()
+
+
+class Driver:
+    """driver.py, and the numbers of its first command on each connection."""
+
+    def __init__(self, robot, port, version, qos):
+        appliance = robot.appliance
+        password = appliance.passwords["alice"]
+        self.arguments = [str(port), str(appliance.ca), "alice", password, version, qos]
+        self.connections = []
+
+    async def start(self):
+        self.process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            str(Path(__file__).parent / "driver.py"),
+            *self.arguments,
+            stdout=asyncio.subprocess.PIPE,
+            env=for_other_programs(),
+        )
+        self.reader = asyncio.create_task(self._read())
+
+    async def _read(self):
+        async for line in self.process.stdout:
+            self.connections.append(int(line))
+
+    async def kill(self):
+        if self.process.returncode is None:
+            self.process.kill()
+        await self.process.wait()
+        await self.reader
+
+
+class Network:
+    """What is between the client and the appliance: while `holding`, nothing gets through."""
+
+    def __init__(self, port):
+        self.port = port
+        self.flowing = asyncio.Event()
+        self.flowing.set()
+        self.tasks = set()
+
+    async def __aenter__(self):
+        self.server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        return self
+
+    async def __aexit__(self, *_):
+        self.server.close()
+        for task in self.tasks:
+            task.cancel()
+        await asyncio.gather(*self.tasks, return_exceptions=True)
+
+    @property
+    def near(self):
+        return self.server.sockets[0].getsockname()[1]
+
+    async def _serve(self, reader, writer):
+        self.tasks.add(asyncio.current_task())
+        try:
+            far = await asyncio.open_connection("127.0.0.1", self.port)
+            there = asyncio.create_task(self._copy(reader, far[1]))
+            back = asyncio.create_task(self._copy(far[0], writer))
+            self.tasks |= {there, back}
+            await asyncio.wait([there, back], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            far[1].transport.abort()
+            writer.transport.abort()
+
+    async def _copy(self, reader, writer):
+        while data := await reader.read(65536):
+            await self.flowing.wait()
+            writer.write(data)
+            await writer.drain()
+
+
+@pytest.mark.parametrize(("version", "qos"), [("5", "0"), ("3.1.1", "1")])
+async def test_a_client_whose_network_is_gone_for_a_while_and_that_is_killed_then(
+    robot, version, qos
+):
+    async with Network(robot.appliance.port) as network:
+        driver = Driver(robot, network.near, version, qos)
+        await driver.start()
+        try:
+            await until(lambda: len(robot.numbers()) > 10, "commands")
+            network.flowing.clear()
+            cut = time.monotonic()
+            last = max(robot.numbers())
+            took = await robot.stopped_after(cut - 1)
+            print(f"{version}: the stop message came {took * 1000:.0f} ms after the last command")
+            assert AFTER - 0.1 < took < AFTER + TOLERANCE + PATIENCE
+            await asyncio.sleep(1)
+            network.flowing.set()
+            await until(lambda: len(driver.connections) > 1, "the second connection")
+            fresh = driver.connections[1]
+            await until(
+                lambda: robot.numbers()[-1] >= fresh + 5, "commands of the second connection"
+            )
+        finally:
+            killed = time.monotonic()
+            await driver.kill()
+        moved = [n for n in robot.numbers() if n]
+        old = [n for n in moved if last + 2 < n < fresh]
+        assert fresh > last + 20, "the driver has sent nothing while it was cut off"
+        assert old == [], "these were sent while the network was gone"
+        assert moved == sorted(set(moved))
+        took = await robot.stopped_after(killed)
+        print(f"{version}: the stop message came {took * 1000:.0f} ms after the kill")
+        assert took < AFTER + TOLERANCE + PATIENCE

@@ -1,0 +1,191 @@
+"""The bridge as a citizen of ROS: its node, arguments, time, diagnostics; on real ROS 2."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from appliance.environment import for_other_programs
+from appliance.ros import ros2
+from appliance.ros.bridge import Bridge
+
+pytest.importorskip("rclpy")
+from appliance_process import ROBOT, ApplianceProcess
+from test_ros2 import STRING, House, Peer, domain, route, until
+
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import load_description
+from appliance.ros.diagnostics import TYPE
+
+__all__ = ["domain"]  # a fixture for all tests here
+
+CLOCK, STAMP = "rosgraph_msgs/msg/Clock", "builtin_interfaces/msg/Time"
+
+
+@pytest.fixture
+async def peer():
+    peer = await Peer().start()
+    yield peer
+    await peer.stop()
+
+
+@pytest.fixture
+async def start():
+    houses = []
+
+    def start(*routes, diagnostics=0.0, **node):
+        house = House()
+        house.node = ros2.Ros2Node(**node)
+        loop = asyncio.get_running_loop()
+        house.bridge = Bridge(
+            house.node, house.broker, routes, loop, "r2d2", diagnostics=diagnostics
+        )
+        house.bridge.start()
+        houses.append(house)
+        return house
+
+    yield start
+    for house in houses:
+        await house.bridge.stop()
+
+
+async def test_messages_come_in_order_and_some_are_timed(start, peer):
+    house = start(route("/a", "mqtt", "text", keep=10_000))
+    await peer.do("advertise", "/a", STRING)
+    await until(house.bridged, "/a")
+    await peer.do("matched", "/a")
+    total = 400
+    for number in range(total // 40):
+        burst = [f"{number * 40 + i:08d}" for i in range(40)]
+        for text in burst:
+            await peer.do("publish", "/a", (b"\0\1\0\0\x09\0\0\0" + text.encode() + b"\0").hex())
+    await until(lambda: len(house.payloads("r2d2/a")) == total, "all messages")
+    assert [int(payload) for payload in house.payloads("r2d2/a")] == list(range(total))
+    latency = house.bridge.status()[0].latency_ms
+    assert 0 < latency.p50 <= latency.p99 < 1000
+    (topic,) = house.bridge.topics()
+    assert topic.size == 8
+
+
+async def test_what_was_latched_before_is_not_timed(start, peer):
+    await peer.do("advertise", "/map", STRING, "reliable", "transient_local")
+    await peer.do("publish", "/map", (b"\0\1\0\0\x04\0\0\0old\0").hex())
+    await asyncio.sleep(0.2)
+    house = start(route("/map", "mqtt", "text"))
+    await until(lambda: house.payloads("r2d2/map"), "the map")
+    assert house.bridge.status()[0].latency_ms is None
+
+
+async def test_arguments_name_the_node_and_remap_topics(start, peer):
+    arguments = ["-r", "__node:=other", "-r", "__ns:=/base", "-r", "/a:=/elsewhere/a"]
+    house = start(
+        route("/a", "mqtt", "text"),
+        route("/b", "ros", "text", type=STRING),
+        arguments=[*arguments, "-r", "/b:=/elsewhere/b"],
+        namespace="/not_this",
+    )
+    await peer.do("advertise", "/elsewhere/a", STRING)
+    await peer.do("subscribe", "/elsewhere/b", STRING)
+    await until(lambda: len(house.bridged()) == 2, "both")
+    assert house.node.name == "/base/other"
+    await peer.do("matched", "/elsewhere/a")
+    await peer.do("publish", "/elsewhere/a", (b"\0\1\0\0\x02\0\0\0x\0").hex())
+    await until(lambda: house.payloads("r2d2/a") == [b"x"], "the message from ROS")
+
+    def arrives():
+        house.send("r2d2/b", b"y")
+        return peer.received
+
+    await until(arrives, "the message from MQTT")
+    assert peer.received[0][0] == "/elsewhere/b"
+
+
+async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
+    house = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
+    await until(lambda: house.bridge.problem, "the problem")
+    assert "not a remapping" in house.bridge.problem
+
+
+@pytest.mark.parametrize(
+    "node", [{"use_sim_time": True}, {"arguments": ["-p", "use_sim_time:=true"]}]
+)
+async def test_time_is_the_simulations(start, peer, node):
+    house = start(route("/t", "ros", type=STAMP), **node)
+    await peer.do("advertise", "/clock", CLOCK)
+    await peer.do("subscribe", "/t", STAMP)
+    await until(house.bridged, "/t")
+    await peer.do("matched", "/clock")
+    clock = b"\0\1\0\0" + (1234).to_bytes(4, "little") + (500).to_bytes(4, "little")
+
+    async def has_arrived():
+        await peer.do("publish", "/clock", clock.hex())
+        house.send("r2d2/t", b'"now"')
+        return any(cdr == clock.hex() for _, cdr in peer.received)
+
+    deadline = time.monotonic() + 10
+    while not await has_arrived():
+        assert time.monotonic() < deadline, peer.received[-1:]
+        await asyncio.sleep(0.05)
+    assert house.node.now() == 1234 * 10**9 + 500
+
+
+async def test_the_appliance_tells_how_it_is_on_ros_on_mqtt_and_at_its_door(tmp_path, peer):
+    appliance = ApplianceProcess(tmp_path, acl=f"user alice\ntopic {ROBOT}/#\n")
+    settings = yaml.safe_load(appliance.config.read_text())
+    settings["bridge"] = {
+        "ros_arguments": ["-r", "__ns:=/base"],
+        "diagnostics": "100 ms",
+        "topics": [{"ros": ["/some/**", "!/some/raw"], "to": "mqtt"}],
+    }
+    appliance.config.write_text(yaml.safe_dump(settings))
+    await peer.do("advertise", "/some/text", STRING)
+    await peer.do("advertise", "/some/raw", STRING)
+    await peer.do("subscribe", "/diagnostics", TYPE)
+
+    async def ask(*arguments):
+        return await asyncio.to_thread(
+            subprocess.run,
+            [sys.executable, "-m", "appliance", "routes", "-c", str(appliance.config), *arguments],
+            capture_output=True,
+            text=True,
+            env=for_other_programs(),
+        )
+
+    refused = await ask()
+    assert refused.returncode == 1
+    assert "no appliance is running" in refused.stderr
+    appliance.start()
+    try:
+        await peer.do("matched", "/some/text")
+        await peer.do("publish", "/some/text", (b"\0\1\0\0\x02\0\0\0x\0").hex(), 20, 100)
+        converter = Converters(load_description).get(TYPE)
+
+        def told():
+            if not peer.received:
+                return {}
+            array = converter.to_dict(bytes.fromhex(peer.received[-1][1]))
+            return {status["name"]: status for status in array["status"]}
+
+        name = "base/appliance: /some/**, !/some/raw to MQTT"
+        await until(
+            lambda: name in told() and "bridged: 1" in told()[name]["message"], "diagnostics"
+        )
+        (topic,) = [json.loads(line) for line in (await ask("--json")).stdout.splitlines()]
+        assert (topic["ros"], topic["mqtt"], topic["type"]) == (
+            "/some/text",
+            f"{ROBOT}/some/text",
+            STRING,
+        )
+        assert topic["messages"] > 0
+        assert topic["latency_ms"]["p50"] > 0
+        heading, row = (await ask()).stdout.splitlines()
+        assert heading.split()[:3] == ["ROS", "MQTT", "TYPE"]
+        assert row.split()[:4] == ["/some/text", "→", f"{ROBOT}/some/text", STRING]
+    finally:
+        appliance.stop()
