@@ -29,6 +29,13 @@ from appliance.mqtt.packets import (
 #: Seconds for an answer, on a computer that is busy.
 PATIENCE = 30.0
 
+#: Messages that may wait for one subscriber: as many as its session holds easily, for it to be
+#: killed quickly and often.
+MOST_WAITING = 20_000
+
+#: Seconds until publishers that wait look again.
+PAUSE = 0.1
+
 #: What ends a connection when the broker ends.
 GONE = (OSError, EOFError, asyncio.TimeoutError)
 
@@ -48,6 +55,15 @@ class World:
     forgetful: bool = False
     problems: list[str] = field(default_factory=list)
     refused: Counter[int] = field(default_factory=Counter)
+    publishers: list[Publisher] = field(default_factory=list)
+    subscribers: list[Subscriber] = field(default_factory=list)
+
+    @property
+    def crowded(self) -> bool:
+        """Whether so much waits for a subscriber that publishers had better wait, too."""
+        sent = sum(publisher.sent for publisher in self.publishers if not publisher.retain)
+        taken = min((len(subscriber.received) for subscriber in self.subscribers), default=sent)
+        return sent - taken > MOST_WAITING and not self.forgetful
 
 
 class Client:
@@ -158,6 +174,7 @@ class Publisher(Client):
         self._unfinished: dict[int, int] = {}  # by packet id, in the order sent
         self._released: dict[int, int] = {}
         self._packet_id = 0
+        self._waits = False
 
     @property
     def idle(self) -> bool:
@@ -185,6 +202,11 @@ class Publisher(Client):
         self._released.clear()
 
     def _fill(self) -> None:
+        if self.world.crowded:
+            if not self._waits:
+                self._waits = True
+                asyncio.get_running_loop().call_later(PAUSE, self._fill_again)
+            return
         busy = self._unfinished.keys() | self._released.keys()
         while self.connected and not self.world.stopping and len(busy) < self.window:
             self._packet_id = self._packet_id % 65535 + 1
@@ -194,6 +216,10 @@ class Publisher(Client):
             self.sent += 1
             self._unfinished[self._packet_id] = self.sent
             self.send(self._packet(self._packet_id, self.sent, dup=False))
+
+    def _fill_again(self) -> None:
+        self._waits = False
+        self._fill()
 
     def took(self, packet: Packet) -> None:
         if isinstance(packet, Puback) or (

@@ -73,9 +73,15 @@ class Ordeal:
         self.say = say
         broker = {**BROKER, "store": store} if store else BROKER
         self.broker = ApplianceProcess(directory, acl=ACL, broker=broker)
-        self.publishers: list[Publisher] = []
-        self.subscribers: list[Subscriber] = []
         self.world: World
+
+    @property
+    def publishers(self) -> list[Publisher]:
+        return self.world.publishers
+
+    @property
+    def subscribers(self) -> list[Subscriber]:
+        return self.world.subscribers
 
     @property
     def store(self) -> Path:
@@ -113,14 +119,14 @@ class Ordeal:
         world = self.world
         for number, (version, qos) in enumerate(((4, 1), (5, 1), (4, 2), (5, 2))):
             name = f"publisher{number}"
-            self.publishers.append(Publisher(world, name, version, qos, tls=number in (1, 2)))
+            self.world.publishers.append(Publisher(world, name, version, qos, tls=number in (1, 2)))
         for version in (4, 5):
             name = f"keeper{version}"
-            self.publishers.append(
+            self.world.publishers.append(
                 Publisher(world, name, version, 1, tls=version == 4, retain=True, window=2)
             )
         for number, version in enumerate((4, 5, 5)):
-            self.subscribers.append(
+            self.world.subscribers.append(
                 Subscriber(
                     world, f"subscriber{number}", version, tls=number == 0, leaves=number == 2
                 )
