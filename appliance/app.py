@@ -4,32 +4,43 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import gc
-import json
 import logging
 import os
 import signal
-import ssl
+from collections.abc import Coroutine
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, FileAccess
-from appliance.amqtt_broker import ApplianceBroker, configuration, plugin_kinds
+from appliance import wiring
+from appliance.access import FileAccess
+from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
+from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Features, Limits
 from appliance.broker.sys_topics import SysTopics
-from appliance.certs import ClientCertificates, server_context
-from appliance.config import Listener, Settings, TopicRoute
-from appliance.listeners import Admission, Listeners, ListenerSettings
-from appliance.mqtt.reason import ReasonCode
-from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.certs import (
+    CertificateError,
+    LoadedTls,
+    TlsContexts,
+    keep_server_certificate,
+)
+from appliance.certs.settings import tls_files, tls_policies
+from appliance.config import (
+    OPEN_WITH_SECRETS,
+    Settings,
+    is_open_with_secrets,
+    secrets_in,
+)
+from appliance.control import Control, ControlError
+from appliance.listeners import Listeners
+from appliance.reload import Parts, Reload, ReloadError
+from appliance.ros.bridge import Bridge
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
-from appliance.ros.rules import CommandRules, OnSilence
-from appliance.store import MemoryStore
+from appliance.store import MemoryStore, SqliteStore
+from appliance.watch import watch
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +55,12 @@ YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
 
 
+#: Seconds between two looks at the server's certificate and this computer's names and addresses,
+#: and after which the log is told again of what has run out or does soon.
+CERTIFICATE_CHECK = 300.0
+CERTIFICATE_WARNING = 86400.0
+
+
 class App:
     """The whole appliance, on the running event loop."""
 
@@ -52,6 +69,7 @@ class App:
         self.settings = settings
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
+        self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
 
@@ -60,7 +78,9 @@ class App:
 
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
+            AuditError: the audit log cannot be written.
             PluginSettingsError: one of broker.plugins cannot be loaded.
+            StoreError: the store is in use, of a newer version, or cannot be read.
             OSError: a port cannot be listened on.
         """
         try:
@@ -73,24 +93,38 @@ class App:
         loop = asyncio.get_running_loop()
         settings = self.settings
         broker_settings = settings.broker
-        users, acl = broker_settings.users, broker_settings.acl
-        # A file may be missing where plugins do its work, and only there.
-        authenticating, ruling = plugin_kinds(broker_settings.plugins)
+        if is_open_with_secrets(settings):
+            log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
+        authenticating, _ = plugin_kinds(broker_settings.plugins)
+        self._tls = tls = self._load_tls()
         self._access = access = FileAccess(
-            None if authenticating and not users.exists() else users,
-            None if ruling and not acl.exists() else acl,
+            *wiring.access_files(settings),
             settings.robot,
             broker_settings.anonymous,
+            failed_logins=broker_settings.limits.failed_logins,
+            patience=0.6 * broker_settings.limits.connect_timeout,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits
+        store = self._open_store()
         self.broker = broker = Broker(
-            access, MemoryStore(), _broker_limits(settings), _features(settings)
+            access,
+            store or MemoryStore(),
+            wiring.broker_limits(settings),
+            wiring.features(settings),
         )
+        audit = broker_settings.audit
+        if audit.path is not None:
+            self.audit = broker.journal = Audit(audit.path, audit.size, audit.keep)
+            self._stack.callback(self.audit.close)
+            self.audit.began()
+            self._stack.callback(self.audit.ended)
         broker.tick(loop.time())
+        if store is not None:
+            store.restore(broker)
 
         async def listen() -> None:
-            wanted = self._listener_settings()
+            wanted = wiring.listener_settings(settings, tls)
             self.addresses = await listeners.start(wanted)
             for (host, port), listener in zip(self.addresses, wanted, strict=True):
                 kind = " for WebSocket" if listener.protocol == "websocket" else ""
@@ -102,55 +136,104 @@ class App:
             limits.connections,
             broker_settings.plugins,
         )
+        answers = broker_settings.plugin_answers
         # In less than the listeners' time limit, so that a client is told when plugins hang.
-        plugin_timeout = 0.8 * limits.connect_timeout
         frame = ApplianceBroker(
-            broker, access, config, listen, lambda: listeners.stop(), plugin_timeout
+            broker,
+            access,
+            config,
+            listen,
+            lambda: listeners.stop(),
+            min(answers.timeout, 0.8 * limits.connect_timeout),
+            answers=Answers(answers.keep, answers.keep_refusals, answers.size),
+            secrets=secrets_in(broker_settings.plugins),
+            patience=0.2 * limits.connect_timeout,
+            certificate_user=tls.username if tls is not None else lambda _: None,
         )
-        listeners = Listeners(
+        self._listeners = listeners = Listeners(
             broker,
             frame.authenticate,
             # It would pass by plugins that refuse clients.
-            access.exchange if not authenticating else lambda method: None,
-            _admission(settings),
+            access.exchange if not authenticating else lambda method, address: None,
+            wiring.admission(settings),
+            tls,
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", _Deaf())
         self._start_clock(loop)
         await frame.start()
         self._stack.push_async_callback(frame.shutdown)
+        if tls is not None:
+            self._keep_certificates(tls)
         self._start_bridge(loop)
+        self._reload = Reload(
+            Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
+        )
+        if settings.file is not None:
+            await self._open_to_commands()
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
 
-    def _listener_settings(self) -> list[ListenerSettings]:
-        tls = self.settings.broker.tls
+    def _load_tls(self) -> TlsContexts | None:
+        """The TLS of the listeners, by their place in the configuration; None when none has it."""
+        broker = self.settings.broker
+        policies = tls_policies(broker)
+        if not policies:
+            return None
+        return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
 
-        @functools.cache
-        def context(asked_for: ClientCertificates) -> ssl.SSLContext:
-            return server_context(tls.certificate, tls.key, tls.ca, asked_for)
+    def _open_store(self) -> SqliteStore | None:
+        wanted = self.settings.broker.store
+        if wanted.durability == "off":
+            return None
+        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
+        store.open()
+        self._stack.push_async_callback(store.close)
+        return store
 
-        def context_of(listener: Listener) -> ssl.SSLContext | None:
-            if not listener.tls:
-                return None
-            asked_for = tls.client_certificates
-            # Asked for a certificate that it does not have, a browser gives a WebSocket up.
-            if listener.protocol == "websocket" and asked_for == "optional":
-                asked_for = "none"
-            return context(asked_for)
+    def _keep_certificates(self, tls: TlsContexts) -> None:
+        """Renew the server's certificate when that is due, and tell of what has run out."""
+        self._beside(self._keep(tls))
 
-        return [
-            ListenerSettings(
-                listener.bind.host,
-                listener.bind.port,
-                context_of(listener),
-                listener.protocol,
-                listener.bind.path,
-                listener.mode,
-            )
-            for listener in self.settings.broker.listeners
-        ]
+    def _beside(self, work: Coroutine[object, object, None]) -> None:
+        """Run this beside everything else, until the stop."""
+        task = asyncio.ensure_future(work)
+
+        async def end() -> None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+        self._stack.push_async_callback(end)
+
+    async def _keep(self, tls: TlsContexts) -> None:
+        told: dict[str, float] = {}
+        loop = asyncio.get_running_loop()
+        reason = ""
+        while True:
+            problems: list[str] = []
+            try:
+                reason = await asyncio.to_thread(keep_server_certificate, tls.files) or reason
+                if reason:
+                    self._take_tls(tls.prepare())
+                    log.info("the server's certificate was renewed: %s", reason)
+                    reason = ""
+            except (CertificateError, OSError) as error:
+                problems = [f"the server's certificate is not renewed: {error}"]
+            now = loop.time()
+            told = {text: at for text, at in told.items() if now - at < CERTIFICATE_WARNING}
+            for text in (*problems, *tls.warnings()):
+                if text not in told:
+                    told[text] = now
+                    log.warning("%s", text)
+            await asyncio.sleep(CERTIFICATE_CHECK)
+
+    def _take_tls(self, loaded: LoadedTls) -> None:
+        """Let these certificates hold, for the connections that are open too."""
+        assert self._tls is not None
+        if self._tls.take(loaded):
+            self._listeners.network.in_background(self._listeners.check_certificates())
+            log.info("certificates reloaded")
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""
@@ -162,7 +245,7 @@ class App:
         self.bridge = Bridge(
             Ros2Node(bridge.node, bridge.namespace, bridge.domain_id),
             self.broker,
-            [_route_settings(route, settings.robot) for route in bridge.topics],
+            wiring.routes(settings),
             loop,
             settings.robot,
         )
@@ -206,28 +289,39 @@ class App:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)
         await self.start()
-        loop.add_signal_handler(signal.SIGHUP, self.reload)
+        loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         try:
             await self._stopping.wait()
             log.info("stopping")
         finally:
             await self.stop()
 
-    def reload(self) -> None:
-        """Take over the users and ACL files as they are now; a wrong one changes nothing."""
-        users = set(self._access.users())
+    async def reload(self) -> list[str]:
+        """Take over all files as they are now; see `Reload.run`."""
+        return await self._reload.run()
+
+    async def _try_reload(self) -> None:
+        with contextlib.suppress(ReloadError):  # the log was told
+            await self._reload.run()
+
+    def _on_hangup(self) -> None:
+        self._listeners.network.in_background(self._try_reload())
+
+    async def _answer_reload(self) -> list[str]:
         try:
-            self._access.reload()
-        except AccessFileError as error:
-            log.error("not reloaded, what was in force stays so: %s", error)
-            return
-        removed = users - set(self._access.users())  # others are known to plugins
-        for session in list(self.broker.sessions.values()):
-            if session.identity and session.identity.username in removed:
-                session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
-        self.broker.rules_changed()
-        self.broker.flush()
-        log.info("users and access rules reloaded")
+            return await self._reload.run()
+        except ReloadError as error:
+            raise ControlError(f"nothing was reloaded: {error}") from None
+
+    async def _open_to_commands(self) -> None:
+        """Answer commands of this computer, and follow the files."""
+        settings = self.settings
+        settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        control = Control(settings.control, {"reload": self._answer_reload})
+        await control.start()
+        self._stack.push_async_callback(control.stop)
+        if settings.reload_on_change:
+            self._beside(watch(self._reload.files, self._try_reload))
 
     def request_stop(self) -> None:
         """Let `run` end."""
@@ -254,78 +348,6 @@ class _Deaf:
 
     def close(self, reason: object, message: str) -> None:
         """There is no connection to close."""
-
-
-def _broker_limits(settings: Settings) -> Limits:
-    limits = settings.broker.limits
-    return Limits(
-        connections=limits.connections,
-        packet_size=limits.packet_size,
-        memory=limits.memory,
-        queue_messages=limits.queue_messages,
-        queue_bytes=limits.queue_bytes,
-        queue_full=limits.queue_full,
-        keep=0 if limits.keep == "latest" else limits.keep,
-        inflight=limits.inflight,
-        sessions=limits.sessions,
-        subscriptions=limits.subscriptions,
-        topic_length=limits.topic_length,
-        topic_levels=limits.topic_levels,
-        retained_messages=limits.retained_messages,
-        retained_bytes=limits.retained_bytes,
-        session_expiry=round(limits.session_expiry),
-        topic_alias=limits.topic_alias,
-        keep_alive=round(limits.keep_alive),
-    )
-
-
-def _admission(settings: Settings) -> Admission:
-    limits = settings.broker.limits
-    return Admission(
-        limits.connections,
-        limits.connect_timeout,
-        limits.connections_per_address,
-        limits.connection_rate,
-        limits.publish_rate,
-    )
-
-
-def _features(settings: Settings) -> Features:
-    return Features(
-        check_payload_format=settings.broker.check_payload_format,
-        reason_strings=settings.broker.reason_strings,
-        response_information=settings.broker.response_information or "",
-    )
-
-
-def _route_settings(route: TopicRoute, robot: str) -> RouteSettings:
-    return RouteSettings(
-        ros=route.ros,
-        to=route.to,
-        mqtt=route.topic(robot),
-        type=route.type,
-        encoding=route.encoding,
-        rate=route.rate,
-        qos=route.qos,
-        retain=route.retain,
-        keep=route.keep,
-        rules=_command_rules(route) if route.command_keys else None,
-    )
-
-
-def _command_rules(route: TopicRoute) -> CommandRules:
-    silence = route.on_silence
-    return CommandRules(
-        expire=route.expire,
-        take_retained=route.take_retained,
-        exclusive=route.exclusive,
-        lease=route.lease,
-        on_silence=OnSilence(silence.after, json.dumps(silence.publish), silence.disconnect)
-        if silence
-        else None,
-        clamp=tuple((path, low, high) for path, (low, high) in route.clamp.items()),
-        allow=tuple((path, tuple(values)) for path, values in route.allow.items()),
-    )
 
 
 def run(settings: Settings) -> int:

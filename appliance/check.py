@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
 
 from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
-from appliance.config import Settings
+from appliance.certs.settings import tls_files, tls_policies
+from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Finding:
 def check(settings: Settings) -> Iterator[Finding]:
     """Everything there is to say about what these settings name, the good news included."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _plugins, _bridge]
+    parts = [_listeners, _access, _audit, _plugins, _bridge]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:
@@ -89,28 +91,59 @@ def _access(settings: Settings) -> Iterator[Finding]:
         yield Finding("warning", str(broker.users), text)
     if rules is not None:
         yield Finding("ok", str(broker.acl), f"rules: {len(rules)}")
-    if rules is not None and users is not None and not broker.plugins:  # which may know others
+    others = broker.plugins or broker.tls.username_from != "none"  # they may know more
+    if rules is not None and users is not None and not others:
         for name in sorted({rule.user for rule in rules if rule.user} - set(users)):
             yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
+
+
+def _audit(settings: Settings) -> Iterator[Finding]:
+    path = settings.broker.audit.path
+    if path is None:
+        return
+    directory = path.parent
+    if path.exists() and not path.is_file():
+        yield Finding("error", "broker.audit.path", f"{path} is not a regular file")
+    elif not directory.is_dir() or not os.access(directory, os.W_OK):
+        text = f"{directory} is no directory that can be written; the appliance's user must own it"
+        yield Finding("error", "broker.audit.path", text)
+    elif path.exists() and path.stat().st_mode & 0o077:
+        yield Finding("warning", str(path), "others than its owner can read it; chmod 600")
+    else:
+        yield Finding("ok", str(path), "the audit log: who connected, was refused, changed what")
 
 
 def _certificates(settings: Settings) -> Iterator[Finding]:
     tls = settings.broker.tls
     try:
-        # What the listener will do.
-        certs.server_context(tls.certificate, tls.key, tls.ca, tls.client_certificates)
+        loaded = certs.load_tls(tls_files(settings.broker), tls_policies(settings.broker))
     except certs.CertificateError as error:
-        yield Finding("error", "tls", str(error))
+        yield from (Finding("error", "tls", problem) for problem in error.problems)
         return
-    certificate = x509.load_pem_x509_certificates(tls.certificate.read_bytes())[0]
+    certificate = loaded.chain[0]
     text = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d}, for {_names(certificate)}"
     yield Finding("ok", str(tls.certificate), text)
+    yield from (Finding("warning", "tls", text) for text in loaded.warnings())
+    revoked = len(loaded.revocations)
+    if revoked:
+        yield Finding("ok", str(loaded.files.revocations), f"revoked certificates: {revoked}")
+    yield from _own_authority(tls.ca, certificate, str(tls.certificate))
+
+
+def _own_authority(path: Path, certificate: x509.Certificate, name: str) -> Iterator[Finding]:
+    """What is to be said of the CA that the clients are given, and of its key."""
     try:
-        authority = x509.load_pem_x509_certificates(tls.ca.read_bytes())[0]
-        certificate.verify_directly_issued_by(authority)
-    except (OSError, ValueError, TypeError, InvalidSignature):
-        text = f"did not sign {tls.certificate}: clients need the CA that did"
-        yield Finding("warning", str(tls.ca), text)
+        is_issuer = certs.issued_by(certificate, certs.load_certificates(path)[0])
+    except certs.CertificateError:
+        is_issuer = False
+    if not is_issuer:
+        yield Finding("warning", str(path), f"did not sign {name}: clients need the CA that did")
+    key = path.with_name("ca.key")
+    if key.exists():
+        try:
+            certs.load_key(key)
+        except certs.CertificateError as error:
+            yield Finding("error", "tls", str(error))
 
 
 def _names(certificate: x509.Certificate) -> str:
@@ -122,6 +155,8 @@ def _names(certificate: x509.Certificate) -> str:
 
 
 def _plugins(settings: Settings) -> Iterator[Finding]:
+    if is_open_with_secrets(settings):
+        yield Finding("warning", str(settings.file), OPEN_WITH_SECRETS)
     for name in settings.broker.plugins:
         module = name.rpartition(".")[0]
         try:

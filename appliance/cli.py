@@ -15,6 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
+from appliance.cert_command import cert_app
+from appliance.console import (
+    CommandError,
+    ConfigOption,
+    GenerateOption,
+    PasswordFileOption,
+    new_password,
+)
+from appliance.console import load as _load
+from appliance.console import read_password as _read_password
+from appliance.console import shown as _shown
+
 if TYPE_CHECKING:
     from appliance.access import Passwords
     from appliance.client import Target
@@ -28,29 +40,11 @@ app = typer.Typer(
 )
 user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
 acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
+store_app = typer.Typer(help="What outlives a restart.")
+app.add_typer(store_app, name="store")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
-
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        "-c",
-        metavar="FILE",
-        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
-    ),
-]
-PasswordFileOption = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
-]
-GenerateOption = Annotated[
-    bool, typer.Option("--generate", help="Make a random password, and show it once.")
-]
-
-
-class CommandError(Exception):
-    """Told to the user as it is; the command ends with exit code 1."""
+app.add_typer(cert_app, name="cert")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -69,15 +63,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         what = f"{error.filename}: {what}" if error.filename else what
         typer.secho(f"appliance: {what}", fg="red", err=True)
     sys.exit(1)
-
-
-def _load(config: Path | None) -> Settings:
-    from appliance.config import ConfigError, load
-
-    try:
-        return load(config)
-    except ConfigError as error:
-        raise CommandError(f"the configuration cannot be used\n{error}") from None
 
 
 # Setting up, running, checking
@@ -143,12 +128,33 @@ def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
     from appliance.access import AccessFileError
     from appliance.amqtt_broker import PluginSettingsError
+    from appliance.audit import AuditError
     from appliance.certs import CertificateError
+    from appliance.store import StoreError
 
     try:
         yield
-    except (AccessFileError, CertificateError, PluginSettingsError) as error:
+    except (
+        AccessFileError,
+        AuditError,
+        CertificateError,
+        PluginSettingsError,
+        StoreError,
+    ) as error:
         raise CommandError(str(error)) from None
+
+
+@app.command()
+def reload(config: ConfigOption = None) -> None:
+    """Have the running appliance take over its files as they are now: all of them, or none."""
+    settings = _load(config)
+    from appliance.control import ControlError, ask
+
+    try:
+        changed = ask(settings.control, "reload")
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    typer.echo("\n".join(changed) if changed else "nothing has changed")
 
 
 @app.command()
@@ -207,6 +213,110 @@ def bench(
     raise typer.Exit(bench.main(cell or None, seconds, peer, as_json))
 
 
+# What is stored
+
+
+@store_app.callback(invoke_without_command=True)
+def store_show(context: typer.Context, config: ConfigOption = None) -> None:
+    """What outlives a restart: sessions, what waits for them, retained messages."""
+    if context.invoked_subcommand is not None:
+        return
+    path = _store_path(config)
+    from datetime import datetime
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from appliance.config import format_size
+    from appliance.mqtt.codec import quote
+    from appliance.store import StoreError
+    from appliance.store.inspection import summarise
+
+    try:
+        summary = summarise(path)
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+    def when(moment: float | None) -> str:
+        return "" if moment is None else f"{datetime.fromtimestamp(moment):%Y-%m-%d %H:%M:%S}"
+
+    table = Table("client id", "user", "subscriptions", "messages", "bytes", "oldest", "ends")
+    for session in summary.sessions:
+        table.add_row(
+            escape(quote(session.client_id)),
+            "" if session.username is None else escape(quote(session.username)),
+            str(session.subscriptions),
+            str(session.messages),
+            str(session.size),
+            when(session.oldest),
+            when(session.ends_at) or "connected",
+        )
+    if summary.sessions:
+        Console().print(table)
+    typer.echo(
+        f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
+        f"{summary.retained_size} bytes; all {summary.messages} messages have "
+        f"{summary.payload_size} bytes, {_shown(path)} has {format_size(summary.file_size)}"
+    )
+
+
+@store_app.command("export")
+def store_export(config: ConfigOption = None) -> None:
+    """Print all of it as JSON, one session or retained message a line."""
+    path = _store_path(config)
+    import json
+
+    from appliance.store import StoreError
+    from appliance.store.inspection import export
+
+    try:
+        for entry in export(path):
+            typer.echo(json.dumps(entry, ensure_ascii=False))
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+
+@store_app.command("prune")
+def store_prune(
+    older_than: Annotated[
+        str | None,
+        typer.Option(metavar="DURATION", help="Messages that wait for longer, such as 7 d."),
+    ] = None,
+    client: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Of this client only; else its whole session. Repeatable."),
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Delete sessions, or what has waited too long for them, while the appliance is stopped."""
+    if older_than is None and not client:
+        raise typer.BadParameter("say what: --older-than, --client, or both")
+    path = _store_path(config)
+    import sqlite3
+
+    from appliance.config import parse_duration
+    from appliance.store import StoreError
+    from appliance.store.inspection import prune
+
+    try:
+        age = None if older_than is None else parse_duration(older_than)
+    except ValueError as error:
+        raise typer.BadParameter(f"--older-than {error}") from None
+    try:
+        sessions, messages = prune(path, age, client or [])
+    except (StoreError, sqlite3.Error) as error:
+        raise CommandError(str(error)) from None
+    typer.echo(f"{sessions} sessions and {messages} messages deleted")
+
+
+def _store_path(config: Path | None) -> Path:
+    store = _load(config).broker.store
+    if store.durability == "off":
+        raise CommandError("nothing is stored: broker.store.durability is off")
+    return store.path
+
+
 # Users
 
 
@@ -226,13 +336,15 @@ def user_add(
     ] = False,
 ) -> None:
     """Add a user; the password is asked for unless an option says where it comes from."""
-    with _users(config, new=True) as users:
+    settings = _load(config)
+    with _users(settings, new=True) as users:
         if name in users.users():
             raise CommandError(
                 f"there is a user {name!r} already; `appliance user passwd` changes it"
             )
         _set_password(users, name, password_file, generate, scram)
     typer.echo(f"user {name} added to {_shown(users.path)}")
+    _note(settings, "user added", name)
 
 
 @user_app.command("passwd")
@@ -251,29 +363,33 @@ def user_passwd(
     ] = None,
 ) -> None:
     """Change a user's password."""
-    with _users(config) as users:
+    settings = _load(config)
+    with _users(settings) as users:
         if name not in users.users():
             raise CommandError(_no_user(name, users))
         _set_password(users, name, password_file, generate, scram)
     typer.echo(f"password of user {name} changed")
+    _note(settings, "password changed", name)
 
 
 @user_app.command("remove")
 def user_remove(name: str, config: ConfigOption = None) -> None:
     """Remove a user."""
-    with _users(config) as users:
+    settings = _load(config)
+    with _users(settings) as users:
         try:
             users.remove(name)
         except KeyError:
             raise CommandError(_no_user(name, users)) from None
         users.save()
     typer.echo(f"user {name} removed")
+    _note(settings, "user removed", name)
 
 
 @user_app.command("list")
 def user_list(config: ConfigOption = None) -> None:
     """Print the users' names, one a line, and how each one's password is kept."""
-    with _users(config) as users:
+    with _users(_load(config)) as users:
         names = users.users()
         width = max(map(len, names), default=0)
         for name in names:
@@ -281,9 +397,8 @@ def user_list(config: ConfigOption = None) -> None:
 
 
 @contextmanager
-def _users(config: Path | None, *, new: bool = False) -> Iterator[Passwords]:
+def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
     """The users file; what is wrong with it, or with writing it, is a CommandError."""
-    settings = _load(config)
     from appliance.access import AccessFileError, Passwords
 
     path = settings.broker.users
@@ -294,6 +409,18 @@ def _users(config: Path | None, *, new: bool = False) -> Iterator[Passwords]:
         raise CommandError(str(error)) from None
 
 
+def _note(settings: Settings, what: str, user: str) -> None:
+    """Have a change in the audit log, if there is one; it is done whether that works or not."""
+    from appliance.audit import note
+
+    path = settings.broker.audit.path
+    try:
+        note(path, what, user=user)
+    except OSError as error:
+        message = f"appliance: {path}: this is not in the audit log ({error.strerror})"
+        typer.secho(message, fg="yellow", err=True)
+
+
 def _no_user(name: str, users: Passwords) -> str:
     return f"there is no user {name!r} in {_shown(users.path)}"
 
@@ -301,18 +428,7 @@ def _no_user(name: str, users: Passwords) -> str:
 def _set_password(
     users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
 ) -> None:
-    if generate and file:
-        raise typer.BadParameter("--generate and --password-file exclude each other")
-    if generate:
-        from appliance.init import generate_password
-
-        password = generate_password()
-    elif file:
-        password = _read_password(file)
-    elif sys.stdin.isatty():
-        password = typer.prompt(f"Password of {name}", hide_input=True, confirmation_prompt=True)
-    else:
-        raise CommandError("no terminal to ask on; use --generate or --password-file")
+    password = new_password(name, file, generate)
     try:
         users.set(name, password, scram)
     except ValueError as error:
@@ -320,11 +436,6 @@ def _set_password(
     users.save()
     if generate:
         typer.echo(f"password {password}")
-
-
-def _read_password(file: str) -> str:
-    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
-    return text.split("\n", 1)[0].rstrip("\r")
 
 
 # Access
@@ -363,6 +474,13 @@ PortOption = Annotated[
 CaOption = Annotated[
     Path | None,
     typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
+]
+CertOption = Annotated[
+    Path | None,
+    typer.Option("--cert", metavar="FILE", help="A client certificate, with its key in it or in:"),
+]
+KeyOption = Annotated[
+    Path | None, typer.Option("--key", metavar="FILE", help="The key of the client certificate.")
 ]
 UserOption = Annotated[
     str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
@@ -406,6 +524,8 @@ def pub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -423,7 +543,9 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -449,6 +571,8 @@ def sub(
     host: HostOption = "localhost",
     port: PortOption = None,
     ca: CaOption = None,
+    cert: CertOption = None,
+    key: KeyOption = None,
     user: UserOption = None,
     password_file: ClientPasswordOption = None,
     client_id: ClientIdOption = "",
@@ -457,7 +581,9 @@ def sub(
     config: ConfigOption = None,
 ) -> None:
     """Subscribe, and print what comes, a message a line."""
-    target = _target(config, host, port, ca, user, password_file, client_id, mqtt_version, insecure)
+    target = _target(
+        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
+    )
     from appliance import client
 
     try:
@@ -486,6 +612,8 @@ def _target(
     client_id: str,
     version: Literal["5", "311"],
     insecure: bool,
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> Target:
     """Where to connect and as whom; what no option says is taken from the configuration, if any."""
     from paho.mqtt.enums import MQTTProtocolVersion
@@ -510,15 +638,8 @@ def _target(
     else:
         raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
     protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
-    return Target(host, port or 8883, ca, user, password, client_id, protocol, insecure)
-
-
-def _shown(path: Path) -> str:
-    """The path as a user of this folder would type it."""
-    try:
-        return str(path.absolute().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+    address = (host, port or 8883)
+    return Target(*address, ca, user, password, client_id, protocol, insecure, cert, key)
 
 
 def _version(wanted: bool) -> None:

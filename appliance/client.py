@@ -27,7 +27,10 @@ class ClientError(Exception):
 
 @dataclass(frozen=True)
 class Target:
-    """Which broker to talk to, how its certificate is checked, and as whom."""
+    """Which broker to talk to, how its certificate is checked, and as whom.
+
+    `certificate` is the client's own, with its key in the same file or in `key`.
+    """
 
     host: str
     port: int
@@ -37,6 +40,8 @@ class Target:
     client_id: str = ""
     version: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv5
     insecure: bool = False
+    certificate: Path | None = None
+    key: Path | None = None
 
     @property
     def address(self) -> str:
@@ -112,7 +117,10 @@ class Connection:
         client.on_subscribe = lambda c, u, mid, reasons, p: setattr(self, "_granted", reasons)
         client.on_publish = lambda c, u, mid, reason, p: self._published.update({mid: reason})
         client.on_message = lambda c, u, message: on_message(message)
-        client.tls_set_context(_tls(target))
+        context = _tls(target)
+        if target.certificate is not None:
+            _show_certificate(context, target.certificate, target.key)
+        client.tls_set_context(context)
         client.tls_insecure_set(target.insecure)
         self._connect()
 
@@ -207,3 +215,18 @@ def _tls(target: Target) -> ssl.SSLContext:
         raise ClientError(f"{target.ca} is not a CA certificate in PEM form") from None
     except OSError as error:
         raise ClientError(f"{target.ca} cannot be read: {error.strerror}") from None
+
+
+def _show_certificate(context: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
+    def no_password() -> str:
+        raise ClientError(f"{key or certificate} is encrypted; take its password off first")
+
+    try:
+        context.load_cert_chain(certificate, key, no_password)
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).lower().replace("_", " ")
+        files = f"{certificate} and {key}" if key else f"{certificate} (without --key)"
+        raise ClientError(f"{files}: no certificate with its key: {reason}") from None
+    except OSError as error:
+        files = f"{certificate} or {key}" if key else str(certificate)
+        raise ClientError(f"{files} cannot be read: {error.strerror}") from None

@@ -60,6 +60,11 @@ COMMAND_KEYS = (
 )
 """The keys of a route that say when a command may reach ROS, and with what in it."""
 
+OPEN_WITH_SECRETS = (
+    "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
+    "take them from environment variables, ${NAME}"
+)
+
 
 # Errors
 
@@ -181,6 +186,10 @@ def _parse_path(value: object, info: ValidationInfo) -> Path:
         raise ValueError("must be a path")
     base: Path = (info.context or {}).get("directory", Path())
     return (base / value).absolute()
+
+
+def _parse_optional_path(value: object, info: ValidationInfo) -> Path | None:
+    return None if value is None else _parse_path(value, info)
 
 
 def _parse_qos(value: object) -> int | None:
@@ -324,6 +333,14 @@ def _check_bus(value: object) -> object:
     return value
 
 
+def _unquoted_off(value: object) -> object:
+    return "off" if value is False else value  # off is a boolean in YAML 1.1
+
+
+def _unquoted_version(value: object) -> object:
+    return str(value) if isinstance(value, float) else value
+
+
 def _or_auto(value: object) -> object:
     return "auto" if value is None else value
 
@@ -340,11 +357,16 @@ Mode = Annotated[
 ]
 # Defaults of paths are validated as well: that is what makes them relative to the file.
 FilePath = Annotated[Path, PlainValidator(_parse_path), Field(validate_default=True)]
+OptionalPath = Annotated[Path | None, PlainValidator(_parse_optional_path)]
 Qos = Annotated[int | None, PlainValidator(_parse_qos), PlainSerializer(_or_auto, when_used="json")]
 Retain = Annotated[
     bool | None, PlainValidator(_parse_retain), PlainSerializer(_or_auto, when_used="json")
 ]
 Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
+ClientCertificates = Annotated[
+    Literal["off", "optional", "required"], BeforeValidator(_unquoted_off)
+]
+TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
 Encoding = Literal["json", "text", "cdr"]
@@ -366,11 +388,17 @@ def _section() -> Any:
 
 
 class Listener(_Section):
-    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket."""
+    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket.
+
+    What is None of `client_certificates`, `min_version` and `ciphers` is as `broker.tls` says.
+    """
 
     bind: Address
     tls: bool = False
     protocol: Literal["mqtt", "websocket"] = "mqtt"
+    client_certificates: ClientCertificates | None = None
+    min_version: TlsVersion | None = None
+    ciphers: str | None = None
     mode: Mode = 0o660
 
     @property
@@ -388,12 +416,19 @@ class Listener(_Section):
 
 
 class Tls(_Section):
-    """The server's certificate, and the CA whose client certificates are accepted."""
+    """The server's certificate, whose client certificates are accepted, and what they are for.
+
+    Without `crl` it is `ca.crl` beside `ca`, if there is one.
+    """
 
     certificate: FilePath = Path("certs/server.crt")
     key: FilePath = Path("certs/server.key")
     ca: FilePath = Path("certs/ca.crt")
-    client_certificates: Literal["none", "optional", "required"] = "optional"
+    crl: Annotated[Path, PlainValidator(_parse_path)] | None = None
+    client_certificates: ClientCertificates = "optional"
+    username_from: Literal["none", "subject", "san"] = "none"
+    min_version: TlsVersion = "1.2"
+    ciphers: str | None = None
 
 
 class Limits(_Section):
@@ -402,6 +437,7 @@ class Limits(_Section):
     connections: Count = 1000
     connections_per_address: Count = 250
     connection_rate: Count = 100
+    failed_logins: Count = 30
     packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
     memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
     queue_messages: Count = 1000
@@ -422,6 +458,32 @@ class Limits(_Section):
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
 
 
+class PluginAnswers(_Section):
+    """How long plugins may take, and for how long and how many of their answers hold."""
+
+    timeout: Annotated[Duration, Field(gt=0)] = 5.0
+    keep: Annotated[Duration, Field(ge=0)] = 10.0
+    keep_refusals: Annotated[Duration, Field(ge=0)] = 2.0
+    size: Count = 4096
+
+
+class AuditLog(_Section):
+    """Where is written who connected, was refused and changed what; None for nowhere."""
+
+    path: OptionalPath = None
+    size: Annotated[Size, Field(ge=1 << 10)] = 10 << 20
+    keep: Annotated[int, Field(ge=1, le=1000)] = 5
+
+
+class Store(_Section):
+    """Where sessions and retained messages are kept; `size` is in bytes, `age` in seconds."""
+
+    path: FilePath = Path("state/store.db")
+    durability: Literal["power", "process", "off"] = "power"
+    size: Annotated[Size, Field(ge=1 << 20)] = 1 << 30
+    age: Annotated[Duration, Field(gt=0)] | None = None
+
+
 class Broker(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
@@ -437,6 +499,8 @@ class Broker(_Section):
     anonymous: bool = False
     tls: Tls = _section()
     limits: Limits = _section()
+    audit: AuditLog = _section()
+    store: Store = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(_check_response_information)] | None = None
@@ -444,6 +508,16 @@ class Broker(_Section):
     plugins: Annotated[
         dict[str, dict[str, Any]], BeforeValidator(_check_plugins), Field(repr=False)
     ] = {}
+    plugin_answers: PluginAnswers = _section()
+
+    def client_certificates(self, listener: Listener) -> Literal["off", "optional", "required"]:
+        """Whether that listener asks its clients for one."""
+        if listener.client_certificates is not None:
+            return listener.client_certificates
+        # Asked for a certificate that it does not have, a browser gives a WebSocket up.
+        if listener.protocol == "websocket" and self.tls.client_certificates == "optional":
+            return "off"
+        return self.tls.client_certificates
 
 
 class RouteDefaults(_Section):
@@ -541,6 +615,8 @@ class Settings(_Section):
     broker: Broker = _section()
     bridge: Bridge = _section()
     log: Log = _section()
+    control: FilePath = Path("state/control.sock")
+    reload_on_change: bool = True
     _file: Path | None = PrivateAttr(default=None)
 
     @property
@@ -601,6 +677,13 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if first != number and (listener.bind.port or listener.bind.path):
             path = ("broker", "listeners", number, "bind")
             yield path, f"broker.listeners[{first}] listens there already"
+    tls = settings.broker.tls
+    if tls.username_from != "none" and not any(
+        listener.tls and settings.broker.client_certificates(listener) != "off"
+        for listener in settings.broker.listeners
+    ):
+        problem = "needs a listener with tls: true that asks for client certificates"
+        yield ("broker", "tls", "username_from"), problem
     routes: dict[tuple[str, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
         first = routes.setdefault((route.ros, route.topic(settings.robot)), number)
@@ -706,6 +789,36 @@ def mask(path: KeyPath, value: Any) -> Any:
     if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
         return MASK
     return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
+    """All that `mask` hides in a value, to be kept out of what others say about it."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from secrets_in(inner, (*path, key))
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from secrets_in(inner, path)
+    elif path and isinstance(path[-1], str) and _SECRET_KEY.search(path[-1]):
+        if value:
+            yield str(value)
+    elif isinstance(value, str):
+        for match in _URL_PASSWORD.finditer(value):
+            yield match[0].partition(":")[2]
+
+
+def is_open_with_secrets(settings: Settings) -> bool:
+    """Whether every user of this computer can read secrets in the file of these settings."""
+    if settings.file is None:
+        return False
+    try:
+        if not settings.file.stat().st_mode & 0o004:
+            return False
+        text = settings.file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    # What an environment variable has put there is not in the file.
+    return any(secret in text for secret in secrets_in(settings.broker.plugins))
 
 
 def describe(settings: Settings) -> dict[str, Any]:

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+from appliance.addresses import network
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
 from appliance.sockets import allow_files, listen, listen_on_path
-from appliance.wire import FAREWELLS, Authenticate, ClientProtocol, Network
+from appliance.wire import FAREWELLS, Authenticate, Certificates, ClientProtocol, Network
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,9 @@ HANDSHAKES = 64
 #: Seconds without one handshake ending after which those under way no longer keep others waiting:
 #: it is the network that they wait for, or they are not meant to end.
 HANDSHAKE_STALL = 0.25
+
+#: Certificates that are looked at in one go when they are looked at anew, at most 0.2 ms each.
+CHECKED_A_TURN = 16
 
 #: Seconds that one address may open connections ahead of `limits.connection_rate`.
 CONNECTION_BURST = 5.0
@@ -64,12 +68,13 @@ class Admission:
 class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
-    `context` is None for a connection without TLS.
+    `context` is asked at each connection for its TLS settings, so that these can be replaced; None
+    is for connections without TLS.
     """
 
     host: str
     port: int
-    context: ssl.SSLContext | None
+    context: Callable[[], ssl.SSLContext] | None
     protocol: Literal["mqtt", "websocket"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
@@ -87,8 +92,9 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         admission: Admission,
+        certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
         self.admission = admission
@@ -99,6 +105,7 @@ class Listeners:
             self._ended,
             connect_timeout=admission.connect_timeout,
             publish_rate=admission.publish_rate,
+            certificates=certificates,
         )
         self._addresses = _Addresses(admission)
         self._doors: list[_Door] = []
@@ -178,19 +185,27 @@ class Listeners:
             connection.close()
             counters.connections_refused += 1
             self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            if self.broker.journal is not None:
+                self.broker.journal.refused(address, refusal)
             return
         protocol = ClientProtocol(self.network, address, host)
         self.network.open.add(protocol)
+        context = None
         if listener.context is not None:
+            context = listener.context()
             self._handshakes.add(protocol)
-        self.network.in_background(self._begin(protocol, connection, listener))
+        is_websocket = listener.protocol == "websocket"
+        self.network.in_background(self._begin(protocol, connection, context, is_websocket))
 
     async def _begin(
-        self, protocol: ClientProtocol, connection: socket.socket, listener: ListenerSettings
+        self,
+        protocol: ClientProtocol,
+        connection: socket.socket,
+        context: ssl.SSLContext | None,
+        is_websocket: bool,
     ) -> None:
         try:
-            is_websocket = listener.protocol == "websocket"
-            await protocol.begin(connection, listener.context, websocket=is_websocket)
+            await protocol.begin(connection, context, websocket=is_websocket)
         finally:
             self._handshakes.discard(protocol)
             if self._stall is not None:
@@ -221,6 +236,13 @@ class Listeners:
             self._stall = None
         for door in self._doors:
             door.open()
+
+    async def check_certificates(self) -> None:
+        """End the connections whose client's certificate is not, or no longer, accepted."""
+        for number, protocol in enumerate(list(self.network.open)):
+            protocol.check_certificate()
+            if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
+                await asyncio.sleep(0)
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""
@@ -322,12 +344,12 @@ class _Addresses:
 
     def admit(self, host: str, now: float) -> str:
         """Count a new connection; or, uncounted, why it is not allowed."""
-        network = _network(host)
-        neighbour = self._known.get(network)
+        where = network(host)
+        neighbour = self._known.get(where)
         if neighbour is None:
             if len(self._known) >= self._many:
                 self._forget_idle(now)
-            neighbour = self._known[network] = _Neighbour()
+            neighbour = self._known[where] = _Neighbour()
         if neighbour.connections >= self._limit:
             return (
                 f"its address has {neighbour.connections} connections "
@@ -345,23 +367,13 @@ class _Addresses:
 
     def leave(self, host: str) -> None:
         """A connection from there ended."""
-        self._known[_network(host)].connections -= 1
+        self._known[network(host)].connections -= 1
 
     def _forget_idle(self, now: float) -> None:
         self._known = {
-            network: neighbour
-            for network, neighbour in self._known.items()
+            where: neighbour
+            for where, neighbour in self._known.items()
             if neighbour.connections or neighbour.paid_at > now
         }
         # Each is looked at once for every two that come: the work stays in proportion.
         self._many = max(ADDRESSES, 2 * len(self._known))
-
-
-def _network(host: str) -> bytes:
-    """What counts as one address: one of IPv4; of IPv6 a network of 64 bits, as one site has."""
-    if ":" not in host:
-        return socket.inet_aton(host)
-    packed = socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
-    if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
-        return packed[12:]
-    return packed[:8]

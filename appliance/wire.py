@@ -8,13 +8,13 @@ import os
 import socket
 import ssl
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import TypeAlias, cast
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from typing import Any, Protocol, TypeAlias, cast
 
 from appliance import tls
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -24,6 +24,17 @@ from appliance.websocket import WebSocket
 Authenticate: TypeAlias = Callable[
     [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
 ]
+
+
+class Certificates(Protocol):
+    """What is to be known of a client's certificate, of a connection with TLS."""
+
+    def refusal(self, tls: ssl.SSLObject) -> str:
+        """Why the client is not, or no longer, let in with it; empty when it is."""
+
+    def username(self, tls: ssl.SSLObject) -> str | None:
+        """The user that it names; None when that is not asked for. ValueError: it names none."""
+
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
 #: read them: what a healthy one takes in one round of the event loop, with room to spare.
@@ -68,6 +79,9 @@ SLOW_AFTER = 1.0
 #: Seconds that a client gets to read the last bytes before its connection is cut.
 CLOSE_TIMEOUT = 10.0
 
+#: Seconds that one gets whose certificate was revoked.
+REVOKED_TIMEOUT = 1.0
+
 #: Seconds that a closed connection is listened to, the bytes that may come, and how many
 #: connections this is done for at a time.
 FAREWELL_TIMEOUT = 2.0
@@ -85,13 +99,15 @@ class Network:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str], Exchange | None],
+        exchange: Callable[[str, str | None], Exchange | None],
         ended: Callable[[ClientProtocol], None],
         *,
         connect_timeout: float,
         publish_rate: float,
+        certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
+        self.certificates = certificates
         self.authenticate = authenticate
         self.exchange = exchange
         self.use(connect_timeout, publish_rate)
@@ -301,6 +317,34 @@ class ClientProtocol:
         self._transport.set_write_buffer_limits(high=OUTPUT_LOW_WATER)
         if self not in self._network.open:  # the handshake ended just after its time
             self._transport.abort()
+        else:
+            self.check_certificate()
+
+    @property
+    def _tls(self) -> ssl.SSLObject | None:
+        """The TLS of the connection, if it has any."""
+        if self._transport is None:
+            return None
+        return cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object"))
+
+    def check_certificate(self) -> None:
+        """Close the connection when the client's certificate is not, or no longer, accepted.
+
+        One that has logged in is told why, and has a second to read it.
+        """
+        certificates, tls_object = self._network.certificates, self._tls
+        if certificates is None or tls_object is None or self._closing:
+            return
+        reason = certificates.refusal(tls_object)
+        if not reason:
+            return
+        if self._client.session is None:
+            self.complain("no TLS connection", reason)
+            self._client.abandon()
+        else:
+            self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
+        self._broker.flush()
+        self._loop.call_later(REVOKED_TIMEOUT, self.abort)
 
     def _too_late(self) -> None:
         timeout = f"{self._network.connect_timeout:g} s"
@@ -312,6 +356,8 @@ class ClientProtocol:
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
         self._broker.complaints.tell(now, (self.host, what), "%s", message)
+        if self._broker.journal is not None:
+            self._broker.journal.refused(self.address, f"{what}: {why}")
 
     def eof_received(self) -> None:
         """The client sends no more; the transport closes."""
@@ -587,8 +633,7 @@ class ClientProtocol:
         self._network.in_background(self._log_in(connect))
 
     async def _log_in(self, connect: Connect) -> None:
-        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
-        who = await self._network.authenticate(connect, self.address, peer)
+        who = await self._network.authenticate(connect, self.address, self._tls)
         self._logging_in = False
         if isinstance(who, Refusal):
             self._client.refuse(who.code, who.reason)
@@ -598,8 +643,19 @@ class ClientProtocol:
         self._read_on()
 
     def exchange(self, method: str) -> Exchange | None:
-        """Begin an enhanced authentication; None when the method is not offered."""
-        return self._network.exchange(method)
+        """Begin an enhanced authentication; None when the method is not offered.
+
+        None is to a client whose certificate says who it is: it could only say something else.
+        """
+        certificates, tls_object = self._network.certificates, self._tls
+        if certificates is not None and tls_object is not None:
+            try:
+                if certificates.username(tls_object) is not None:
+                    return None
+            except ValueError:
+                return None
+        stranger = self._client.session is None
+        return self._network.exchange(method, self.address if stranger else None)
 
     def now(self) -> float:
         """Seconds of the event loop's clock."""
@@ -608,6 +664,13 @@ class ClientProtocol:
     def accepted(self) -> None:
         """The client has logged in, and may be silent now."""
         self._timeout.cancel()
+
+    def secured(self) -> Secured:
+        """The version of TLS, and the name in the client's certificate."""
+        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
+        if peer is None:
+            return Secured()
+        return Secured(peer.version() or "", _name_in(peer.getpeercert()))
 
     def later(self) -> None:
         """Let the others have their turn, then let the client go on; it is not read before that."""
@@ -700,6 +763,10 @@ class _Gone:
     def accepted(self) -> None:
         """Nobody waits for it."""
 
+    def secured(self) -> Secured:
+        """Nothing is left to be secured."""
+        return Secured()
+
     def later(self) -> None:
         """There is nothing to go on with."""
 
@@ -756,6 +823,17 @@ class _Farewell:
 _SCRATCH = bytearray(256 * 1024)
 
 
+def _name_in(certificate: Mapping[str, Any] | None) -> str:
+    """The common name of a certificate's subject, or else its first alternative name."""
+    if not certificate:
+        return ""
+    for part in certificate.get("subject", ()):
+        for key, value in part:
+            if key == "commonName":
+                return str(value)
+    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")
+
+
 def _tls_reason(error: BaseException) -> str:
     """What went wrong in a handshake, in words for the person who reads the log."""
     reason = getattr(error, "reason", None) or str(error) or type(error).__name__
@@ -764,6 +842,9 @@ def _tls_reason(error: BaseException) -> str:
         return f"the client does not trust our certificate; does it have ca.crt? ({text})"
     if "http request" in text or "wrong version number" in text:
         return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
+    if "certificate verify failed" in text:
+        why = getattr(error, "verify_message", "")
+        return f"the client's certificate is not accepted: {why or text} (broker.tls.ca)"
     if "peer did not return a certificate" in text:
         return f"it has no client certificate, and one is required ({text})"
     return text

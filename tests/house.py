@@ -58,7 +58,7 @@ class House:
         self.listeners = Listeners(
             self.broker,
             self._ask,
-            lambda method: None,
+            lambda method, address: None,
             Admission(connections, connect_timeout, **limits),
         )
         return self.listeners
@@ -82,9 +82,9 @@ class House:
         self.ports = await self.listeners.start(
             [
                 ListenerSettings("127.0.0.1", 0, None),
-                ListenerSettings("127.0.0.1", 0, self.context),
+                ListenerSettings("127.0.0.1", 0, lambda: self.context),
                 ListenerSettings("127.0.0.1", 0, None, "websocket"),
-                ListenerSettings("127.0.0.1", 0, self.context, "websocket"),
+                ListenerSettings("127.0.0.1", 0, lambda: self.context, "websocket"),
             ]
         )
 

@@ -19,9 +19,13 @@ class RawClient:
     def __init__(self, broker: BrokerProcess, version: int, *, tls: bool = False) -> None:
         self.broker = broker
         self.version = version
-        self.socket = broker.open(tls=tls)
+        self.socket = self.open(tls=tls)
         self.packet_ids = itertools.count(1)
         self._buffer = b""
+
+    def open(self, *, tls: bool) -> socket.socket:
+        """A new connection, with nothing sent on it."""
+        return self.broker.open(tls=tls)
 
     def __enter__(self) -> RawClient:
         return self

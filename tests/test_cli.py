@@ -42,7 +42,7 @@ def typed(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 def test_help_is_there_at_once_and_for_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--help") == 0
     text = capsys.readouterr().out
-    for command in ("init", "run", "check", "user", "acl", "pub", "sub", "bench", "demo"):
+    for command in ("init", "run", "check", "user", "cert", "acl", "pub", "sub", "bench", "demo"):
         assert f" {command} " in text
         assert run(command, "--help") == 0
 

@@ -332,3 +332,40 @@ def test_a_pattern_names_many_topics_and_goes_to_mqtt_only() -> None:
     assert any(
         "***" in problem for problem in problems("bridge: {topics: [{ros: /a/***, to: mqtt}]}")
     )
+
+
+# TLS
+
+
+def test_what_yaml_takes_for_something_else() -> None:
+    text = """\
+broker:
+  tls: {client_certificates: off, min_version: 1.3}
+  listeners:
+    - {bind: ":1", tls: true}
+    - {bind: ":2", tls: true, client_certificates: optional, protocol: websocket}
+    - {bind: ":3", tls: true, protocol: websocket}
+"""
+    broker = loads(text).broker
+    assert (broker.tls.client_certificates, broker.tls.min_version) == ("off", "1.3")
+    asked = [broker.client_certificates(listener) for listener in broker.listeners]
+    assert asked == ["off", "optional", "off"]
+    assert config.loads(yaml.safe_dump(config.describe(loads(text))), HERE).broker == broker
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{client_certificates: none}", "client_certificates: must be off, optional or required"),
+        ("{client_certificates: on}", "client_certificates: must be off, optional or required"),
+        ("{min_version: 1.1}", "min_version: must be 1.2 or 1.3"),
+        ("{username_from: cn}", "username_from: must be none, subject or san"),
+        (
+            "{username_from: subject, client_certificates: off}",
+            "username_from: needs a listener with tls: true that asks for client certificates",
+        ),
+    ],
+)
+def test_tls_that_cannot_be(text: str, problem: str) -> None:
+    [found] = problems(f"broker:\n  tls: {text}\n")
+    assert found.startswith(f"2: broker.tls.{problem}")

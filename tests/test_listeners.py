@@ -527,11 +527,12 @@ broker:
     - {bind: "unix:/run/web.sock", protocol: websocket}
 """
     settings = config.loads(text, tmp_path / "appliance.yaml", {})
-    tls, plain, web, private, shared = App(settings)._listener_settings()
+    app = App(settings)
+    tls, plain, web, private, shared = app._listener_settings(app._load_tls())
     assert (plain.host, plain.context, plain.protocol, plain.path) == ("::1", None, "mqtt", None)
-    assert tls.context is not None and tls.context.verify_mode == ssl.CERT_OPTIONAL
+    assert tls.context is not None and tls.context().verify_mode == ssl.CERT_OPTIONAL
     # Asked for a certificate that it does not have, a browser gives up.
-    assert web.context is not None and web.context.verify_mode == ssl.CERT_NONE
+    assert web.context is not None and web.context().verify_mode == ssl.CERT_NONE
     assert web.protocol == "websocket"
     assert (private.path, private.mode) == (tmp_path / "run/mqtt.sock", 0o600)
     assert (shared.path, shared.mode) == (Path("/run/web.sock"), 0o660)

@@ -137,7 +137,7 @@ def content(path: Path) -> str:
 
 
 def begin(access: FileAccess) -> ScramExchange:
-    exchange = access.exchange(METHOD)
+    exchange = access.exchange(METHOD, "::1")
     assert isinstance(exchange, ScramExchange)
     return exchange
 
@@ -475,11 +475,11 @@ def test_what_is_wrong_with_a_hash_is_told(tmp_path: Path) -> None:
 
 
 def test_the_methods_that_are_offered(access: FileAccess) -> None:
-    assert access.exchange("SCRAM-SHA-256") is not None
+    assert access.exchange("SCRAM-SHA-256", "::1") is not None
     for method in ("SCRAM-SHA-256-PLUS", "SCRAM-SHA-1", "scram-sha-256", "PLAIN", ""):
-        assert access.exchange(method) is None
+        assert access.exchange(method, "::1") is None
     nobody = FileAccess(None, None, "r2d2")
-    assert nobody.exchange("SCRAM-SHA-256") is None
+    assert nobody.exchange("SCRAM-SHA-256", "::1") is None
     nobody.close()
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from appliance.broker.ports import Refusal
 
-from .acl import Acl, Explanation, Permission, Rule, Verdict
-from .files import FileAccess
+from .acl import Acl, Explanation, Verdict
+from .files import Changes, FileAccess, Rules
 from .passwords import Passwords, check_password, check_username
 from .problems import AccessFileError, Problem
+from .rules import Permission, Rule
 
 __all__ = [
     "AccessFileError",
     "Acl",
+    "Changes",
     "Explanation",
     "FileAccess",
     "Passwords",
@@ -19,6 +21,7 @@ __all__ = [
     "Problem",
     "Refusal",
     "Rule",
+    "Rules",
     "Verdict",
     "check_password",
     "check_username",

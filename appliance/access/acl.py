@@ -1,23 +1,17 @@
-"""The ACL file: mosquitto's grammar and meaning, and `include`, `{robot}` and SUBSCRIBE beyond."""
+"""What the rules of an ACL file decide: mosquitto's meaning, and SUBSCRIBE beyond."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import Flag
 from itertools import zip_longest
 from pathlib import Path
 from typing import Final
 
 from appliance.broker.ports import Action, Decision, Identity
-from appliance.mqtt.topics import check_filter, check_topic, matches, overlaps, parse_shared
+from appliance.mqtt.topics import check_filter, matches, overlaps, parse_shared
 
-from .problems import AccessFileError, Problem, read_text
-
-# What C's isspace() takes for white space, and mosquitto trims. Python's strip() takes more.
-_BLANK: Final = " \t\n\v\f\r"
-_KEYWORDS: Final = ("topic", "pattern", "user", "include")
+from .rules import Permission, Rule, read_rules
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
 
@@ -26,23 +20,6 @@ _FEW: Final = 4
 
 # A level that no rule can name, as no filter may hold U+0000 [MQTT-4.7.3-2].
 _FRESH: Final = "\0"
-
-
-class Permission(Flag):
-    """What a rule gives; DENY takes."""
-
-    DENY = 0
-    READ = 1
-    WRITE = 2
-    READWRITE = 3
-
-
-_PERMISSIONS: Final = {
-    "read": Permission.READ,
-    "write": Permission.WRITE,
-    "readwrite": Permission.READWRITE,
-    "deny": Permission.DENY,
-}
 
 _ONLY: Final = {Permission.READ: "gives read only", Permission.WRITE: "gives write only"}
 
@@ -57,35 +34,6 @@ _VERBS: Final = {
     Action.SUBSCRIBE: "subscribe to",
     Action.RECEIVE: "read",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """One `topic` or `pattern` line.
-
-    `file` is named as seen from the directory of the ACL file, `text` is the line with `{robot}`
-    replaced, and `user` is None in a pattern and in a rule for anonymous clients.
-    """
-
-    file: str
-    line: int
-    text: str
-    permission: Permission
-    filter: str
-    user: str | None = None
-    pattern: bool = False
-
-    @property
-    def denies(self) -> bool:
-        """Whether it takes, and does not give."""
-        return self.permission is Permission.DENY
-
-    def gives(self, permission: Permission) -> bool:
-        """Whether it gives this, READ or WRITE."""
-        return self.permission is permission or self.permission is Permission.READWRITE
-
-    def __str__(self) -> str:
-        return f"{self.file}:{self.line}: {self.text}"
 
 
 class _Level:
@@ -206,6 +154,8 @@ class Explanation:
             answer = "allowed" if verdict.allowed else "refused"
             verb = _VERBS[verdict.action].partition(" ")[0]
             lines.append(f"  {verb:<9}  {answer}  {verdict.reason}")
+            if verdict.rule is not None and verdict.rule.via:
+                lines.append(f"             included by  {', then '.join(verdict.rule.via)}")
             for rule, why in verdict.passed_over:
                 lines.append(f"             passed over  {rule}  ({why})")
         return "\n".join(lines)
@@ -219,9 +169,12 @@ class Acl:
     the action decides, and what none decides is refused.
     """
 
-    def __init__(self, name: str, rules: Iterable[Rule]) -> None:
-        """`name` is what the file is called in reasons."""
+    def __init__(
+        self, name: str, rules: Iterable[Rule], files: frozenset[Path] = frozenset()
+    ) -> None:
+        """`name` is what the file is called in reasons, `files` is it and what it includes."""
         self._name = name
+        self.files = files
         own: dict[str | None, list[Rule]] = {}
         patterns: list[Rule] = []
         for rule in rules:
@@ -239,12 +192,7 @@ class Acl:
         AccessFileError names all that is wrong, in included files too; ValueError when `robot`
         cannot stand in a topic.
         """
-        check_topic(robot)
-        reader = _Reader(path.parent, robot)
-        reader.read(path)
-        if reader.problems:
-            raise AccessFileError(reader.problems)
-        return cls(path.name, reader.rules)
+        return cls(path.name, *read_rules(path, robot))
 
     @property
     def rules(self) -> list[Rule]:
@@ -394,131 +342,3 @@ def _samples(a: str, b: str, depth: int) -> Iterator[str]:
         topic = "/".join(shared + [_FRESH] * extra)
         if topic:
             yield topic
-
-
-class _LineError(ValueError):
-    """What is wrong in a line, and in which column, from 0."""
-
-    def __init__(self, column: int, message: str) -> None:
-        super().__init__(message)
-        self.column = column
-
-
-class _Reader:
-    """Reads an ACL file and those that it includes: all rules, and all that is wrong."""
-
-    def __init__(self, directory: Path, robot: str) -> None:
-        """File names of rules are as seen from `directory`."""
-        self.rules: list[Rule] = []
-        self.problems: list[Problem] = []
-        self._directory = directory
-        self._robot = robot
-        self._read: set[Path] = set()
-
-    def read(self, path: Path, including: tuple[Path, ...] = ()) -> None:
-        """Reads the file at `path`; `including` are those that led to it.
-
-        A file begins without a user, wherever it is included, and the one that includes it goes
-        on with the user that it had. So a file always means the same, and is read once.
-        """
-        try:
-            text = read_text(path, "make it, or name another in appliance.yaml")
-        except AccessFileError as error:
-            self.problems += error.problems
-            return
-        self._read.add(path.resolve())
-        below = path.is_relative_to(self._directory)
-        name = str(path.relative_to(self._directory) if below else path)
-        user: str | None = None
-        for number, raw in enumerate(text.split("\n"), 1):
-            line = raw.rstrip(_BLANK)
-            if not line or line[0] == "#":
-                continue
-            try:
-                column = _skip(line, 0)
-                keyword = line[column:].partition(" ")[0]
-                _check_keyword(keyword, column)
-                start = _skip(line, column + len(keyword))
-                rest = line[start:].lstrip(_BLANK)
-                if not rest:
-                    what = {"user": "a user name", "include": "a file"}.get(keyword, "a filter")
-                    raise _LineError(start, f"{what} is missing after {keyword!r}")
-                if keyword == "user":
-                    user = rest
-                elif keyword == "include":
-                    self._include(path, rest, (*including, path), start)
-                else:
-                    permission, filter = self._clause(line, start, keyword == "pattern")
-                    self.rules.append(
-                        Rule(
-                            name,
-                            number,
-                            line.strip(" ").replace("{robot}", self._robot),
-                            permission,
-                            filter,
-                            user if keyword == "topic" else None,
-                            keyword == "pattern",
-                        )
-                    )
-            except _LineError as mistake:
-                self.problems.append(Problem(path, number, mistake.column + 1, str(mistake)))
-
-    def _include(self, path: Path, target: str, including: tuple[Path, ...], column: int) -> None:
-        included = path.parent / target
-        if not included.is_file():
-            raise _LineError(column, f"there is no file {included} to include")
-        found = included.resolve()
-        if found in (file.resolve() for file in including):
-            way = " → ".join(file.name for file in (*including, included))
-            raise _LineError(column, f"a file must not include itself: {way}")
-        if found not in self._read:
-            self.read(included, including)
-
-    def _clause(self, line: str, start: int, pattern: bool) -> tuple[Permission, str]:
-        """What follows `topic` or `pattern` from column `start` on: [access] filter."""
-        word, _, rest = line[start:].partition(" ")
-        filter = rest.lstrip(_BLANK)
-        if filter:
-            permission = _PERMISSIONS.get(word)
-            if permission is None:
-                hint = "a filter with a space in it needs the access before it"
-                raise _LineError(start, _unknown("access", word, _PERMISSIONS) + f"; {hint}")
-        else:
-            permission, filter = Permission.READWRITE, word
-        column = len(line) - len(filter)
-        if pattern:
-            for level in filter.split("/"):
-                if level not in ("%c", "%u") and ("%c" in level or "%u" in level):
-                    raise _LineError(
-                        column, f"%c and %u must be alone in their level, not {level!r}"
-                    )
-                column += len(level) + 1
-            column = len(line) - len(filter)
-        filter = filter.replace("{robot}", self._robot)
-        try:
-            check_filter(filter)
-        except ValueError as error:
-            raise _LineError(column, f"{filter!r}: {error}") from None
-        return permission, filter
-
-
-def _skip(line: str, column: int) -> int:
-    """The column of what follows the spaces at `column`."""
-    return len(line) - len(line[column:].lstrip(" "))
-
-
-def _check_keyword(keyword: str, column: int) -> None:
-    if keyword in _KEYWORDS:
-        return
-    if "\t" in keyword:  # mosquitto takes no tab for a space either.
-        raise _LineError(column + keyword.index("\t"), "a tab; put spaces between the words")
-    if keyword.startswith("#"):
-        raise _LineError(column, "a comment begins in the first column")
-    raise _LineError(column, _unknown("keyword", keyword, _KEYWORDS))
-
-
-def _unknown(what: str, word: str, known: Iterable[str]) -> str:
-    known = list(known)
-    near = difflib.get_close_matches(word.lower(), known, 1)
-    advice = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-    return f"unknown {what} {word!r}; {advice}"

@@ -7,25 +7,111 @@ import hmac
 import logging
 import os
 import secrets
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
+from appliance.addresses import network
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
 from appliance.mqtt.codec import quote
 from appliance.mqtt.reason import ReasonCode
 
 from .acl import Acl
+from .checks import BusyError, Checks
+from .guesses import Guesses, Recent
 from .passwords import Passwords
 from .problems import AccessFileError, Problem
-from .scram import METHOD, ScramExchange
+from .scram import METHOD, ScramExchange, Verifier
 
 _log = logging.getLogger(__name__)
 
 # Logins that wait for a worker. More would wait longer than clients do, some 20 ms of CPU each.
 _MAX_WAITING: Final = 64
 
+# Seconds that a login may wait for its turn after others from its address failed: less than clients
+# wait.
+_PATIENCE: Final = 6.0
+
+# Failed logins that are known to be wrong, some 150 bytes each, and those that were sent away
+# unchecked: of the second kind there are many in a flood, and one that counts among them.
+_WRONG: Final = 1024
+_TURNED_AWAY: Final = 16_384
+
+# Logins with a password that is known to be wrong that are answered late, at a time.
+_PENITENTS: Final = 64
+
+#: Failed logins a minute, from one address or of one user, that slow nothing down.
+FAILED_LOGINS: Final = 30
+
 _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
+
+_STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
+_TOO_MANY: Final = Refusal(ReasonCode.SERVER_BUSY, "too many passwords wait to be checked")
+_COME_AGAIN: Final = Refusal(
+    ReasonCode.SERVER_BUSY,
+    "too many logins from its address were wrong, it has to come again "
+    "(broker.limits.failed_logins)",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What both files say, read and checked as a whole, and not in force yet."""
+
+    users_path: Path | None
+    acl_path: Path | None
+    robot: str
+    anonymous: bool
+    passwords: Passwords
+    acl: Acl | None
+
+    @classmethod
+    def read(cls, users: Path | None, acl: Path | None, robot: str, anonymous: bool) -> Rules:
+        """Reads both files; AccessFileError names all that is wrong with either."""
+        passwords, rules = Passwords(Path()), None
+        problems: list[Problem] = []
+        if users is not None:
+            try:
+                passwords = Passwords.load(users)
+            except AccessFileError as error:
+                problems += error.problems
+        if acl is not None:
+            try:
+                rules = Acl.load(acl, robot)
+            except AccessFileError as error:
+                problems += error.problems
+        if problems:
+            raise AccessFileError(problems)
+        return cls(users, acl, robot, anonymous, passwords, rules)
+
+    @property
+    def files(self) -> frozenset[Path]:
+        """What they were read from, included files too."""
+        named = {path for path in (self.users_path, self.acl_path) if path is not None}
+        return frozenset(named) | (self.acl.files if self.acl else frozenset())
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What is different after a reload; users by their names, sorted."""
+
+    users_added: list[str]
+    users_removed: list[str]
+    passwords_changed: list[str]
+    rules_changed: bool
+
+    @classmethod
+    def between(cls, before: Rules, after: Rules) -> Changes:
+        """What makes `after` another than `before`."""
+        old, new = before.passwords, after.passwords
+        known, now = set(old.users()), set(new.users())
+        return cls(
+            sorted(now - known),
+            sorted(known - now),
+            sorted(name for name in known & now if old.hash_of(name) != new.hash_of(name)),
+            (before.acl.rules if before.acl else None) != (after.acl.rules if after.acl else None),
+        )
 
 
 class FileAccess:
@@ -33,7 +119,14 @@ class FileAccess:
 
     Passwords are checked by threads of its own. The password that was right for a user is
     remembered, as an HMAC under a key that only this process has ever had, until the user's hash
-    changes: when all clients come back at once, nothing is hashed again, however many users.
+    changes: when all clients come back at once, nothing is hashed again, however many users, and
+    no guesser is in their way.
+
+    Other logins are guesses until they are checked: see `Guesses`. When an address has made so many
+    wrong ones that the next would wait too long, it is told to come again (0x89), and nothing is
+    hashed. Who then comes again with the same password waits in a line of its own: a guesser tries
+    others. A password that was found wrong is no guess when it comes again, but a device that was
+    set up wrongly: it slows nobody, and is not hashed again.
     """
 
     def __init__(
@@ -43,61 +136,94 @@ class FileAccess:
         robot: str,
         anonymous: bool = False,
         max_waiting: int = _MAX_WAITING,
+        failed_logins: int = FAILED_LOGINS,
+        patience: float = _PATIENCE,
     ) -> None:
         """Reads both files; AccessFileError names all that is wrong with either.
 
         Without a users file nobody has a password here. Without an ACL file whoever came in may
-        do everything, as in mosquitto.
+        do everything, as in mosquitto. `failed_logins` in a minute cost an address or a user
+        nothing; who would have to wait longer than `patience`, in seconds, is to come again.
         """
         self.epoch = 0
-        self._users_path = users
-        self._acl_path = acl
-        self._robot = robot
-        self._anonymous = anonymous
-        self._passwords, self._acl = self._load()
+        self._in_force = rules = Rules.read(users, acl, robot, anonymous)
+        self._passwords, self._acl = rules.passwords, rules.acl
         if acl is None:
             _log.warning("no ACL file: whoever is let in may read and write every topic")
         self._key = secrets.token_bytes(32)
         #: By user name: the login that was right, and the hash that it was right for.
         self._remembered: dict[str, tuple[bytes, str]] = {}
-        self._checking: dict[bytes, asyncio.Future[str | None]] = {}
-        self._busy = 0
+        self._wrong = Recent(_WRONG)
+        self._turned_away = Recent(_TURNED_AWAY)
+        self._penitents = 0
+        #: By address and login: what is found about it by the users file that is named.
+        self._checking: dict[tuple[bytes, bytes], asyncio.Task[str | Refusal | None]] = {}
         self._closed = False
+        self._patience = patience
+        self.guesses = Guesses(failed_logins)
         # One of two cores stays with the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
-        self._max_checking = workers + max_waiting
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="password")
+        self._checks: Checks[str | None] = Checks(workers, max_waiting)
 
-    def reload(self) -> None:
+    @property
+    def in_force(self) -> Rules:
+        """What both files said when they were last read."""
+        return self._in_force
+
+    def reload(self) -> Changes:
         """Reads both files again. AccessFileError leaves what was in force in force."""
-        self._passwords, self._acl = self._load()
+        before = self._in_force
+        return self.adopt(
+            Rules.read(before.users_path, before.acl_path, before.robot, before.anonymous)
+        )
+
+    def adopt(self, rules: Rules) -> Changes:
+        """Puts into force what was read; returns what is different now. It does not fail."""
+        before, self._in_force = self._in_force, rules
+        self._passwords, self._acl = rules.passwords, rules.acl
         self._checking.clear()  # They are about the old hashes, and are not joined any more.
+        self._wrong.clear()
         self._remembered = {
             username: (login, stored)
             for username, (login, stored) in self._remembered.items()
             if stored == self._passwords.hash_of(username)
         }
         self.epoch += 1
+        return Changes.between(before, rules)
 
     def close(self) -> None:
         """Stops the threads; logins that wait are refused. May be called twice."""
         self._closed = True
-        self._pool.shutdown(wait=True, cancel_futures=True)  # A hash takes some 20 ms.
+        self._checks.close()  # A hash takes some 20 ms.
 
     def users(self) -> list[str]:
         """The names of all users, sorted."""
         return self._passwords.users()
 
-    def exchange(self, method: str) -> Exchange | None:
+    def exchange(self, method: str, address: str | None) -> Exchange | None:
         """Begins an enhanced authentication; None when the method is not offered.
+
+        A stranger's, from this address, is a guess; with None it is one who has logged in, and
+        whom the guesses of others must not throw out.
 
         SCRAM-SHA-256 is, where there is a users file. The exchange knows the users as they are at
         each of its steps, a reload between them included. amqtt's plugins are not asked: they
         judge a user name and a password, and here is no password to show them.
         """
-        if method != METHOD or self._users_path is None:
+        if method != METHOD or self._in_force.users_path is None:
             return None
-        return ScramExchange(lambda username: self._passwords.verifier(username))
+
+        def verifier_of(username: str) -> Verifier:
+            return self._passwords.verifier(username)
+
+        if address is None:
+            return ScramExchange(verifier_of)
+        guesses = self.guesses
+        return ScramExchange(
+            verifier_of,
+            admits=lambda: guesses.turn(address, METHOD, patience=0.0) is not None,
+            failed=lambda username: guesses.failed(address, username),
+        )
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the rules in force let the client do this; see `Acl.decide`."""
@@ -108,9 +234,9 @@ class FileAccess:
     async def authenticate(
         self, username: str | None, password: bytes | None, client_id: str, address: str
     ) -> Identity | Refusal:
-        """Who the client is, or why it is refused. `address` makes no difference here."""
+        """Who the client is, or why it is refused. From where it comes counts for guesses only."""
         if username is None:
-            if self._anonymous:
+            if self._in_force.anonymous:
                 return Identity(None, client_id)
             return Refusal(ReasonCode.NOT_AUTHORIZED, "no user name, and anonymous is off")
         if password is None:
@@ -121,16 +247,26 @@ class FileAccess:
             stored = passwords.hash_of(username)
             if stored is not None and self._remembered.get(username) == (login, stored):
                 return Identity(username, client_id)
-            check = self._checking.get(login) or self._check(login, username, password)
-            if check is None:
-                if self._closed:
-                    return Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
-                return Refusal(ReasonCode.SERVER_BUSY, "too many passwords wait to be checked")
-            # Not the check itself is awaited: one that leaves must not cancel it for others.
-            await asyncio.wait([check])
-            if check.cancelled():
-                return Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
-            right = check.result()
+            if self._closed:
+                return _STOPPING
+            if login in self._wrong:
+                await self._repent(address, username)
+                right: str | Refusal | None = None
+            else:
+                where = network(address)
+                check = self._checking.get((where, login))
+                if check is None:
+                    turn = self._turn(address, login)
+                    if turn is None:
+                        return _COME_AGAIN
+                    check = self._begin_check((where, login), address, username, password, turn)
+                # Not the check itself is awaited: one that leaves must not cancel it for others.
+                await asyncio.wait([check])
+                if check.cancelled():
+                    return _STOPPING
+                right = check.result()
+            if isinstance(right, Refusal):
+                return right
             if right is not None and right == self._passwords.hash_of(username):
                 self._remembered[username] = login, right
             if self._passwords is not passwords:
@@ -140,42 +276,68 @@ class FileAccess:
             what = "unknown user" if stored is None else "wrong password for user"
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {quote(username)}")
 
-    def _check(
-        self, login: bytes, username: str, password: bytes
-    ) -> asyncio.Future[str | None] | None:
-        """Has a thread check the password; None when too many wait already, or after `close`."""
-        if self._closed or self._busy >= self._max_checking:
-            return None
-        loop = asyncio.get_running_loop()
-        verify = self._passwords.verified_hash
-        check = loop.run_in_executor(self._pool, verify, username, password)
-        self._busy += 1
-        self._checking[login] = check
-        check.add_done_callback(lambda check: self._checked(login, check))
+    def _turn(self, address: str, login: bytes) -> float | None:
+        """In how many seconds the login is looked at; None when that is too long."""
+        again = "again" if login in self._turned_away else ""
+        turn = self.guesses.turn(address, again, self._patience)
+        if turn is None:
+            self._turned_away.add(login)
+        return turn
+
+    def _begin_check(
+        self,
+        key: tuple[bytes, bytes],
+        address: str,
+        username: str,
+        password: bytes,
+        turn: float,
+    ) -> asyncio.Task[str | Refusal | None]:
+        check = asyncio.get_running_loop().create_task(
+            self._check(key, address, username, password, turn)
+        )
+        self._checking[key] = check
+
+        def forget(check: asyncio.Task[str | Refusal | None]) -> None:
+            if self._checking.get(key) is check:
+                del self._checking[key]
+
+        check.add_done_callback(forget)
         return check
 
-    def _checked(self, login: bytes, check: asyncio.Future[str | None]) -> None:
-        self._busy -= 1
-        if self._checking.get(login) is check:
-            del self._checking[login]
+    async def _check(
+        self, key: tuple[bytes, bytes], address: str, username: str, password: bytes, turn: float
+    ) -> str | Refusal | None:
+        """The hash that the password is right for, None when it is wrong."""
+        lane, login = key
+        delay = max(turn, self.guesses.hold_up(username))
+        if delay:
+            await asyncio.sleep(delay)
+        passwords = self._passwords
+        try:
+            right = await self._checks.run(
+                lane, partial(passwords.verified_hash, username, password)
+            )
+        except BusyError:
+            self._turned_away.add(login)
+            return _TOO_MANY
+        if right is None:
+            self.guesses.failed(address, username)
+            if self._passwords is passwords:
+                self._wrong.add(login)
+        return right
+
+    async def _repent(self, address: str, username: str) -> None:
+        """Let who comes with a wrong password again wait as long as others that guess."""
+        if self._penitents >= _PENITENTS:
+            return
+        delay = max(self.guesses.hold_up(username), self.guesses.delay(address))
+        if delay:
+            self._penitents += 1
+            try:
+                await asyncio.sleep(delay)
+            finally:
+                self._penitents -= 1
 
     def _login(self, username: str, password: bytes) -> bytes:
         name = username.encode()
         return hmac.digest(self._key, len(name).to_bytes(4, "big") + name + password, "sha256")
-
-    def _load(self) -> tuple[Passwords, Acl | None]:
-        passwords, acl = Passwords(Path()), None
-        problems: list[Problem] = []
-        if self._users_path is not None:
-            try:
-                passwords = Passwords.load(self._users_path)
-            except AccessFileError as error:
-                problems += error.problems
-        if self._acl_path is not None:
-            try:
-                acl = Acl.load(self._acl_path, self._robot)
-            except AccessFileError as error:
-                problems += error.problems
-        if problems:
-            raise AccessFileError(problems)
-        return passwords, acl

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
+#: Bytes of a file that can be meant: a hundred thousand users.
+MAX_SIZE: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +34,22 @@ class AccessFileError(ValueError):
         self.problems = list(problems)
 
 
-def read_text(path: Path, advice: str) -> str:
-    """The text of a file; AccessFileError when it is missing (then with `advice`) or not UTF-8."""
+def read_text(path: Path, advice: str, limit: int = MAX_SIZE) -> str:
+    """The text of a file of `limit` bytes at most.
+
+    AccessFileError when it is missing (then with `advice`), too large or not UTF-8.
+    """
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(limit + 1)
     except FileNotFoundError:
         raise AccessFileError([Problem(path, 0, 0, f"there is no such file; {advice}")]) from None
     except OSError as error:
         message = f"cannot be read ({error.strerror}); let the user that runs the appliance read it"
         raise AccessFileError([Problem(path, 0, 0, message)]) from error
+    if len(data) > limit:
+        message = f"larger than {limit >> 20} MiB; is it the right file?"
+        raise AccessFileError([Problem(path, 0, 0, message)])
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

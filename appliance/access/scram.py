@@ -182,12 +182,22 @@ class ScramExchange:
     client talks to us, and not to one who passes its messages on, is for certificates to show.
     """
 
-    def __init__(self, verifier_of: Callable[[str], Verifier], nonce: str | None = None) -> None:
+    def __init__(
+        self,
+        verifier_of: Callable[[str], Verifier],
+        nonce: str | None = None,
+        *,
+        admits: Callable[[], bool] = lambda: True,
+        failed: Callable[[str], None] = lambda username: None,
+    ) -> None:
         """`verifier_of` is asked at both messages; one that has changed between them fails.
 
-        `nonce` is the server's part of it, a random one unless a test brings its own.
+        `nonce` is the server's part of it, a random one unless a test brings its own. `admits` is
+        asked before anything is told about a user, and `failed` is told of a wrong proof for one.
         """
         self._verifier_of = verifier_of
+        self._admits = admits
+        self._failed = failed
         self._nonce = nonce or _base64(secrets.token_bytes(18))
         self._next: Callable[[str], bytes | Accepted | Refusal] = self._begin
 
@@ -201,7 +211,7 @@ class ScramExchange:
         except ValueError as error:
             return _refusal(f"{METHOD}: {error}")
 
-    def _begin(self, message: str) -> bytes:
+    def _begin(self, message: str) -> bytes | Refusal:
         if message:
             return self._first(message)
         # A CONNECT without data: the client is asked for its first message, as MQTT 5.0, section
@@ -209,7 +219,7 @@ class ScramExchange:
         self._next = self._first
         return b""
 
-    def _first(self, message: str) -> bytes:
+    def _first(self, message: str) -> bytes | Refusal:
         _check_extensions(message)
         match = _CLIENT_FIRST.fullmatch(message)
         if match is None:
@@ -219,6 +229,12 @@ class ScramExchange:
         name = prepared_name(_unescaped(match["name"]))
         if match["authzid"] and prepared_name(_unescaped(match["authzid"])) != name:
             raise ValueError(f"user {name!r} may not act for another one")
+        if not self._admits():
+            return Refusal(
+                ReasonCode.SERVER_BUSY,
+                "too many logins from its address were wrong, it has to come again "
+                "(broker.limits.failed_logins)",
+            )
         verifier = self._verifier_of(name)
         nonce = match["nonce"] + self._nonce
         answer = f"r={nonce},s={_base64(verifier.salt)},i={verifier.iterations}"
@@ -243,6 +259,8 @@ class ScramExchange:
         client_key = bytes(a ^ b for a, b in zip(proof, signature, strict=True))
         proven = hmac.compare_digest(hashlib.sha256(client_key).digest(), verifier.stored_key)
         changed = self._verifier_of(challenge.username) != verifier
+        if verifier.decoy or not (changed or proven):
+            self._failed(challenge.username)
         if verifier.decoy:
             return _refusal(verifier.decoy)
         if changed:

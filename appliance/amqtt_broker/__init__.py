@@ -15,12 +15,22 @@ for it run unchanged. Its listeners, sessions and broadcast loop are not used: w
 * A session's `username` is what the client gave, vouched for or not, as in amqtt; its `password`
   is None for users of the users file.
 * The protocol handlers of `BrokerContext`'s sessions are None, and so are packet ids of messages.
-* A plugin that computes, or waits without `await`, stops everything meanwhile: `FileAuthPlugin`
-  does while it hashes. The users file does not.
+* A plugin that computes, or waits without `await`, stops everything meanwhile. Those of amqtt that
+  do, `FileAuthPlugin` and the LDAP ones, are called in threads, each one call after the other.
+* What plugins said about a login holds for a while (`broker.plugin_answers`): a client that comes
+  back with the same is not asked about again.
 """
 
 from __future__ import annotations
 
 from .broker import ApplianceBroker, Files, PluginSettingsError, configuration, plugin_kinds
+from .logins import Answers
 
-__all__ = ["ApplianceBroker", "Files", "PluginSettingsError", "configuration", "plugin_kinds"]
+__all__ = [
+    "Answers",
+    "ApplianceBroker",
+    "Files",
+    "PluginSettingsError",
+    "configuration",
+    "plugin_kinds",
+]

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections import OrderedDict
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from amqtt.broker import BrokerContext
 from amqtt.contexts import Action as AmqttAction
@@ -17,17 +17,15 @@ from amqtt.session import Session as AmqttSession
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Access, Action, Decision, Identity
 
-from .guard import Guard, name
+from .guard import Guard, name, redacted
+from .logins import Answers
+from .threads import Threads, blocks
 from .views import Sessions, Unclaimed
 
 log = logging.getLogger(__name__)
 
-#: Seconds after which topic plugins are asked again, as they may have changed their mind.
-VERDICT_AGE = 10.0
 #: Seconds for which an older verdict holds while they are asked.
 VERDICT_USE = 600.0
-#: Verdicts of plugins that have to wait for something, kept in all.
-VERDICTS = 4096
 #: Questions to such plugins at one time, in all and of one client.
 QUESTIONS = 64
 CLIENT_QUESTIONS = 8
@@ -44,9 +42,10 @@ class PluginAccess:
 
     The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait for
     anything (rules in the configuration, a token) are run on the spot. From the first time that
-    one has to wait (HTTP, SQL), all are asked in the background: what is asked for the first time
-    is refused meanwhile, a SUBSCRIBE too, and the answer holds for the next try. Later an answer
-    older than 10 s holds while they are asked again, for 10 minutes at most.
+    one has to wait (HTTP, SQL, LDAP), all are asked in the background: what is asked for the first
+    time is refused meanwhile, a SUBSCRIBE too, and the answer holds for the next try. Later one
+    that is older than `answers` says, or from before the files were read again, holds while they
+    are asked anew, for 10 minutes at most.
 
     What already waits for a client is checked again when such an answer turns to no, or when the
     files are read again.
@@ -59,7 +58,11 @@ class PluginAccess:
         plugins: PluginManager[BrokerContext],
         sessions: Sessions,
         guard: Guard,
+        threads: Threads,
+        answers: Answers,
     ) -> None:
+        self.answers = answers
+        self._threads = threads
         self._files = files
         self._broker = broker
         self._plugins = plugins
@@ -67,7 +70,7 @@ class PluginAccess:
         self._guard = guard
         self._epoch = 0
         self._waits = False
-        self._verdicts: OrderedDict[Question, tuple[Decision, float]] = OrderedDict()
+        self._verdicts: OrderedDict[Question, tuple[Decision, float, int]] = OrderedDict()
         self._asked: dict[Question, asyncio.Task[None]] = {}
 
     @property
@@ -107,7 +110,7 @@ class PluginAccess:
         session = self._sessions.of_identity(identity)
         for plugin in self._plugins._topic_plugins:
             try:
-                answer = _answer_now(plugin, session, action, topic)
+                answer = _WAITS if blocks(plugin) else _answer_now(plugin, session, action, topic)
             except Exception:
                 # Whatever it was, the lack of a task perhaps: it is asked again in one, and what
                 # it raises there is told.
@@ -126,9 +129,14 @@ class PluginAccess:
 
     def _verdict(self, question: Question) -> Decision:
         """What the plugins last said; they are asked when that is long ago."""
-        decision, said_at = self._verdicts.get(question, (None, 0.0))
+        decision, said_at, epoch = self._verdicts.get(question, (None, 0.0, 0))
         age = asyncio.get_running_loop().time() - said_at
-        if (decision is None or age > VERDICT_AGE) and question not in self._asked:
+        is_old = (
+            decision is None
+            or age > self.answers.of_topic(allowed=decision.allowed)
+            or epoch != self._files.epoch
+        )
+        if is_old and question not in self._asked:
             own = sum(1 for asked in self._asked if asked[0] == question[0])
             if len(self._asked) >= QUESTIONS or own >= CLIENT_QUESTIONS:
                 return Decision(False, "the topic plugins have too many questions to answer", True)
@@ -142,17 +150,15 @@ class PluginAccess:
         """Ask all topic plugins and keep what they say."""
         identity, action, topic = question
         session = self._sessions.of_identity(identity)
-        work = self._plugins.map_plugin_topic(
-            session=session, topic=topic, action=AmqttAction(action.value)
-        )
         try:
-            answers = await self._guard.within(work)
+            answers = await self._guard.within(self._ask_all(session, action, topic))
         except asyncio.TimeoutError:
             reason = f"the topic plugins said nothing within {self._guard.timeout:g} s"
             decision = Decision(False, reason)
         except Exception as error:  # a plugin may raise anything
             self._guard.tell("an amqtt topic plugin", error)
-            decision = Decision(False, f"a topic plugin failed: {error!r}")
+            reason = redacted(repr(error), self._guard.secrets)
+            decision = Decision(False, f"a topic plugin failed: {reason}")
         else:
             refusing = ", ".join(name(plugin) for plugin, yes in answers.items() if not yes)
             reason = f"refused by {refusing}" if refusing else "allowed by the topic plugins"
@@ -161,10 +167,19 @@ class PluginAccess:
             del self._asked[question]
         self._keep(question, decision)
 
+    async def _ask_all(
+        self, session: AmqttSession, action: Action, topic: str
+    ) -> dict[BaseTopicPlugin, object]:
+        arguments = {"session": session, "topic": topic, "action": AmqttAction(action.value)}
+        plugins: list[Any] = list(self._plugins._topic_plugins)
+        asked = (self._threads.call(plugin, "topic_filtering", arguments) for plugin in plugins)
+        return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
+
     def _keep(self, question: Question, decision: Decision) -> None:
-        before, _ = self._verdicts.pop(question, (None, 0.0))
-        self._verdicts[question] = decision, asyncio.get_running_loop().time()
-        if len(self._verdicts) > VERDICTS:
+        before, _, _ = self._verdicts.pop(question, (None, 0.0, 0))
+        now = asyncio.get_running_loop().time()
+        self._verdicts[question] = decision, now, self._files.epoch
+        if len(self._verdicts) > self.answers.size:
             self._verdicts.popitem(last=False)
         was_allowed = before is not None and before.allowed
         if was_allowed and not decision.allowed:

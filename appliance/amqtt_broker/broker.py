@@ -7,14 +7,14 @@ import contextlib
 import logging
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
-from typing import Any, Protocol, cast
+from enum import Enum
+from typing import Any, Protocol, cast, get_type_hints
 
 import amqtt.broker
 from amqtt.contexts import BrokerConfig, ListenerConfig
 from amqtt.errors import BrokerError, PluginError, PluginLoadError
 from amqtt.events import BrokerEvents
 from amqtt.mqtt.protocol.broker_handler import BrokerProtocolHandler
-from amqtt.plugins.authentication import AnonymousAuthPlugin
 from amqtt.plugins.base import BaseAuthPlugin, BaseTopicPlugin
 from amqtt.session import Session as AmqttSession
 from amqtt.utils import import_string
@@ -24,16 +24,23 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Identity, Refusal
 from appliance.broker.session import Session
+from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
-from .access import VERDICT_AGE, PluginAccess
+from .access import PluginAccess
 from .events import PluginEvents
-from .guard import PLUGIN_TIMEOUT, Guard, name
+from .guard import PLUGIN_TIMEOUT, Guard, name, redacted
+from .logins import Answers, Guesses, PluginLogins
+from .threads import Threads
 from .views import RetainedMessages, Sessions, Unclaimed, login_of
 
 log = logging.getLogger(__name__)
+
+
+#: Nothing of a login is remembered unless that is asked for.
+_ANSWERS = Answers(keep=0.0, keep_refusals=0.0)
 
 
 class PluginSettingsError(ValueError):
@@ -42,6 +49,10 @@ class PluginSettingsError(ValueError):
 
 class Files(Access, Protocol):
     """The users file and the ACL file, as far as the plugins stand beside them."""
+
+    @property
+    def guesses(self) -> Guesses:
+        """How long logins have to wait because others were wrong."""
 
     def users(self) -> list[str]:
         """The names of all users."""
@@ -81,12 +92,30 @@ def configuration(
     """
     config = BrokerConfig(
         listeners={"default": ListenerConfig(bind=None)},
-        plugins={path: dict(settings) for path, settings in plugins.items()},
+        plugins={path: _typed(path, settings) for path, settings in plugins.items()},
     )
     # Added afterwards: BrokerConfig fills what equals a default from the listener "default".
     for bind, tls in listeners:
         config.listeners[bind] = ListenerConfig(bind=bind, ssl=tls, max_connections=connections)
     return config
+
+
+def _typed(path: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings, with the members of enumerations that the plugin wants for their names.
+
+    amqtt takes nothing else for them, which a file cannot hold.
+    """
+    typed = dict(settings)
+    try:
+        kinds = get_type_hints(getattr(import_string(path), "Config", None))
+    except (ImportError, NameError, TypeError):  # amqtt says better what is wrong with it
+        return typed
+    for key, value in settings.items():
+        kind = kinds.get(key)
+        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                typed[key] = kind(value)
+    return typed
 
 
 class _NoLink:
@@ -116,7 +145,8 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     `listen` and `hang_up` start and stop the listeners, where amqtt would its own. `files` stay
     in force: plugins can admit clients that the files do not know, and refuse what these allow.
-    `plugin_timeout` is in seconds.
+    `plugin_timeout` is in seconds. `certificate_user` is the user that a client's certificate
+    names, None for none; its ValueError refuses the client.
     """
 
     def __init__(
@@ -127,8 +157,16 @@ class ApplianceBroker(amqtt.broker.Broker):
         listen: Callable[[], Awaitable[None]],
         hang_up: Callable[[], Awaitable[None]],
         plugin_timeout: float = PLUGIN_TIMEOUT,
+        *,
+        answers: Answers = _ANSWERS,
+        secrets: Iterable[str] = (),
+        patience: float = PLUGIN_TIMEOUT,
+        certificate_user: Callable[[ssl.SSLObject], str | None] = lambda tls: None,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
+
+        `secrets` are strings of their settings that are told to nobody; `patience` is how many
+        seconds a login may wait when others from its address were wrong.
 
         Raises:
             PluginSettingsError: one cannot be loaded.
@@ -137,7 +175,10 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._files = files
         self._listen = listen
         self._hang_up = hang_up
-        self._guard = Guard(plugin_timeout)
+        self._guard = Guard(plugin_timeout, secrets)
+        self._threads = Threads()
+        self._answers = answers
+        self._certificate_user = certificate_user
         self._views = Sessions(broker)
         self._inside: Session | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -147,11 +188,22 @@ class ApplianceBroker(amqtt.broker.Broker):
             reasons = [str(error), str(error.__cause__ or "")]
             raise PluginSettingsError(
                 f"broker.plugins ({', '.join(cast(dict[str, Any], config.plugins))}): "
-                + ": ".join(filter(None, reasons))
-            ) from error
+                + redacted(": ".join(filter(None, reasons)), self._guard.secrets)
+            ) from None
         manager = self.plugins_manager
         self._events = PluginEvents(manager, self._views, self._guard)
-        self._access = PluginAccess(files, broker, manager, self._views, self._guard)
+        self._access = PluginAccess(
+            files, broker, manager, self._views, self._guard, self._threads, answers
+        )
+        self._logins = PluginLogins(
+            manager,
+            self._guard,
+            self._threads,
+            files.guesses,
+            lambda: files.epoch,
+            answers,
+            patience,
+        )
         # BrokerContext reads and writes these: they are windows on our broker.
         self._sessions = cast(Any, self._views)
         self._retained_messages = cast(Any, RetainedMessages(broker, self._retain_quietly))
@@ -208,6 +260,8 @@ class ApplianceBroker(amqtt.broker.Broker):
         if self._timer is not None:
             self._timer.cancel()
         self._access.close()
+        self._logins.close()
+        self._threads.close()
         await self._finish("close", self.plugins_manager.close())
         self.broker.observer = None
         self.broker.access = self._files
@@ -225,7 +279,7 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     def _tick(self) -> None:
         """Forget what has ended, and let topic plugins change their mind."""
-        self._timer = self._loop.call_later(VERDICT_AGE, self._tick)
+        self._timer = self._loop.call_later(self._answers.of_topic(allowed=True), self._tick)
         self._views.purge()
         if self.plugins_manager._topic_plugins:
             self._access.changed()
@@ -242,15 +296,22 @@ class ApplianceBroker(amqtt.broker.Broker):
     ) -> Identity | Refusal:
         """Who sent the CONNECT, or why it is refused.
 
-        Who has a line in the users file is decided by that file alone, and who needs none, as
-        anonymous clients are let in, comes in. Others come in when at least one plugin says yes
-        and none says no, under the user name that they gave if a plugin vouches for it. With a yes
-        of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
+        Who shows a certificate that names a user is that one, without a password, and may not say
+        to be another one. Who has a line in the users file is decided by that file alone, and who
+        needs none, as anonymous clients are let in, comes in. Others come in when at least one
+        plugin says yes and none says no, under the user name that they gave if a plugin vouches
+        for it. With a yes of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
         """
         username, password = connect.username, connect.password
         plugins = self.plugins_manager
         if plugins.plugins:
             self._events.connect_received(connect)
+        try:
+            owner = self._certificate_user(ssl_object) if ssl_object is not None else None
+        except ValueError as error:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, str(error))
+        if owner is not None:
+            return self._by_certificate(owner, connect, address, ssl_object)
         known = not plugins._auth_plugins or username in self._files.users()
         if known or username is None:
             who = await self._files.authenticate(username, password, connect.client_id, address)
@@ -265,9 +326,26 @@ class ApplianceBroker(amqtt.broker.Broker):
         except UnicodeDecodeError:
             return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
         login = login_of(connect, address, text, ssl_object)
-        who = await self._ask_plugins(login)
+        who = await self._logins.ask(login, address)
         if isinstance(who, Identity):
             self._admit(who, address, lambda: login)
+        return who
+
+    def _by_certificate(
+        self, owner: str, connect: Connect, address: str, ssl_object: ssl.SSLObject | None
+    ) -> Identity | Refusal:
+        if connect.username not in (None, "", owner):
+            # Two names are one too many to guess whose rights are meant.
+            reason = f"its certificate is of user {quote(owner)}, and it says to be another one"
+            return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
+
+        def login() -> AmqttSession:
+            shown = login_of(connect, address, None, ssl_object)
+            shown.username = owner
+            return shown
+
+        who = Identity(owner, connect.client_id)
+        self._admit(who, address, login)
         return who
 
     def _admit(self, identity: Identity, address: str, login: Callable[[], AmqttSession]) -> None:
@@ -279,36 +357,6 @@ class ApplianceBroker(amqtt.broker.Broker):
             log.info("the session that a plugin made is taken over by %s", identity)
             self.broker.claim(session, identity)
             self.broker.rules_changed()
-
-    async def _ask_plugins(self, login: AmqttSession) -> Identity | Refusal:
-        names = ", ".join(map(name, self.plugins_manager._auth_plugins))
-        try:
-            answers, vouched = await self._guard.within(self._answers(login))
-        except asyncio.TimeoutError:
-            reason = f"{names} said nothing within {self._guard.timeout:g} s"
-            return Refusal(ReasonCode.SERVER_UNAVAILABLE, reason)
-        except Exception as error:  # a plugin may raise anything
-            self._guard.tell(f"authentication by {names}", error)
-            return Refusal(ReasonCode.SERVER_UNAVAILABLE, f"{names} failed: {error!r}")
-        answered = {plugin: yes for plugin, yes in answers.items() if yes is not None}
-        if not answered:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, f"{names} do not know the client")
-        refusing = ", ".join(name(plugin) for plugin, yes in answered.items() if not yes)
-        if refusing:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, f"refused by {refusing}")
-        return Identity(login.username if vouched else None, login.client_id or "")
-
-    async def _answers(self, login: AmqttSession) -> tuple[dict[Any, Any], bool]:
-        """What each plugin says, and whether one vouches for the user name."""
-        # `map_plugin_auth` in two parts: who vouches is not to be seen from its mixed answers.
-        plugins: list[Any] = list(self.plugins_manager._auth_plugins)
-        demanding = [plugin for plugin in plugins if not isinstance(plugin, AnonymousAuthPlugin)]
-        undemanding = [plugin for plugin in plugins if plugin not in demanding]
-        ask = self.plugins_manager._map_plugin_method
-        answers = await ask(demanding, "authenticate", {"session": login})
-        vouched = not login.is_anonymous and any(answers.values())
-        answers |= await ask(undemanding, "authenticate", {"session": login})
-        return answers, vouched
 
     # --- what BrokerContext does ---------------------------------------------------------------
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import re
 import traceback
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterable
 from typing import Any, TypeVar
 
 log = logging.getLogger(__name__)
@@ -17,14 +19,21 @@ PLUGIN_TIMEOUT = 8.0
 #: Failures that are told apart, so that each is told once.
 _FAILURES = 1000
 
+#: Characters: what is shorter is in every text.
+_SHORT_SECRET = 4
+
 _T = TypeVar("_T")
 
 
 class Guard:
-    """Limits the time that plugins take, in seconds, and tells their failures."""
+    """Limits the time that plugins take, in seconds, and tells their failures.
 
-    def __init__(self, timeout: float = PLUGIN_TIMEOUT) -> None:
+    `secrets` are those of the plugins' settings: no failure is told with one of them in it.
+    """
+
+    def __init__(self, timeout: float = PLUGIN_TIMEOUT, secrets: Iterable[str] = ()) -> None:
         self.timeout = timeout
+        self.secrets = list(secrets)
         self._told: set[tuple[str, str]] = set()
 
     async def within(self, work: Coroutine[Any, Any, _T]) -> _T:
@@ -42,15 +51,42 @@ class Guard:
         finally:
             task.cancel()
 
-    def tell(self, what: str, error: BaseException) -> None:
-        """Log that `what` failed, with the traceback, the first time that it did so there."""
+    def tell(self, what: str, error: BaseException, secrets: Iterable[str] = ()) -> None:
+        """Log that `what` failed, with the traceback, the first time that it did so there.
+
+        `secrets` are what the plugin was told and nobody else may read, such as a password.
+        """
+        hidden = [*self.secrets, *secrets]
         last = traceback.extract_tb(error.__traceback__)[-1:]
         failure = what, f"{type(error).__name__} {last}"
         if failure in self._told or len(self._told) >= _FAILURES:
-            log.debug("%s failed again: %s", what, error)
+            log.debug("%s failed again: %s", what, redacted(str(error), hidden))
         else:
             self._told.add(failure)
-            log.error("%s failed; this is told once", what, exc_info=error)
+            told = "".join(traceback.format_exception(error)).rstrip()
+            log.error("%s failed; this is told once\n%s", what, redacted(told, hidden))
+
+
+def redacted(text: str, secrets: Iterable[str]) -> str:
+    """The text without the secrets, also as they stand in an address, in JSON or in a `repr`.
+
+    With one that is too short to be told from other text nothing is left.
+    """
+    for secret in sorted(filter(None, set(secrets)), key=len, reverse=True):
+        form = re.compile("".join(map(_form, secret)), re.IGNORECASE)
+        if len(secret) < _SHORT_SECRET and form.search(text):
+            return "(not shown: it may hold a secret)"
+        text = form.sub("********", text)
+    return text
+
+
+def _form(char: str) -> str:
+    """What a character may have become on its way into a message; each in its own way."""
+    encoded = "".join(f"%{byte:02x}" for byte in char.encode("utf-8", "surrogatepass"))
+    forms = {char, encoded, json.dumps(char)[1:-1], repr(char)[1:-1], ascii(char)[1:-1]}
+    if char == " ":
+        forms.add("+")
+    return f"(?:{'|'.join(map(re.escape, sorted(forms, key=len, reverse=True)))})"
 
 
 def name(plugin: object) -> str:

@@ -7,6 +7,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -38,6 +39,7 @@ class Row:
     cell: Cell
     ours: Figures | None = None
     peer: Figures | None = None
+    note: str | None = None  # what the cell tells beside its figures
     problem: str | None = None  # what went wrong
     missing: str | None = None  # what this computer lacks to run it
 
@@ -88,6 +90,10 @@ class Cell:
         """mosquitto, running, with what else the cell needs."""
         raise NotImplementedError
 
+    def note(self, site: Site) -> str | None:
+        """What there is to tell beside the figures, when all is over."""
+        return None
+
 
 @dataclass(frozen=True, slots=True)
 class LoadSide:
@@ -125,6 +131,27 @@ class LoadCell(Cell):
     def peer(self, site: Site, command: str) -> Iterator[Side]:
         with peers.mosquitto(command, site) as server:
             yield LoadSide(server, self.load, self.tls)
+
+
+@dataclass(frozen=True, slots=True)
+class StoreCell(LoadCell):
+    """This broker with the store in the way of every message, against itself without it."""
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        with peers.appliance(site, [], os.environ, "power") as server:
+            yield LoadSide(server, self.load, self.tls)
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        with peers.appliance(site, [], os.environ) as server:
+            yield LoadSide(server, self.load, self.tls)
+
+    def note(self, site: Site) -> str | None:
+        """The sizes of the groups in which messages were committed, out of the log."""
+        logs = [log.read_text(errors="replace") for log in site.directory.glob("*/log")]
+        found = re.search(r"\d+ commits of .*", "\n".join(logs))
+        return f"{found[0]}; in the peer's column: without the store" if found else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +283,7 @@ CELLS: tuple[Cell, ...] = (
     LoadCell("qos0-pair", "QoS 0, one pair, one at a time", {CPU: 1.0}, "qos0-pair"),
     LoadCell("qos0-pipelined", "QoS 0, one pair, pipelined", {CPU: 3.0}, "qos0-pipelined"),
     LoadCell("qos1-inflight50", "QoS 1, one pair, 50 in flight", {CPU: 1.5}, "qos1-inflight50"),
+    StoreCell("qos1-stored", "QoS 1, 50 in flight, stored", {"rate": 0.5}, "qos1-stored"),
     LoadCell("qos1-50pairs", "QoS 1, 50 pairs, one at a time each", {CPU: 1.0}, "qos1-50pairs"),
     LoadCell("qos0-fanout50", "QoS 0, one to 50 subscribers", {CPU: 1.0}, "qos0-fanout50"),
     LoadCell("qos1-100k", "QoS 1, 100 KB payload", {CPU: 1.0}, "qos1-100k"),
@@ -298,7 +326,8 @@ def compare(
         return Row(cell, missing=missing)
     # A connection's memory shows in a process that has not freed any: one run, a process each.
     # The search for the highest rate is a series of runs by itself.
-    repeats = 1 if cell.goals.keys() & {"memory_kib", "rate"} else repeats
+    if "memory_kib" in cell.goals or (isinstance(cell, BridgeCell) and cell.maximum):
+        repeats = 1
     runs: dict[str, list[Result]] = {"ours": [], "peer": []}
     problems: dict[str, str] = {}
     with tempfile.TemporaryDirectory(prefix="appliance-bench-") as directory:
@@ -327,9 +356,11 @@ def compare(
                 progress("stopping")
         except PeerError as error:  # what should be running at the end has ended before
             problems["end"] = str(error)
+        note = cell.note(site)
     return Row(
         cell,
         ours=median(runs["ours"]) if runs["ours"] else None,
         peer=median(runs["peer"]) if runs["peer"] else None,
+        note=note,
         problem="; ".join(problems.values()) or None,
     )

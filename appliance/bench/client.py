@@ -89,9 +89,11 @@ def packet(first_byte: int, body: bytes) -> bytes:
             return bytes(head) + body
 
 
-def connect_packet(client_id: str, username: str | None, password: bytes | None) -> bytes:
-    """CONNECT with a clean session and no keep alive (section 3.1)."""
-    flags, body = 0x02, field(client_id.encode())
+def connect_packet(
+    client_id: str, username: str | None, password: bytes | None, clean: bool = True
+) -> bytes:
+    """CONNECT without keep alive (section 3.1)."""
+    flags, body = 0x02 if clean else 0, field(client_id.encode())
     if username is not None:
         flags, body = flags | 0x80, body + field(username.encode())
     if password is not None:
@@ -201,7 +203,7 @@ class Tls:
 class Client:
     """One MQTT connection: opened step by step while blocking, then without ever blocking."""
 
-    def __init__(self, target: Target, client_id: str) -> None:
+    def __init__(self, target: Target, client_id: str, *, clean: bool = True) -> None:
         self.client_id = client_id
         self.socket = socket.create_connection((target.host, target.port), CONNECT_SECONDS)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -210,7 +212,7 @@ class Client:
         )
         self._watch: Callable[[bool], None] = lambda wanted: None
         self._waiting = False
-        self.write(connect_packet(client_id, target.username, target.password))
+        self.write(connect_packet(client_id, target.username, target.password, clean))
 
     def connected(self) -> None:
         """Wait for the CONNACK."""

@@ -44,6 +44,7 @@ class Load:
     batch: int = 1  # send only when this many fit into the window
     payload: int = 64  # bytes
     topics: int = 1  # of each publisher, each in its turn; the subscriber has one wildcard for all
+    stored: bool = False  # the subscribers' sessions outlive their connections
     idle: int = 0  # connections that only stay: measures memory, not messages
 
 
@@ -51,6 +52,7 @@ CELLS: dict[str, Load] = {
     "qos0-pair": Load(),
     "qos0-pipelined": Load(window=4096, batch=1024),
     "qos1-inflight50": Load(qos=1, window=50),
+    "qos1-stored": Load(qos=1, window=50, stored=True),
     "qos1-50pairs": Load(qos=1, pairs=50),
     "qos0-fanout50": Load(subscribers=50),
     "qos0-topics": Load(window=200, batch=100, topics=10_000),
@@ -194,8 +196,8 @@ class Subscriber(Client):
     """Counts messages by their length, and acknowledges them where QoS 1 asks for it."""
 
     def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
-        super().__init__(target, client_id)
         load = flow.load
+        super().__init__(target, client_id, clean=not load.stored)
         example = publish_packet(
             topic_of(topic, load, 0), bytes(load.payload), 0 if load.qos else None
         )

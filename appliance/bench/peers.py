@@ -166,7 +166,10 @@ keyfile {site.directory / "server.key"}
 
 @contextlib.contextmanager
 def appliance(
-    site: Site, routes: Sequence[Mapping[str, object]], environment: Mapping[str, str]
+    site: Site,
+    routes: Sequence[Mapping[str, object]],
+    environment: Mapping[str, str],
+    durability: str = "off",
 ) -> Iterator[Server]:
     """Run this appliance, with a bridge when there are routes; stopped in the end. PeerError."""
     directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
@@ -188,12 +191,13 @@ def appliance(
                 "certificate": str(site.directory / "server.crt"),
                 "key": str(site.directory / "server.key"),
                 "ca": str(site.ca),
-                "client_certificates": "none",
+                "client_certificates": "off",
             },
             "limits": {"inflight": INFLIGHT, **LIMITS},
+            "store": {"durability": durability},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
-        "log": {"level": "warning"},
+        "log": {"level": "warning", "levels": {"appliance.store": "info"}},
     }
     file = directory / "appliance.yaml"
     file.write_text(yaml.safe_dump(settings, sort_keys=False))

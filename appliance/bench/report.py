@@ -57,6 +57,7 @@ def to_json(
                     "ratios": {figure: row.ratio(figure) for figure in HEADINGS},
                     "goals": dict(row.cell.goals),
                     "met": row.met,
+                    "note": row.note,
                     "problem": row.problem,
                     "missing": row.missing,
                 }
@@ -128,6 +129,8 @@ def table(rows: Sequence[Row], peer: str | None) -> Table:
                 what = f"{figures.lost} of {figures.messages + figures.lost}"
                 result.add_row(title, f"[red]lost by {name.partition(' ')[0]}[/red]", what)
                 title = ""
+        if row.note:
+            result.add_row(title, escape(row.note))
         for note in (row.problem, row.missing):
             if note:
                 result.add_row(title, f"[red]{escape(note)}[/red]")

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
+from appliance.broker.kept import Kept, Owed
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
     Access,
@@ -23,6 +24,7 @@ from appliance.broker.ports import (
     Features,
     Guard,
     Identity,
+    Journal,
     Limits,
     Link,
     Observer,
@@ -82,6 +84,15 @@ class Ticking(Protocol):
     def flush(self) -> None:
         """Write what was sent to it."""
 
+    def wait(self, committed: int) -> bool:
+        """Keep what was sent to it, if it depends on a later batch of the store than this."""
+
+    def release(self, committed: int) -> bool:
+        """Write what does not depend on a later batch; True when some does."""
+
+    def resume(self) -> None:
+        """The store keeps again what is to be kept."""
+
     def abandon(self) -> None:
         """Close it without writing what was sent to it."""
 
@@ -140,10 +151,14 @@ class Broker:
         self.guards: dict[str, list[Guard]] = {}
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
+        self.journal: Journal | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
         #: Network clients with bytes to write.
         self.unflushed: list[Ticking] = []
+        #: Network clients with bytes that wait for a commit, in the order in which they do.
+        self._waiting: dict[Ticking, None] = {}
+        store.listen(self._committed)
         #: Grows whenever a cached route may be wrong.
         self.epoch = 0
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
@@ -219,22 +234,16 @@ class Broker:
         session.ends_at = None
         session.set_will(will)
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
-        self._set_expiry(session, expiry)
+        session.expiry = expiry
+        self.store.session_saved(session)
         return session, present
 
     def claim(self, session: Session, identity: Identity) -> None:
         """A session that was made for a client that had not logged in yet has found its user."""
         session.identity = identity
+        self.store.session_saved(session)
         session.readable.clear()
         self.epoch += 1
-
-    def _set_expiry(self, session: Session, expiry: int) -> None:
-        was_kept = session.persistent
-        session.expiry = expiry
-        if expiry:
-            self.store.session_saved(session)
-        elif was_kept:
-            self.store.session_removed(session)
 
     def connected(self, session: Session) -> None:
         """The CONNACK was sent: observers may know, and what waits may go."""
@@ -275,7 +284,7 @@ class Broker:
         session.forget_transient()
         self._hand_over(session)
         if expiry is not None:
-            self._set_expiry(session, min(expiry, self.limits.session_expiry))
+            session.expiry = min(expiry, self.limits.session_expiry)
         if self.observer is not None:
             self.observer.disconnected(session)
         self._tell_departure(session)
@@ -293,6 +302,7 @@ class Broker:
                 self._schedule(session.will_at, session)
             else:
                 self._publish_will(session)
+        self.store.session_saved(session)
 
     def _tell_departure(self, session: Session) -> None:
         for told in tuple(self.departures):
@@ -310,8 +320,7 @@ class Broker:
             self.epoch += 1
         session.hand_over(None, self._giver(absent_too=True), sent=True)
         session.clear()
-        if session.persistent:
-            self.store.session_removed(session)
+        self.store.session_removed(session)
 
     def _leave(self, session: Session, topic_filter: str) -> None:
         """Take a subscription out of the tree, or a member out of its group."""
@@ -367,6 +376,70 @@ class Broker:
 
     def _is_alive(self, session: Session) -> bool:
         return session.ends_at is None or session.ends_at > self.now
+
+    # --- what the store kept -------------------------------------------------------------------
+
+    def restore(self, kept: list[Kept], retained: list[Message]) -> None:
+        """Take up the sessions and retained messages of the last run, before anybody connects.
+
+        A client that was connected when that ended counts as gone since now: so do the time that
+        its session is kept, and the delay of its will. A session that was not to outlive its
+        connection is there for its will alone, which the next tick publishes (3.1.1 section
+        3.1.2.5, 5.0 section 3.1.2.5).
+        """
+        for entry in kept:
+            session = Session(entry.identity.client_id, entry.identity, self.ledger)
+            entry.session = self.sessions[session.client_id] = session
+            session.expiry = entry.expiry
+            session.set_will(entry.will)
+            session.ends_at = entry.ends_at
+            session.will_at = entry.will_at
+            if session.ends_at is None:
+                session.ends_at = self.now + session.expiry
+                if entry.will is not None:
+                    session.will_at = self.now + min(entry.will.delay, session.expiry)
+            self._schedule(session.ends_at, session)
+            if session.will_at is not None:
+                self._schedule(session.will_at, session)
+            for subscription in entry.subscriptions:
+                session.subscribe(subscription)
+                self._join(session, subscription)
+        for entry in kept:  # what is owed names sessions and groups, all of which are there now
+            self._restore_owed(entry)
+        for message in retained:
+            self.retained.set(message.topic, message)
+            self.retained_bytes += retained_size(message)
+            if message.expires_at is not None:
+                self._schedule_expiry(message)
+        self.epoch += 1
+
+    def _restore_owed(self, entry: Kept) -> None:
+        def delivery(owed: Owed) -> Delivery:
+            share = self._shares.get(owed.share) if owed.share is not None else None
+            return owed.message, owed.qos, owed.retain, owed.subscription_ids, share
+
+        assert entry.session is not None
+        entry.session.restore(
+            {
+                packet_id: delivery(owed) if owed is not None else None
+                for packet_id, owed in entry.inflight.items()
+            },
+            [delivery(owed) for owed in entry.queue],
+            {
+                packet_id: Held(
+                    message,
+                    frozenset(
+                        receiver
+                        for receiver in (
+                            *(self.sessions.get(name) for name in sessions),
+                            *(self._shares.get(name) for name in shares),
+                        )
+                        if receiver is not None
+                    ),
+                )
+                for packet_id, (message, sessions, shares) in entry.received.items()
+            },
+        )
 
     # --- publishing ----------------------------------------------------------------------------
 
@@ -501,7 +574,14 @@ class Broker:
             ProtocolError: the topic is not valid.
         """
         route = self.route(origin, message.topic_wire)
-        return self.publish_to(route.targets, route, message, origin)
+        if not self.ledger.refusing:
+            return self.publish_to(route.targets, route, message, origin)
+        # Who cannot be told would take it for kept: so it is, in memory, until the store can.
+        self.ledger.refusing = False
+        try:
+            return self.publish_to(route.targets, route, message, origin)
+        finally:
+            self.ledger.refusing = True
 
     def publish_to(
         self, targets: list[Target], route: Route, message: Message, origin: Session
@@ -523,7 +603,10 @@ class Broker:
             if session.deliver(message, qos, retain and as_published, subscription_ids):
                 taken = True
             elif qos:
-                self._tell_full(session)
+                if self.ledger.refusing and session.persistent:
+                    kept = False  # who publishes has to try again, whoever else has got it
+                else:
+                    self._tell_full(session)
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
@@ -531,7 +614,10 @@ class Broker:
                 taken = True
             elif published_qos and (asked := [member[0] for member in members if member[1]]):
                 self.counters.publish_dropped += chosen is None
-                self._tell_full(asked[0])
+                if self.ledger.refusing and any(session.persistent for session in asked):
+                    kept = False
+                else:
+                    self._tell_full(asked[0])
                 full = True
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
@@ -569,6 +655,15 @@ class Broker:
                 if not any(session.has_room(message) for session in asked):
                     full.add(share)
         return frozenset(full), bool(receivers) and len(full) == receivers
+
+    def must_store(self, route: Route, message: Message, origin: Session) -> bool:
+        """Whether the message, of QoS 1 or 2, would be kept in the store."""
+        return (
+            message.retain
+            or (message.qos == 2 and origin.persistent)
+            or any(qos and session.persistent for session, qos, _, _ in route.targets)
+            or any(qos and session.persistent for _, m in route.shares for session, qos, _, _ in m)
+        )
 
     def release(self, held: Held, origin: Session, age: float) -> None:
         """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
@@ -610,7 +705,12 @@ class Broker:
             guard.refused(session)
         if self.observer is not None:
             self.observer.refused(session, message)
+        self._tell_denied(session, Action.PUBLISH, route.topic, route.reason)
         self.complain(session, "may not publish to %s: %s", quote(route.topic), route.reason)
+
+    def _tell_denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        if self.journal is not None and session.identity is not None:
+            self.journal.denied(session, action, topic, reason)
 
     def complain(self, session: Session, message: str, *args: object) -> None:
         """Log what a client does wrong, but not every time that it does it again."""
@@ -626,6 +726,8 @@ class Broker:
         )
 
     def _retain(self, message: Message) -> bool:
+        if self.ledger.refusing and message.qos:
+            return False
         old = self.retained.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
             if old is None:
@@ -686,6 +788,7 @@ class Broker:
         if refusal is not None:
             code, reason = refusal
             name = quote(subscription.filter)
+            self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
             self.complain(session, "may not subscribe to %s: %s", name, reason)
             return code
         if session.subscriptions.get(subscription.filter) != subscription:
@@ -707,7 +810,7 @@ class Broker:
             return
         share = self._shares.get(topic_filter)
         if share is None:
-            share = self._shares[topic_filter] = Share()
+            share = self._shares[topic_filter] = Share(topic_filter)
             self._subscriptions.add(shared[1], topic_filter, share)
         share.members[session] = subscription
 
@@ -848,6 +951,7 @@ class Broker:
                 continue
             if session.will_at is not None and session.will_at <= now:
                 self._publish_will(session)
+                self.store.session_saved(session)
             if session.ends_at is not None and session.ends_at <= now:
                 log.info("%s: the session expired", session)
                 self.counters.sessions_expired += 1
@@ -858,7 +962,7 @@ class Broker:
     def flush(self) -> None:
         """Write to every network client what it was sent since the last flush.
 
-        With something staged in the store this waits for its commit: acknowledged means kept.
+        What depends on changes that the store has not committed waits: acknowledged means kept.
         """
         overflowed = self.ledger.overflowed
         while overflowed:
@@ -866,25 +970,58 @@ class Broker:
                 ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
             )
         while self.unflushed:  # what was written makes room for what waited
-            if self.store.staged:
-                self.store.after_commit(self._committed)
-                return
             clients = self.unflushed
             self.unflushed = []
+            if self.store.staged:
+                clients = self._hold_back(clients)
             for client in clients:
                 client.flush()
 
+    def _hold_back(self, clients: list[Ticking]) -> list[Ticking]:
+        """Let those wait whose bytes depend on what is not committed; returns the others."""
+        self.store.fresh = False
+        committed = self.store.committed
+        free: list[Ticking] = []
+        for client in clients:
+            if client.wait(committed):
+                self._waiting[client] = None
+            else:
+                free.append(client)
+        if self._waiting:
+            self.store.hurry()
+        return free
+
     def _committed(self, kept: bool) -> None:
-        if not kept:
-            clients, self.unflushed = self.unflushed, []
-            for client in clients:
+        waiting, self._waiting = self._waiting, {}
+        if kept:
+            committed = self.store.committed
+            self._waiting = {client: None for client in waiting if client.release(committed)}
+            if self.ledger.failing:
+                self._recover()
+        else:
+            if not self.ledger.failing:
+                self.ledger.failing = self.ledger.refusing = True
+                for session in self.sessions.values():
+                    session.hold_back()
+            for client in waiting:
                 client.abandon()
+        if self._waiting:
+            self.store.hurry()
         self.flush()
+
+    def _recover(self) -> None:
+        """What had to wait for the store can go on."""
+        self.ledger.failing = self.ledger.refusing = False
+        for client in tuple(self.clients):
+            client.resume()
+        for session in self.sessions.values():
+            session.go_on()
 
     def close(self, close: Callable[[Session], None]) -> None:
         """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""
         for session in list(self.sessions.values()):
-            session.set_will(None)
-            if session.link is not None and session.identity is not None:
-                close(session)
+            if session.link is not None:
+                session.set_will(None)
+                if session.identity is not None:
+                    close(session)
         self.flush()

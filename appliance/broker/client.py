@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import uuid
+from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -20,7 +21,7 @@ from appliance.broker.handshake import (
     pending_will,
 )
 from appliance.broker.message import Late, Message
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.broker.session import Held, Session
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
@@ -98,6 +99,9 @@ class Wire(Protocol):
     def accepted(self) -> None:
         """The client has logged in: the time limit for that is over."""
 
+    def secured(self) -> Secured:
+        """What protects the connection, and who its certificate says that the client is."""
+
     def later(self) -> None:
         """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
 
@@ -106,6 +110,10 @@ class Wire(Protocol):
 
     def close(self) -> None:
         """Write what was written so far, then close."""
+
+
+#: Why a message is refused while the store cannot take it.
+CANNOT_KEEP = "it cannot be stored: see the log of the store"
 
 
 def _reason(code: int, route: Route) -> str:
@@ -124,6 +132,12 @@ class Client:
         self.session: Session | None = None
         self._ledger = broker.ledger
         self._counters = broker.counters
+        self._store = broker.store
+        #: The batch of the store that what it is answered depends on, and what waits for which.
+        self._batch = 0
+        self._waiting: deque[tuple[int, list[bytes]]] = deque()
+        #: PUBRELs that wait until the store can keep what they release.
+        self._postponed: dict[int, None] = {}
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
         self._out: list[bytes] = []
@@ -180,8 +194,15 @@ class Client:
                     self.later()
         except ProtocolError as error:
             self.fail(error)
+        if self._store.fresh:
+            self._depend()
         if connection.held != self._held:
             self._count_held()
+
+    def _depend(self) -> None:
+        """What it was just answered depends on what was just staged."""
+        self._store.fresh = False
+        self._batch = self._store.batch
 
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
@@ -287,6 +308,15 @@ class Client:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         code = ReasonCode.SUCCESS
         held = session.received.get(packet_id)
+        if (
+            self._ledger.refusing
+            and route.allowed
+            and self.broker.must_store(route, message, session)
+        ):
+            session.unhold(packet_id)
+            self._counters.publish_dropped += 1
+            self._acknowledge(0x50, packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
+            return
         if held is not None and not held.message.is_like(message):
             # A client that has lost its memory begins anew with the same ids: what it does not
             # know of any more, it will not release. mosquitto sees it like this, too.
@@ -326,17 +356,43 @@ class Client:
             known = session.pubrec(packet_id, code)
             if not known:
                 log.debug("%s: PUBREC %d for nothing in flight", self, packet_id)
-            if code < 0x80:
+            if code < 0x80 and not (self._ledger.failing and session.expiry):
                 # An unknown id is answered too, or a client that missed our end would wait forever;
                 # without 0x92, which says nothing that it needs (and as mosquitto does).
                 self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
+            if self._ledger.failing and self._must_postpone(session, packet_id):
+                return
             held = session.unhold(packet_id)
             if held is not None:
                 self.broker.release(held, session, self.wire.now() - held.since)
             self._acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
+
+    def _must_postpone(self, session: Session, packet_id: int) -> bool:
+        """Whether a PUBREL, which cannot be refused, has to wait until the store can keep it."""
+        held = session.received.get(packet_id)
+        if held is None:
+            # Its PUBCOMP may depend on what is not kept yet.
+            postpone = session.persistent
+        else:
+            route = self.broker.route(session, held.message.topic_wire)
+            postpone = self.broker.must_store(route, held.message, session)
+        if postpone:
+            self._postponed[packet_id] = None
+        return postpone
+
+    def resume(self) -> None:
+        """The store keeps again what is to be kept: go on with what had to wait for it."""
+        postponed, self._postponed = self._postponed, {}
+        try:
+            for packet_id in postponed:
+                self._on_acknowledgement(PUBREL, packet_id, 0)
+        except ProtocolError as error:
+            self.fail(error)
+        if self._store.fresh:
+            self._depend()
 
     def _on_packet(self, packet: Packet) -> None:
         if isinstance(packet, Publish):
@@ -425,6 +481,7 @@ class Client:
             )
         log.info("%s disconnected", self)
         self._leave(
+            "it disconnected",
             publish_will=packet.reason_code != ReasonCode.NORMAL_DISCONNECTION,  # [MQTT-3.14.4-3]
             expiry=expiry if isinstance(expiry, int) else None,
         )
@@ -525,6 +582,9 @@ class Client:
             self.wire.address,
             reason,
         )
+        if self.broker.journal is not None:
+            address, secured = self.wire.address, self.wire.secured()
+            self.broker.journal.refused(address, reason, code, name, user, secured)
         self._counters.connects_refused += 1
         self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
@@ -553,7 +613,7 @@ class Client:
             self.refuse(error.code, str(error))
             return
         self.wire.accepted()
-        session.window = agreement.window
+        session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         session.reconnected()
@@ -587,6 +647,9 @@ class Client:
             agreement.keep_alive,
             ", session continued" if present else "",
         )
+        if self.broker.journal is not None:
+            address, secured = self.wire.address, self.wire.secured()
+            self.broker.journal.connected(session, address, packet.version, secured)
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
 
@@ -692,16 +755,20 @@ class Client:
 
         `reason` is for a refusal, and for clients that are to be told.
         """
-        if code >= 0x80 and self._explain and reason:
-            self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
-            return
+        packet = bytes((first, 2, packet_id >> 8, packet_id & 0xFF))
+        if code:
+            if self._version == 5:
+                if code >= 0x80 and self._explain and reason:
+                    self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
+                    return
+                packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
+            elif code == ReasonCode.QUOTA_EXCEEDED and self._ledger.refusing:
+                # 3.1.1 cannot refuse, and what is acknowledged must be kept.
+                raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
         out = self._out
         if not out:
             self.broker.unflushed.append(self)
-        if code and self._version == 5:
-            out.append(bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code)))
-        else:
-            out.append(bytes((first, 2, packet_id >> 8, packet_id & 0xFF)))
+        out.append(packet)
         self._counters.control_sent += 1
 
     def _send(self, packet: Packet) -> None:
@@ -723,7 +790,7 @@ class Client:
         elif self.session is None or isinstance(packet, Connack):
             # There is nothing to refuse it with [MQTT-3.14.0-1].
             self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
-            self._leave(publish_will=False)
+            self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
         elif not isinstance(packet, Disconnect):
             reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
             self.close(ReasonCode.PACKET_TOO_LARGE, reason)
@@ -744,8 +811,43 @@ class Client:
             if self.writable:  # the network has not asked for a pause
                 self.resume_writing()
 
+    def wait(self, committed: int) -> bool:
+        """Keep what was sent since the last flush, if it depends on a later batch than this."""
+        batch = self._batch
+        session = self.session
+        if session is not None and session.batch > batch:
+            batch = session.batch
+        waiting = self._waiting
+        if waiting and waiting[-1][0] > batch:
+            batch = waiting[-1][0]  # nothing passes what waits
+        if batch <= committed:
+            return False
+        out, self._out = self._out, []
+        if waiting and waiting[-1][0] == batch:
+            waiting[-1][1].extend(out)
+        else:
+            waiting.append((batch, out))
+        return True
+
+    def release(self, committed: int) -> bool:
+        """Write what waited for this batch; True when something waits for a later one."""
+        waiting = self._waiting
+        if self._full and not self._out:
+            self.writable = not self._closed
+        while waiting and waiting[0][0] <= committed:
+            chunks = waiting.popleft()[1]
+            if chunks:
+                self.wire.write(chunks)
+        if waiting:
+            return True
+        if not self._out:
+            self._out_size = 0
+            self.flush()
+        return False
+
     def abandon(self) -> None:
         """Close without sending what waits: what it would acknowledge could not be kept."""
+        self._waiting.clear()
         self._out.clear()
         self.lost()
         self.wire.close()
@@ -777,6 +879,8 @@ class Client:
         """The client broke the protocol: tell it why, where it can be told, and close."""
         self._complain("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
+            if self.broker.journal is not None:
+                self.broker.journal.refused(self.wire.address, str(error), error.code)
             # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
             # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
@@ -787,7 +891,7 @@ class Client:
         elif error.told:
             self._end(error.code, str(error))
         else:
-            self._leave(publish_will=True)
+            self._leave(str(error), publish_will=True)
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
@@ -798,7 +902,7 @@ class Client:
         if self._version == 5:
             words: Properties | None = {Property.REASON_STRING: message} if self._explain else None
             self._send(Disconnect(reason, words))
-        self._leave(publish_will=True)
+        self._leave(message, publish_will=True)
 
     def _complain(self, message: str, *args: object) -> None:
         """Log what came from the client's address, unless it is a flood."""
@@ -811,7 +915,7 @@ class Client:
         if not self._closed:
             if self.session is not None:
                 log.info("%s: connection lost", self)
-            self._leave(publish_will=True)
+            self._leave("connection lost", publish_will=True)
 
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
@@ -820,10 +924,12 @@ class Client:
         self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
         return True
 
-    def _leave(self, *, publish_will: bool, expiry: int | None = None) -> None:
+    def _leave(self, why: str, *, publish_will: bool, expiry: int | None = None) -> None:
         session = self.session
         self._shut()
         if session is not None:
+            if self.broker.journal is not None:
+                self.broker.journal.disconnected(session, self.wire.address, why)
             self.broker.disconnect(session, self, publish_will=publish_will, expiry=expiry)
 
     def _shut(self) -> None:

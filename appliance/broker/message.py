@@ -110,6 +110,11 @@ class Message:
             self._properties_wire = encode_varint(len(passed_on)) + passed_on
         return self._properties_wire
 
+    @property
+    def passed_on(self) -> bytes | None:
+        """The properties that all receivers get in the publisher's order, where it is known."""
+        return self._passed_on
+
     def _properties_of_all(self) -> bytes:
         if self._passed_on is None:
             properties = dict(self.properties or {})

@@ -13,7 +13,7 @@ from appliance.mqtt.reason import ReasonCode
 
 if TYPE_CHECKING:
     from appliance.broker.message import Message
-    from appliance.broker.session import Session
+    from appliance.broker.session import Delivery, Held, Session
 
 
 class Action(Enum):
@@ -123,17 +123,35 @@ class Link(Protocol):
 class Store(Protocol):
     """Keeps sessions and retained messages through a restart.
 
-    Each method stages a change; what depends on it is sent only after `after_commit` called back.
+    Each method stages a change. Changes are committed in batches, which are numbered from 1 on.
+    What depends on a change is sent only when its batch is committed.
     """
 
-    #: True while something is staged and not yet committed.
+    #: True while there are changes that something may depend on, and that are not committed.
     staged: bool
 
-    def after_commit(self, callback: Callable[[bool], None]) -> None:
-        """Call back with True when all that is staged now is kept, with False when it failed."""
+    #: True when such a change was staged since this was last set to False.
+    fresh: bool
+
+    #: The batch that changes go into now, and the last one that is committed.
+    batch: int
+    committed: int
+
+    def listen(self, callback: Callable[[bool], None]) -> None:
+        """Call back whenever a batch is done with: with True when it is kept.
+
+        With False when it could not be: then it is tried again, with all that is staged meanwhile,
+        for as long as it takes, and `staged` is False until that succeeds, though nothing is kept.
+        """
+
+    def hurry(self) -> None:
+        """Commit soon: somebody waits."""
+
+    def has_room(self, size: int) -> bool:
+        """Whether a message of so many bytes more may be kept."""
 
     def session_saved(self, session: Session) -> None:
-        """The session was made, or its expiry changed."""
+        """The session was made, or its owner, its expiry or its will changed."""
 
     def session_removed(self, session: Session) -> None:
         """The session and all that belongs to it ended."""
@@ -147,11 +165,26 @@ class Store(Protocol):
     def retained(self, message: Message) -> None:
         """The message is its topic's retained message now; an empty payload deletes it."""
 
-    def queued(self, session: Session, message: Message, qos: int) -> None:
-        """A QoS 1 or 2 message is owed to the session."""
+    def queued(self, session: Session, delivery: Delivery) -> None:
+        """A QoS 1 or 2 message is owed to the session, and waits."""
 
-    def settled(self, session: Session, message: Message) -> None:
+    def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        """A message is on its way under that packet id, whether it was queued before or not."""
+
+    def settled(self, session: Session, delivery: Delivery) -> None:
         """A message that was owed is acknowledged, expired or dropped."""
+
+    def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        """PUBREC came for a QoS 2 message: PUBREL is all that is left of it."""
+
+    def completed(self, session: Session, packet_id: int) -> None:
+        """PUBCOMP came."""
+
+    def held(self, session: Session, packet_id: int, held: Held) -> None:
+        """A QoS 2 message of the session's client waits for its PUBREL."""
+
+    def unheld(self, session: Session, packet_id: int) -> None:
+        """It does not any more."""
 
 
 class Guard(Protocol):
@@ -187,6 +220,41 @@ class Observer(Protocol):
 
     def retained(self, message: Message) -> None:
         """A retained message was kept, or, with an empty payload, deleted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Secured:
+    """How a connection is secured: the version of TLS, and the name in the client's certificate.
+
+    Both are empty where there is none.
+    """
+
+    version: str = ""
+    certificate: str = ""
+
+
+class Journal(Protocol):
+    """Told of who comes, who is refused, and who leaves: an audit log. Not of messages."""
+
+    def connected(self, session: Session, address: str, version: int, secured: Secured) -> None:
+        """A client came in, with this version of MQTT."""
+
+    def refused(
+        self,
+        address: str,
+        reason: str,
+        code: int = 0,
+        client_id: str | None = None,
+        username: str | None = None,
+        secured: Secured | None = None,
+    ) -> None:
+        """A connection, or the client on it, did not come in; who it is, it said itself."""
+
+    def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        """The rules do not let a client publish or subscribe."""
+
+    def disconnected(self, session: Session, address: str, reason: str) -> None:
+        """A client's connection ended."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,10 @@ class Ledger:
     memory: int = field(init=False)
     #: And what a connected client may hold when all the memory is taken by others, in bytes.
     reserve: int = field(init=False)
+    #: Nothing can be kept: the store's last commit failed.
+    failing: bool = False
+    #: And who publishes now can be told so.
+    refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
 
@@ -147,7 +151,9 @@ class Session:
     """
 
     __slots__ = (
+        "_agreed_window",
         "_last_packet_id",
+        "batch",
         "bytes",
         "client_id",
         "ends_at",
@@ -190,7 +196,10 @@ class Session:
         self.inflight: dict[int, Delivery | None] = {}
         #: Of those in flight, the ids that a new connection was not sent yet.
         self.resends: deque[int] = deque()
-        self.window = ledger.limits.inflight
+        #: Messages that may be in flight; none while those that are could not be kept.
+        self.window = self._agreed_window = ledger.limits.inflight
+        #: The batch of the store that what this session sends depends on.
+        self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
         #: Retained messages of new subscriptions, by filter; they go before anything newer. They
@@ -273,16 +282,12 @@ class Session:
                 and not self.queue
                 and not self.replays
             ):
-                if self.expiry:
-                    self._owe(message, qos)
                 self._send(link, (message, qos, retain, subscription_ids, share))
                 return True
             if len(self.queue) < ledger.limits.queue_messages:
-                self._enqueue((message, qos, retain, subscription_ids, share))
-                return True
+                return self._enqueue((message, qos, retain, subscription_ids, share))
         if ledger.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
-            self._enqueue((message, qos, retain, subscription_ids, share))
-            return True
+            return self._enqueue((message, qos, retain, subscription_ids, share))
         if ledger.limits.queue_full == "disconnect" and link is not None:
             ledger.overflowed.append(self)
         ledger.counters.publish_dropped += 1
@@ -296,33 +301,52 @@ class Session:
         """
         if not self.deliver(*delivery):
             self.ledger.counters.publish_dropped -= 1
-            self._enqueue(delivery)
+            self._enqueue(delivery, promised=True)
 
     def has_room(self, message: Message) -> bool:
         """Whether a QoS 1 or 2 message would be kept."""
         limits = self.ledger.limits
+        if self.expiry and not self._may_store(message):
+            return False
         return limits.queue_full == "drop-oldest" or (
             len(self.queue) < limits.queue_messages and self.fits(message.size)
         )
 
-    def _enqueue(self, delivery: Delivery) -> None:
+    def _may_store(self, message: Message) -> bool:
+        ledger = self.ledger
+        return not ledger.refusing and ledger.store.has_room(message.size)
+
+    def _enqueue(self, delivery: Delivery, *, promised: bool = False) -> bool:
+        """Let it wait; False when it had to be stored and cannot be, which is counted."""
         message = delivery[0]
+        if self.expiry:
+            if not promised and not self._may_store(message):
+                self.ledger.counters.publish_dropped += 1
+                return False
+            self._staged()
+            self.ledger.store.queued(self, delivery)
         message.settle()
         self._count(message)
         self.queue.append(delivery)
-        self._owe(message, delivery[1])
+        return True
+
+    def _staged(self) -> None:
+        """What is sent from now on depends on what is about to be staged."""
+        self.batch = self.ledger.store.batch
 
     def _drop_oldest_for(self, message: Message) -> bool:
         """Make room at the old end of the queue; False when even then there is none."""
         ledger = self.ledger
         if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
             return False
+        if self.expiry and self.ledger.refusing:
+            return False
         while self.queue and not (
             len(self.queue) < ledger.limits.queue_messages and self.fits(message.size)
         ):
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
-            self._settled(oldest[0], oldest[1])
+            self._settled(oldest)
             ledger.counters.publish_dropped += 1
         return self.fits(message.size)
 
@@ -391,7 +415,6 @@ class Session:
                     self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
                     break
                 if qos:
-                    self._owe(message, qos)
                     self._send(link, delivery)
                 else:
                     link.publish(message, 0, 0, False, retain, subscription_ids)
@@ -403,11 +426,59 @@ class Session:
             message = delivery[0]
             self._uncount(message)
             if self.ledger.has_expired(message) or self._is_forbidden(message):
-                self._settled(message, delivery[1])
+                self._settled(delivery)
                 # Its number is used up, as by mosquitto, which gives them out on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
                 self._send(link, delivery)
+
+    def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
+        """Drop what waits and is too old; returns how many messages that were."""
+        kept = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
+        dropped = len(self.queue) - len(kept)
+        if dropped:
+            for delivery in self.queue:
+                if is_old(delivery[0]):
+                    self._uncount(delivery[0])
+                    self._settled(delivery)
+            self.queue = kept
+            self.ledger.counters.publish_dropped += dropped
+        return dropped
+
+    def open_window(self, size: int) -> None:
+        """Let so many messages be in flight, once it can be kept that they are."""
+        self._agreed_window = size
+        self.window = 0 if self.ledger.failing and self.expiry else size
+
+    def hold_back(self) -> None:
+        """Send nothing that would have to be stored until `go_on`, as it cannot be."""
+        self.window = 0 if self.expiry else self._agreed_window
+
+    def go_on(self) -> None:
+        """It can again."""
+        self.window = self._agreed_window
+        if self.link is not None:
+            for packet_id, delivery in self.inflight.items():
+                if delivery is None:  # as PUBREC may have come meanwhile
+                    self.link.pubrel(packet_id)
+            self.pump()
+
+    def restore(
+        self,
+        inflight: dict[int, Delivery | None],
+        queue: list[Delivery],
+        received: dict[int, Held],
+    ) -> None:
+        """Owe again what the session was owed when the broker ended."""
+        self.inflight.update(inflight)
+        self.queue.extend(queue)
+        self.received.update(received)
+        for delivery in (*inflight.values(), *queue):
+            if delivery is not None:
+                self._count(delivery[0])
+        for held in received.values():
+            self._count(held.message)
+        self._last_packet_id = next(reversed(inflight), 0)
 
     def resend(self) -> None:
         """Send again what was in flight when the last connection ended [MQTT-4.4.0-1]."""
@@ -415,10 +486,10 @@ class Session:
         assert link is not None
         self.resends.clear()
         for packet_id, delivery in self.inflight.items():
-            if delivery is None:
-                link.pubrel(packet_id)
-            else:
+            if delivery is not None:
                 self.resends.append(packet_id)
+            elif not (self.expiry and self.ledger.failing):
+                link.pubrel(packet_id)
         self.pump()
 
     def _send(self, link: Link, delivery: Delivery) -> None:
@@ -429,6 +500,9 @@ class Session:
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
         inflight[packet_id] = delivery
+        if self.expiry:
+            self._staged()
+            self.ledger.store.sent(self, delivery, packet_id)
         self.bytes += message.size
         self.ledger.queued_bytes += message.size
         link.publish(message, qos, packet_id, False, retain, subscription_ids)
@@ -479,13 +553,9 @@ class Session:
         self.bytes -= message.size
         self.ledger.queued_bytes -= message.size
 
-    def _owe(self, message: Message, qos: int) -> None:
+    def _settled(self, delivery: Delivery) -> None:
         if self.expiry:
-            self.ledger.store.queued(self, message, qos)
-
-    def _settled(self, message: Message, qos: int) -> None:
-        if qos and self.expiry:
-            self.ledger.store.settled(self, message)
+            self.ledger.store.settled(self, delivery)
 
     # --- acknowledgements of the client --------------------------------------------------------
 
@@ -503,12 +573,11 @@ class Session:
         del self.inflight[packet_id]
         if self.resends and packet_id in self.resends:
             self.resends.remove(packet_id)
-        message = delivery[0]
-        size = message.size
+        size = delivery[0].size
         self.bytes -= size
         self.ledger.queued_bytes -= size
         if self.expiry:
-            self.ledger.store.settled(self, message)
+            self.ledger.store.settled(self, delivery)
         if self.queue or self.replays or self.resends:
             self.pump()
         return True
@@ -534,7 +603,9 @@ class Session:
         else:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
-            self._settled(delivery[0], 2)
+            if self.expiry:
+                self._staged()
+                self.ledger.store.recorded(self, delivery, packet_id)
         return True
 
     def pubcomp(self, packet_id: int) -> bool:
@@ -548,6 +619,8 @@ class Session:
         if self.inflight[packet_id] is not None:
             raise _wrong("PUBCOMP", packet_id)
         del self.inflight[packet_id]
+        if self.expiry:
+            self.ledger.store.completed(self, packet_id)
         if self.queue or self.replays or self.resends:
             self.pump()
         return True
@@ -557,7 +630,7 @@ class Session:
         delivery = self.inflight.pop(packet_id, None)
         if delivery is not None:
             self._uncount(delivery[0])
-            self._settled(delivery[0], delivery[1])
+            self._settled(delivery)
 
     # --- QoS 2 from the client -----------------------------------------------------------------
 
@@ -568,6 +641,8 @@ class Session:
         held.message.settle()
         self.received[packet_id] = held
         self._count(held.message)
+        if self.expiry:
+            self.ledger.store.held(self, packet_id, held)
         return True
 
     def reconnected(self) -> None:
@@ -580,6 +655,8 @@ class Session:
         held = self.received.pop(packet_id, None)
         if held is not None:
             self._uncount(held.message)
+            if self.expiry:
+                self.ledger.store.unheld(self, packet_id)
         return held
 
     # --- subscriptions and the will ------------------------------------------------------------
@@ -637,7 +714,7 @@ class Session:
         for delivery in self.queue:
             if is_given(delivery):
                 self._uncount(delivery[0])
-                self._settled(delivery[0], delivery[1])
+                self._settled(delivery)
             else:
                 kept.append(delivery)
         self.queue = kept

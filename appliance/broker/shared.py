@@ -19,7 +19,8 @@ ASKED = 128
 class Share:
     """One `$share/{group}/{filter}` and its members, in the order in which they came."""
 
-    def __init__(self) -> None:
+    def __init__(self, topic_filter: str) -> None:
+        self.filter = topic_filter
         self.members: dict[Session, Subscription] = {}
         self._turn = 0
 

@@ -11,7 +11,7 @@ from appliance.broker.broker import Broker, retained_size
 from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
-from appliance.broker.session import Session, subscription_size
+from appliance.broker.session import Delivery, Held, Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
@@ -57,54 +57,87 @@ class FakeAccess:
 class FakeStore(MemoryStore):
     """Knows what is owed to whom, and can hold back its commit.
 
-    With `holding`, everything counts as staged until `commit`.
+    With `holding`, what is staged waits for `commit`; else it counts as kept at once.
     """
 
     def __init__(self) -> None:
-        self.holding = False
+        super().__init__()
+        self.holding = self._failing = False
         self.sessions: set[str] = set()
         self.subscriptions: dict[tuple[str, str], int] = {}
         self.kept: dict[str, bytes] = {}
         self.owed: Counter[tuple[str, Message]] = Counter()
-        self._callbacks: list[Callable[[bool], None]] = []
+        self._known: set[tuple[str, int]] = set()
 
-    @property
-    def staged(self) -> bool:  # type: ignore[override]
-        return self.holding
+    def listen(self, callback: Callable[[bool], None]) -> None:
+        self._tell = callback
 
-    def after_commit(self, callback: Callable[[bool], None]) -> None:
-        self._callbacks.append(callback)
+    def _stage(self) -> None:
+        if self.holding:
+            self.fresh = True
+            self.staged = not self._failing
 
     def commit(self, kept: bool = True) -> None:
-        self.holding = False
-        callbacks, self._callbacks = self._callbacks, []
-        for callback in callbacks:
-            callback(kept)
+        """The end of a batch; what is staged from now on is kept at once, unless it failed."""
+        self.staged = False
+        self.holding = self._failing = not kept
+        if kept:
+            self.committed = self.batch
+        self.batch += 1
+        self._tell(kept)
 
     def session_saved(self, session: Session) -> None:
-        self.sessions.add(session.client_id)
+        if session.persistent:
+            self._stage()
+            self.sessions.add(session.client_id)
+        else:
+            self.session_removed(session)
 
     def session_removed(self, session: Session) -> None:
         self.sessions.discard(session.client_id)
+        self._known = {key for key in self._known if key[0] != session.client_id}
         for kept in (self.owed, self.subscriptions):
             for key in [key for key in kept if key[0] == session.client_id]:
                 del kept[key]
 
     def subscribed(self, session: Session, subscription: Subscription) -> None:
+        self._stage()
         self.subscriptions[session.client_id, subscription.filter] = subscription.qos
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         del self.subscriptions[session.client_id, topic_filter]
 
     def retained(self, message: Message) -> None:
+        self._stage()
         self.kept[message.topic] = message.payload
         if not message.payload:
             del self.kept[message.topic]
 
-    def queued(self, session: Session, message: Message, qos: int) -> None:
-        self.owed[session.client_id, message] += 1
+    def queued(self, session: Session, delivery: Delivery) -> None:
+        self._stage()
+        key = session.client_id, id(delivery)
+        assert key not in self._known
+        self._known.add(key)
+        self.owed[session.client_id, delivery[0]] += 1
 
-    def settled(self, session: Session, message: Message) -> None:
+    def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        self._stage()
+        if (session.client_id, id(delivery)) not in self._known:
+            self.queued(session, delivery)
+
+    def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        self._stage()
+        self.settled(session, delivery)
+
+    def held(self, session: Session, packet_id: int, held: Held) -> None:
+        self._stage()
+
+    def unheld(self, session: Session, packet_id: int) -> None:
+        self._stage()
+
+    def settled(self, session: Session, delivery: Delivery) -> None:
+        self._known.remove((session.client_id, id(delivery)))
+        message = delivery[0]
         self.owed[session.client_id, message] -= 1
         if not self.owed[session.client_id, message]:
             del self.owed[session.client_id, message]

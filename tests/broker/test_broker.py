@@ -1157,52 +1157,7 @@ def test_routes_of_invented_topics_are_not_kept_for_ever(join: Join):
     assert not session.routes
 
 
-# --- acknowledged means kept
-
-
-def test_bytes_wait_for_the_commit(join: Join, store: FakeStore):
-    """Rule 2 of the design"""
-    subscriber, publisher = join("subscriber"), join("publisher")
-    subscriber.subscribe("a", 1)
-    store.holding = True
-    publisher.send(Publish("a", b"x", 1, packet_id=1))
-    assert publisher.received() == [] and subscriber.received() == []
-    store.commit()
-    publisher.only(Puback)
-    assert subscriber.payloads() == [b"x"]
-
-
-def test_a_failed_commit_closes_the_connections_concerned(join: Join, store: FakeStore):
-    """Rule 2: without an acknowledgement"""
-    publisher, other = join("publisher"), join("other")
-    store.holding = True
-    publisher.send(Publish("a", b"x", 1, packet_id=1))
-    store.commit(kept=False)
-    assert publisher.received() == [] and publisher.wire.closed
-    assert not other.wire.closed
-    store.holding = True
-    other.send(Publish("a", b"x", 1, packet_id=1))
-    store.commit()
-    other.only(Puback)
-
-
-def test_a_failed_commit_closes_a_connection_that_was_ending(join: Join, store: FakeStore):
-    publisher = join("publisher")
-    store.holding = True
-    publisher.send(Publish("a", b"x", 1, packet_id=1), bytes((0xE0, 0)))
-    store.commit(kept=False)
-    assert publisher.received() == [] and publisher.wire.closed
-
-
-def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store: FakeStore):
-    """Rule 2: the acknowledgement does not leave ahead of it with the last bytes."""
-    publisher = join("publisher")
-    store.holding = True
-    publisher.send(Publish("a", b"x", 1, packet_id=1), bytes((0xE0, 0)))
-    assert publisher.received() == []
-    store.commit()
-    publisher.only(Puback)
-    assert publisher.wire.closed
+# --- what the store and observers are told
 
 
 def test_the_store_knows_the_subscriptions_of_lasting_sessions(join: Join, store: FakeStore):

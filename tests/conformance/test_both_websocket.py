@@ -123,7 +123,7 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
         return Identity(connect.username, connect.client_id)
 
     listeners = Listeners(
-        broker, let_in, lambda method: None, connections=10, connect_timeout=PATIENCE
+        broker, let_in, lambda method, address: None, connections=10, connect_timeout=PATIENCE
     )
     settings = ListenerSettings("127.0.0.1", 0, None, protocol="websocket")
     ((host, port),) = await listeners.start([settings])

@@ -298,6 +298,7 @@ def test_what_cannot_be_kept_closes_the_connection(
 ) -> None:
     """The disk is full, say: there is no acknowledgement, and the client will send it again."""
     client = joined(broker, "c", clean=False)
+    client.say("82 06 0001 0001 61 01")
     store.holding = True
     assert client.say(data) == b"" and not client.closed
     store.commit(kept=False)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
 import random
+import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -43,6 +46,7 @@ def attack(
     at_least: float = 0.0,
     short: bool = True,
     said_after: float = 0.0,
+    p99: float = math.inf,
     **limits: Any,
 ) -> Callable[[Run], Run]:
     """Enter a function into ATTACKS under its name."""
@@ -50,7 +54,7 @@ def attack(
     def enter(run: Run) -> Run:
         name = run.__name__.replace("_", "-")
         what = " ".join((run.__doc__ or "").split())
-        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after)
+        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after, p99)
         return run
 
     return enter
@@ -116,6 +120,86 @@ async def costly_strangers(fight: Fight) -> None:
 
     while fight.on:
         await fight.crowd(200, say, 1.0)
+
+
+#: Logins a second with a wrong password.
+GUESSES = 1000
+
+
+async def _guess(fight: Fight) -> None:
+    """Wrong passwords of every kind of user, some of them again and again, and one right one.
+
+    That comes from another address, for a user that is guessed at and was not here before.
+    """
+    names = ["alice", USER, "root", "admin", "operator"]
+    loop = asyncio.get_running_loop()
+    pending: set[asyncio.Task[None]] = set()
+
+    async def guess(number: int) -> None:
+        password = b"123456" if number % 10 == 0 else b"guess %d" % number
+        name = names[number % len(names)] if number % 3 else f"user{number}"
+        packet = fight.connect_packet(f"g{number}", username=name, password=password)
+        with contextlib.suppress(OSError, asyncio.TimeoutError):
+            line = await fight.dial()
+            try:
+                line.say(packet)
+                if await line.hear(4):
+                    fight.counts[f"answered 0x{line.first[3]:02x}"] += 1
+            finally:
+                line.transport.abort()
+                fight.lines.discard(line)
+
+    async def flood() -> None:
+        began = loop.time()
+        number = 0
+        while fight.on:
+            due = int((loop.time() - began) * GUESSES)
+            while number < due:
+                number += 1
+                if len(pending) < 800:  # as many as may be connected, with room for others
+                    task = asyncio.ensure_future(guess(number))
+                    pending.add(task)
+                    task.add_done_callback(pending.discard)
+            await asyncio.sleep(0.005)
+
+    async def log_in() -> None:
+        await asyncio.sleep(0.5 * fight.seconds)
+        sock = socket.socket()
+        sock.setblocking(False)
+        sock.bind(("127.0.0.2", 0))
+        began = loop.time()
+        await loop.sock_connect(sock, ("127.0.0.1", fight.target.plain_port))
+        _, line = await loop.create_connection(lambda: Line(sock), sock=sock)
+        line.say(fight.connect_packet("owner"))
+        assert await line.hear(4) and line.first[3] == 0, f"not let in: {line.first.hex()}"
+        fight.counts["ms for a right login"] = round((loop.time() - began) * 1000)
+        line.hang_up()
+
+    await fight.together(flood(), log_in())
+    for task in pending:
+        task.cancel()
+
+
+@attack(
+    r"refused: (too many (logins|passwords)|wrong password|unknown user)", at_least=2.0, p99=0.05
+)
+async def wrong_logins(fight: Fight) -> None:
+    """A thousand wrong logins a second, of which no limit of connections keeps any away."""
+    await _guess(fight)
+
+
+@attack(
+    r"127\.0\.0\.1\S* .*connection_rate",
+    at_least=1.4,
+    short=False,
+    p99=0.05,
+    connection_rate=100,
+    connections_per_address=250,
+    connect_timeout="10 s",
+)
+async def wrong_logins_by_default(fight: Fight) -> None:
+    """The same, with the limits of connections as they are by default."""
+    await _guess(fight)
 
 
 @attack(r"127\.0\.0\.1\S* .*connection_rate", connection_rate=100, connections_per_address=250)

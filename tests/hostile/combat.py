@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import multiprocessing
 import os
 import socket
@@ -273,7 +274,8 @@ class Attack:
     `limits` are of `broker.limits`, beside those of `arena.LIMITS`; with less time than `at_least`
     (seconds) nothing comes of it, and with less than `said_after` too little for the log to tell:
     the buffers on the way take that long to fill. `short` is whether it is worth a second in CI,
-    beside the others.
+    beside the others. `p99` is what 99 of 100 round trips of the healthy client may take, in
+    seconds.
     """
 
     name: str
@@ -284,6 +286,7 @@ class Attack:
     at_least: float = 0.0
     short: bool = True
     said_after: float = 0.0
+    p99: float = math.inf
 
 
 def encode(version: int, *packets: Packet) -> bytes:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ipaddress
 import shutil
 import socket
 import ssl
@@ -12,7 +11,9 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
+from authorities import ADDRESSES, NAMES
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import (
     BestAvailableEncryption,
@@ -23,29 +24,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from appliance import certs
-from appliance.certs import CertificateError
-
-NAMES = ["r2d2", "r2d2.local", "localhost"]
-ADDRESSES: list[certs.Address] = [
-    ipaddress.IPv4Address("127.0.0.1"),
-    ipaddress.IPv6Address("::1"),
-]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with an authority, a server's certificate and a client's; nobody changes it."""
-    directory = tmp_path_factory.mktemp("appliance") / "certs"
-    certs.create_authority(directory, "r2d2")
-    certs.issue_server(directory, NAMES, ADDRESSES)
-    certs.issue_client(directory, "tablet")
-    return directory
-
-
-@pytest.fixture
-def own(made: Path, tmp_path: Path) -> Path:
-    """A copy of it to change."""
-    return Path(shutil.copytree(made, tmp_path / "certs"))
+from appliance.certs import CertificateError, addresses, authority, files
 
 
 def load(path: Path) -> x509.Certificate:
@@ -72,6 +51,7 @@ def test_files_and_their_modes(made: Path) -> None:
         "server.key": 0o600,
         "clients/tablet.crt": 0o644,
         "clients/tablet.key": 0o600,
+        "issued.jsonl": 0o644,
     }
     assert stat.S_IMODE(made.stat().st_mode) == 0o755
 
@@ -89,7 +69,7 @@ def test_the_authority(made: Path) -> None:
     assert str(common_name.value).startswith("r2d2 CA ")
     assert isinstance(authority.public_key(), ec.EllipticCurvePublicKey)
     lifetime = authority.not_valid_after_utc - datetime.now(timezone.utc)
-    assert timedelta(days=3649) < lifetime <= certs.AUTHORITY_VALID
+    assert timedelta(days=3649) < lifetime <= timedelta(days=3650)
 
 
 @pytest.mark.parametrize(
@@ -171,11 +151,11 @@ def test_a_certificate_of_someone_else_is_not_replaced(own: Path, tmp_path: Path
 def test_a_certificate_does_not_outlive_its_authority(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certs, "AUTHORITY_VALID", timedelta(days=100))
+    monkeypatch.setattr(authority, "AUTHORITY_VALID", timedelta(days=100))
     certs.create_authority(tmp_path)
     certs.issue_server(tmp_path, NAMES, [])
-    authority, server = load(tmp_path / "ca.crt"), load(tmp_path / "server.crt")
-    assert server.not_valid_after_utc == authority.not_valid_after_utc
+    ca, server = load(tmp_path / "ca.crt"), load(tmp_path / "server.crt")
+    assert server.not_valid_after_utc == ca.not_valid_after_utc
 
 
 def test_an_authority_that_is_not_whole(own: Path, tmp_path: Path) -> None:
@@ -211,7 +191,7 @@ def test_a_clock_that_was_never_set(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         def now(cls, tz=None) -> datetime:
             return datetime(1970, 1, 1, tzinfo=tz)
 
-    monkeypatch.setattr(certs, "datetime", Clock)
+    monkeypatch.setattr(authority, "datetime", Clock)
     with pytest.raises(CertificateError, match="clock says 1970-01-01"):
         certs.create_authority(tmp_path)
     assert not list(tmp_path.iterdir())
@@ -221,7 +201,7 @@ def test_a_write_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(certs.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
         certs.create_authority(tmp_path)
     assert not list(tmp_path.iterdir())
@@ -245,8 +225,8 @@ def test_a_resolver_that_does_not_answer_is_not_waited_for(
         answer.wait(10)
         return "too.late"
 
-    monkeypatch.setattr(certs.socket, "getfqdn", getfqdn)
-    monkeypatch.setattr(certs, "_RESOLVER_PATIENCE", 0.01)
+    monkeypatch.setattr(addresses.socket, "getfqdn", getfqdn)
+    monkeypatch.setattr(addresses, "_RESOLVER_PATIENCE", 0.01)
     names, _ = certs.local_names()
     answer.set()
     assert "too.late" not in names and "localhost" in names
@@ -322,7 +302,7 @@ def client_context(authority: Path) -> ssl.SSLContext:
 
 
 def server_context(
-    directory: Path, client_certificates: certs.ClientCertificates = "none"
+    directory: Path, client_certificates: certs.ClientCertificates = "off"
 ) -> ssl.SSLContext:
     return certs.server_context(
         directory / "server.crt",
@@ -474,9 +454,9 @@ def test_client_certificates_need_an_authority(made: Path) -> None:
 def test_certificates_out_of_their_time(
     own: Path, monkeypatch: pytest.MonkeyPatch, offset: timedelta, message: str
 ) -> None:
-    monkeypatch.setattr(certs, "_check_validity", lambda *_: None)
+    monkeypatch.setattr(authority, "out_of_time", lambda *_: "")
     now = datetime.now(timezone.utc).replace(microsecond=0)
-    monkeypatch.setattr(certs, "_now", lambda: now + offset)
+    monkeypatch.setattr(authority, "_now", lambda: now + offset)
     certs.issue_server(own, NAMES, ADDRESSES)
     monkeypatch.undo()
     with pytest.raises(CertificateError, match=message):
@@ -484,12 +464,13 @@ def test_certificates_out_of_their_time(
 
 
 def test_a_certificate_that_expires_soon_is_told(
-    own: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certs, "CERTIFICATE_VALID", timedelta(days=20))
+    monkeypatch.setattr(authority, "CERTIFICATE_VALID", timedelta(days=20))
     certs.issue_server(own, NAMES, ADDRESSES)
-    server_context(own)
-    assert "server.crt expires on " in caplog.text
+    tls_files = certs.TlsFiles(own / "server.crt", own / "server.key")
+    [warning] = certs.load_tls(tls_files, {}).warnings()
+    assert "server.crt expires on " in warning
 
 
 def test_a_certificate_of_ones_own_with_an_rsa_key(own: Path) -> None:
@@ -505,7 +486,7 @@ def test_a_certificate_of_ones_own_with_an_rsa_key(own: Path) -> None:
         .not_valid_before(now)
         .not_valid_after(now + timedelta(days=90))
         .add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=False)
-        .sign(key, certs.hashes.SHA256())
+        .sign(key, hashes.SHA256())
     )
     (own / "server.crt").write_bytes(certificate.public_bytes(Encoding.PEM))
     (own / "server.key").write_bytes(pem_of(key, None))

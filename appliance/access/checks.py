@@ -1,0 +1,120 @@
+"""The threads that hash passwords: few, behind everything else, and each address in its turn."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Final, Generic, TypeVar
+
+#: How far the threads stand back behind the event loop, see nice(2).
+NICE: Final = 10
+
+T = TypeVar("T")
+
+
+class BusyError(Exception):
+    """As many wait for a check as may."""
+
+
+class Checks(Generic[T]):
+    """Runs checks in `workers` threads; `max_waiting` may wait for one. On the event loop.
+
+    Each lane has its turn, whatever waits in the others. When no more may wait, who comes takes
+    the place of the last in the longest lane, if that is longer than its own: a flood from one
+    address keeps nobody else out.
+    """
+
+    def __init__(self, workers: int, max_waiting: int) -> None:
+        self._workers = workers
+        self._max_waiting = max_waiting
+        self._running = 0
+        self._waiting = 0
+        self._closed = False
+        self._lanes: OrderedDict[bytes, deque[tuple[asyncio.Future[T], Callable[[], T]]]]
+        self._lanes = OrderedDict()
+        self._pool = ThreadPoolExecutor(
+            workers, thread_name_prefix="password", initializer=_stand_back
+        )
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing runs and nothing waits."""
+        return not (self._running or self._waiting)
+
+    async def run(self, lane: bytes, check: Callable[[], T]) -> T:
+        """The result of the check, which must not raise.
+
+        Raises:
+            BusyError: it was not its turn, and others need the place.
+            CancelledError: `close` was called.
+        """
+        if self._closed:
+            raise asyncio.CancelledError
+        if self._waiting >= self._max_waiting and self._running >= self._workers:
+            self._make_room(lane)
+        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        self._lanes.setdefault(lane, deque()).append((future, check))
+        self._waiting += 1
+        self._start_next()
+        return await future
+
+    def close(self) -> None:
+        """Cancel what waits, and wait for what runs. May be called twice."""
+        self._closed = True
+        for lane in self._lanes.values():
+            for future, _ in lane:
+                with contextlib.suppress(RuntimeError):  # its event loop may be closed already
+                    future.cancel()
+        self._lanes.clear()
+        self._waiting = 0
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _make_room(self, lane: bytes) -> None:
+        longest = max(self._lanes, key=lambda name: len(self._lanes[name]), default=lane)
+        if len(self._lanes.get(longest, ())) <= len(self._lanes.get(lane, ())) + 1:
+            raise BusyError
+        future, _ = self._lanes[longest].pop()
+        self._waiting -= 1
+        if not future.done():
+            future.set_exception(BusyError())
+
+    def _start_next(self) -> None:
+        while self._lanes and self._running < self._workers:
+            name, lane = self._lanes.popitem(last=False)
+            future, check = lane.popleft()
+            if lane:
+                self._lanes[name] = lane  # the others' turn is before its next
+            self._waiting -= 1
+            if future.done():  # who wanted to know has gone
+                continue
+            self._running += 1
+            running = asyncio.get_running_loop().run_in_executor(self._pool, check)
+            running.add_done_callback(partial(self._ended, future))
+
+    def _ended(self, future: asyncio.Future[T], ran: asyncio.Future[T]) -> None:
+        self._running -= 1
+        if not self._closed:
+            self._start_next()
+        if future.done():
+            return
+        if ran.cancelled():
+            future.cancel()
+        elif (error := ran.exception()) is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(ran.result())
+
+
+def _stand_back() -> None:
+    # On Linux a thread has a priority of its own, and needs no rights to lower it. Where there is
+    # none, hashing shares the processor like everything else.
+    with contextlib.suppress(OSError):
+        thread = threading.get_native_id()
+        priority = os.getpriority(os.PRIO_PROCESS, thread) + NICE
+        os.setpriority(os.PRIO_PROCESS, thread, min(priority, 19))

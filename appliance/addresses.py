@@ -1,0 +1,21 @@
+"""What counts as one address where limits are an address's."""
+
+from __future__ import annotations
+
+import socket
+
+
+def network(address: str) -> bytes:
+    """One address of IPv4; of IPv6 a network of 64 bits, as one site has; or one Unix socket.
+
+    `address` is a host, with its port or without: "127.0.0.1", "127.0.0.1:54321", "[::1]:54321".
+    """
+    if address.startswith("unix:"):
+        return address.encode()
+    host = address.rpartition("]")[0][1:] if address.startswith("[") else address
+    if host.count(":") < 2:
+        return socket.inet_aton(host.partition(":")[0])
+    packed = socket.inet_pton(socket.AF_INET6, host.partition("%")[0])
+    if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
+        return packed[12:]
+    return packed[:8]

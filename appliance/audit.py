@@ -1,0 +1,390 @@
+"""The audit log: who connected, was refused, changed what; JSON, one object a line, in files.
+
+The event loop puts events into a bounded queue, and a thread of its own writes them: a slow disk
+delays nobody, and a full one loses lines, which are counted and told in the file as soon as it can
+be written again. A flood is told in part, and counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import json
+import logging
+import os
+import queue
+import stat
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from appliance.broker.ports import Action, Identity, Secured
+from appliance.mqtt.reason import ReasonCode
+
+if TYPE_CHECKING:
+    from appliance.broker.session import Session
+
+log = logging.getLogger(__name__)
+
+#: Events that wait to be written; more are lost, and counted.
+WAITING: Final = 10_000
+
+#: Events of one kind from one address, or of one user, that are written in one interval, and its
+#: seconds. More are counted. And of how many kinds and addresses this is known.
+BURST: Final = 100
+INTERVAL: Final = 10.0
+SOURCES: Final = 1024
+
+#: Characters of one value: client ids and topics are up to 64 KiB.
+LONGEST: Final = 256
+
+#: Seconds between two tries while the file cannot be written.
+RETRY: Final = 1.0
+
+#: Seconds that the end of the process waits for the last lines.
+PARTING: Final = 2.0
+
+#: What is written about one event, in the order of the line.
+Fields: TypeAlias = dict[str, Any]
+
+
+class AuditError(ValueError):
+    """The audit log cannot be written; the message says why and what to do."""
+
+
+@dataclass(slots=True)
+class _Flood:
+    """What came from one source in an interval."""
+
+    since: float
+    told: int = 0
+    untold: int = 0
+    last: Fields | None = None
+
+
+class Audit:
+    """Writes the audit log: the broker's `Journal`, and `changed` for what is done to it.
+
+    All methods but `_write_all` and what that calls are the event loop's.
+    """
+
+    def __init__(self, path: Path, size: int, keep: int) -> None:
+        """Opens the file; `size` in bytes is its limit, `keep` how many full ones are kept.
+
+        Raises:
+            AuditError: it cannot be written there.
+        """
+        self._file = _File(path, size, keep)
+        self._queue: queue.Queue[Fields | None] = queue.Queue(WAITING)
+        self._overflowed = 0  # events that found no place, counted by the event loop
+        self._counted = 0  # and how many of these the thread has seen
+        self._lost = 0  # lines that are not in the file, nor told there
+        self._broken = False
+        self._over = threading.Event()
+        self._floods: OrderedDict[tuple[str, str], _Flood] = OrderedDict()
+        self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what waits, for two seconds at most, and close the file. May be called twice."""
+        if not self._thread.is_alive():
+            return
+        self._over.set()
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=PARTING)
+        self._thread.join(PARTING)
+
+    # --- what happens --------------------------------------------------------------------------
+
+    def connected(self, session: Session, address: str, version: int, secured: Secured) -> None:
+        """A client came in."""
+        self._put(
+            "connected",
+            **_who(session.identity),
+            address=address,
+            mqtt="5" if version == 5 else "3.1.1",
+            **_how(secured),
+        )
+
+    def refused(
+        self,
+        address: str,
+        reason: str,
+        code: int = 0,
+        client_id: str | None = None,
+        username: str | None = None,
+        secured: Secured | None = None,
+    ) -> None:
+        """A client, or a connection, did not come in; what it said of itself is not proven."""
+        said: Fields = {}
+        if client_id is not None:
+            said = {"client": client_id, "user": username}
+        how = _how(secured) if secured is not None else {}
+        self._put("refused", **said, address=address, **how, **_code(code), reason=reason)
+
+    def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        """A client may not do what it wanted to do with a topic."""
+        self._put(
+            "denied",
+            **_who(session.identity),
+            action=action.value,
+            topic=topic,
+            reason=reason,
+        )
+
+    def disconnected(self, session: Session, address: str, reason: str) -> None:
+        """A client's connection ended."""
+        self._put("disconnected", **_who(session.identity), address=address, reason=reason)
+
+    def changed(self, what: str, **details: Any) -> None:
+        """Something was changed, or was not, as `details` say: users, rules, certificates."""
+        self._put("changed", what=what, **details)
+
+    def began(self) -> None:
+        """The appliance began to listen."""
+        self._put("started", pid=os.getpid())
+
+    def ended(self) -> None:
+        """It stops."""
+        self._put("stopped", pid=os.getpid())
+
+    def _put(self, event: str, **fields: Any) -> None:
+        try:
+            self._queue.put_nowait({"time": _now(), "event": event, **fields})
+        except queue.Full:
+            self._overflowed += 1
+
+    # --- the thread ----------------------------------------------------------------------------
+
+    def _write_all(self) -> None:
+        ending = False
+        while not ending:
+            events: list[Fields] = []
+            with contextlib.suppress(queue.Empty):
+                event = self._queue.get(timeout=1.0 if self._floods or self._lost else None)
+                while event is not None:
+                    events.append(event)
+                    if len(events) == 1000:
+                        break
+                    event = self._queue.get_nowait()
+                ending = event is None
+            now = time.monotonic()
+            lines = [line for event in events for line in self._admit(event, now)]
+            lines += self._summaries(now, everything=ending)
+            self._write(lines)
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _admit(self, event: Fields, now: float) -> list[Fields]:
+        """What is to be written of an event: nothing when there were too many like it."""
+        if event["event"] in ("changed", "started", "stopped"):
+            return [event]
+        # Client ids are free to choose: of who is in, it is the user that counts.
+        whose = event["address"].rpartition(":")[0] if "address" in event else event["user"]
+        source = event["event"], whose or ""
+        flood = self._floods.get(source)
+        written: list[Fields] = []
+        if flood is None or now - flood.since >= INTERVAL:
+            if flood is not None:
+                written += _summary(source, flood)
+            flood = self._floods[source] = _Flood(now)
+            if len(self._floods) > SOURCES:
+                written += _summary(*self._floods.popitem(last=False))
+        self._floods.move_to_end(source)
+        if flood.told < BURST:
+            flood.told += 1
+            return [*written, event]
+        flood.untold += 1
+        flood.last = event
+        return written
+
+    def _summaries(self, now: float, *, everything: bool) -> list[Fields]:
+        written: list[Fields] = []
+        for source, flood in list(self._floods.items()):
+            if everything or now - flood.since >= INTERVAL:
+                written += _summary(source, flood)
+                del self._floods[source]
+        return written
+
+    def _write(self, lines: list[Fields]) -> None:
+        overflowed = self._overflowed
+        self._lost += overflowed - self._counted
+        self._counted = overflowed
+        left = len(lines)
+        try:
+            if self._lost:
+                self._file.write(_encode({"time": _now(), "event": "lost", "count": self._lost}))
+                self._lost = 0
+            for line in lines:
+                self._file.write(_encode(line))
+                left -= 1
+        except OSError as error:
+            self._lost += left
+            if not self._broken:
+                self._broken = True
+                log.error(
+                    "%s: cannot be written (%s); what happens meanwhile is counted, not kept",
+                    self._file.path,
+                    error.strerror,
+                )
+            self._over.wait(RETRY)
+        else:
+            if self._broken:
+                self._broken = False
+                log.warning("%s: can be written again", self._file.path)
+
+
+class _File:
+    """A file that lines are added to, and that is moved out of the way when it is full."""
+
+    def __init__(self, path: Path, size: int, keep: int) -> None:
+        self.path = path
+        self._size = size
+        self._keep = keep
+        self._torn = False
+        self._descriptor = -1
+        self._open()
+        if not os.access(path.parent, os.W_OK):
+            raise AuditError(
+                f"{path} (broker.audit.path): its directory cannot be written, which it must be "
+                "to keep the file small; let the appliance's user own it"
+            )
+
+    def _open(self) -> None:
+        try:
+            # Not to wait for a reader, should it be a pipe.
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+            self._descriptor = os.open(self.path, flags, 0o600)
+            status = os.fstat(self._descriptor)
+        except OSError as error:
+            raise AuditError(
+                f"{self.path} (broker.audit.path) cannot be written ({error.strerror}); name a "
+                "file in a directory that is there and belongs to the appliance's user"
+            ) from error
+        if not stat.S_ISREG(status.st_mode):
+            self.close()
+            raise AuditError(f"{self.path} (broker.audit.path) is not a regular file")
+        if status.st_mode & 0o077:
+            log.warning(
+                "%s can be read by others than its owner; close it with: chmod 600 %s",
+                self.path,
+                self.path,
+            )
+
+    def write(self, line: bytes) -> None:
+        """Add a line. OSError: it is not there, or a part of it only."""
+        if self._torn:
+            line = b"\n" + line
+        if self._is_elsewhere():
+            self._reopen()
+        elif os.fstat(self._descriptor).st_size + len(line) > self._size:
+            self._rotate()
+        written = os.write(self._descriptor, line)
+        if written < len(line):
+            self._torn = True
+            raise OSError(0, "there is no room")
+        self._torn = False
+
+    def _is_elsewhere(self) -> bool:
+        """Whether somebody has moved or deleted the file: logrotate, most likely."""
+        try:
+            return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
+        except FileNotFoundError:
+            return True
+
+    def _rotate(self) -> None:
+        for number in range(self._keep - 1, 0, -1):
+            with contextlib.suppress(FileNotFoundError):
+                self._numbered(number).rename(self._numbered(number + 1))
+        self.path.rename(self._numbered(1))
+        self._reopen()
+
+    def _numbered(self, number: int) -> Path:
+        return self.path.with_name(f"{self.path.name}.{number}")
+
+    def _reopen(self) -> None:
+        before = self._descriptor
+        try:
+            self._open()
+        except AuditError as error:
+            raise OSError(0, str(error)) from error
+        os.close(before)
+
+    def close(self) -> None:
+        """Close it."""
+        os.close(self._descriptor)
+
+
+def note(path: Path | None, what: str, **details: Any) -> None:
+    """Add one change to the audit log of an appliance that may be running, from a command.
+
+    Only to a file that is there: one that another user made would be none that the appliance could
+    write. OSError: it cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return
+    line = {"time": _now(), "event": "changed", "what": what, **details, "by": _who_types()}
+    try:
+        os.write(descriptor, _encode(line))
+    finally:
+        os.close(descriptor)
+
+
+def _who_types() -> str:
+    """The user of this computer, and behind sudo the one who used it."""
+    user = getpass.getuser()
+    behind = os.environ.get("SUDO_USER", user)
+    return user if behind == user else f"{behind} as {user}"
+
+
+def _now() -> str:
+    moment = datetime.now(timezone.utc)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _who(identity: Identity | None) -> Fields:
+    if identity is None:
+        return {}
+    return {"client": identity.client_id, "user": identity.username}
+
+
+def _how(secured: Secured) -> Fields:
+    if not secured.version:
+        return {"tls": None}
+    return {"tls": secured.version, "certificate": secured.certificate or None}
+
+
+def _code(code: int) -> Fields:
+    if not code:
+        return {}
+    name = ReasonCode(code).name.replace("_", " ").capitalize()
+    return {"code": f"0x{code:02X} {name}"}
+
+
+def _summary(source: tuple[str, str], flood: _Flood) -> list[Fields]:
+    if not flood.untold:
+        return []
+    event, whose = source
+    more = {"time": _now(), "event": "more", "of": event, "from": whose}
+    return [{**more, "count": flood.untold, "last": flood.last}]
+
+
+def _encode(line: Fields) -> bytes:
+    # In ASCII: nothing that a stranger calls itself is more than text to who shows the file.
+    return json.dumps(_cut(line)).encode() + b"\n"
+
+
+def _cut(value: Any) -> Any:
+    if isinstance(value, str):
+        return value if len(value) <= LONGEST else f"{value[:LONGEST]}…"
+    if isinstance(value, dict):
+        return {key: _cut(inner) for key, inner in value.items()}
+    return value

@@ -1,0 +1,62 @@
+"""The names and addresses under which clients reach this computer."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+import threading
+from ipaddress import IPv4Address, IPv6Address
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import psutil
+
+Address: TypeAlias = IPv4Address | IPv6Address
+
+DNS_NAME: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.[A-Za-z0-9_-]{1,63})*\.?")
+_RESOLVER_PATIENCE: Final = 3.0  # seconds
+_IFA_F_TEMPORARY: Final = 0x01  # linux/if_addr.h
+
+
+def local_names() -> tuple[list[str], list[Address]]:
+    """What a certificate of this computer is for.
+
+    The names are the host's, the one that the resolver has for it (waiting at most 3 s), the
+    multicast DNS name and `localhost`; the addresses those of all interfaces except link-local
+    IPv6, which is of no use without the name of the client's interface, and temporary IPv6, which
+    is another one every day and nobody dials.
+    """
+    hostname = socket.gethostname()
+    short = hostname.partition(".")[0]
+    names = [hostname, _full_name(hostname), f"{short}.local", "localhost"]
+    names = [name.lower().rstrip(".") for name in names if DNS_NAME.fullmatch(name)]
+    addresses: set[Address] = {IPv4Address("127.0.0.1"), IPv6Address("::1")}
+    temporary = _temporary()
+    for entries in psutil.net_if_addrs().values():
+        for entry in entries:
+            if entry.family in (socket.AF_INET, socket.AF_INET6):
+                address = ipaddress.ip_address(entry.address.partition("%")[0])
+                if address.version == 4 or not (address.is_link_local or address in temporary):
+                    addresses.add(address)
+    return list(dict.fromkeys(names)), sorted(addresses, key=lambda a: (a.version, a.packed))
+
+
+def _full_name(hostname: str) -> str:
+    """The fully qualified name; `hostname` when DNS does not answer soon, as in a field."""
+    found = [hostname]
+    # getfqdn() has no timeout of its own, and a daemon thread keeps nothing from ending.
+    thread = threading.Thread(target=lambda: found.append(socket.getfqdn(hostname)), daemon=True)
+    thread.start()
+    thread.join(_RESOLVER_PATIENCE)
+    return found[-1] if not found[-1].endswith(".arpa") else hostname
+
+
+def _temporary() -> set[Address]:
+    """The addresses of RFC 8981, where the kernel tells: Linux."""
+    try:
+        lines = Path("/proc/net/if_inet6").read_text().splitlines()
+    except OSError:
+        return set()
+    fields = [line.split() for line in lines]
+    return {IPv6Address(bytes.fromhex(f[0])) for f in fields if int(f[4], 16) & _IFA_F_TEMPORARY}

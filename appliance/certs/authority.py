@@ -1,0 +1,493 @@
+"""The appliance's own certificate authority: what it issues, renews and revokes.
+
+Keys are on the curve P-256, which every TLS stack has, those of microcontrollers included.
+Certificates and revocation lists follow RFC 5280. A key that exists is not replaced, only certified
+again, unless a certificate of it was revoked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+import socket
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
+from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from . import readme, registry
+from .addresses import DNS_NAME, Address
+from .files import (
+    CertificateError,
+    issued_by,
+    load_certificates,
+    load_key,
+    locked,
+    make_directory,
+    out_of_time,
+    read,
+    write,
+    write_certificate,
+    write_key,
+)
+from .registry import Issued, Kind, fingerprint
+from .requests import load_request
+from .revocation import CRL_SIZE, parse_crls
+
+AUTHORITY_VALID: Final = timedelta(days=3650)
+# The longest that Apple's systems accept from a private authority. Shorter would not be safer, as
+# the authority's key is on the same computer, and a robot in the field must not fall silent.
+CERTIFICATE_VALID: Final = timedelta(days=825)
+# Clients whose clock is behind, and time zones taken for UTC.
+_BACKDATED: Final = timedelta(days=1)
+# A computer without a battery for its clock starts in 1970 or with the age of its image, and would
+# make certificates that have expired when the clock is set.
+_NEVER_BEFORE: Final = datetime(2025, 1, 1, tzinfo=timezone.utc)
+
+_MAX_COMMON_NAME: Final = 64  # RFC 5280, appendix A: ub-common-name
+_FILE_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
+#: What `renew` knows by these names is not a client.
+_RESERVED: Final = ("server", "all", "ca")
+_SERIAL: Final = re.compile(r"(?:0x)?((?:[0-9A-Fa-f]{2}:?){8,20})")
+
+
+def create_authority(directory: Path, name: str | None = None) -> None:
+    """Makes `ca.crt` and `ca.key`. `name`, by default the host's, is for people who look at it.
+
+    CertificateError when either file is there.
+    """
+    certificate_file, key_file = directory / "ca.crt", directory / "ca.key"
+    for path in (certificate_file, key_file):
+        if path.exists():
+            raise CertificateError(
+                f"{path} exists; clients trust it. For a new authority move it away first"
+            )
+    now = _now()
+    key = ec.generate_private_key(ec.SECP256R1())
+    identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    # Two authorities must not have one name, or clients that have both get confused.
+    suffix = f" CA {identifier.digest[:4].hex()}"
+    common_name = (name or socket.gethostname())[: _MAX_COMMON_NAME - len(suffix)] + suffix
+    subject = _name(common_name)
+    certificate = (
+        _builder(subject, subject, key.public_key(), now, now + AUTHORITY_VALID)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs_certificates=True), critical=True)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier),
+            critical=False,
+        )
+        .sign(key, hashes.SHA256())
+    )
+    make_directory(directory)
+    write_key(key_file, key)
+    write_certificate(certificate_file, certificate)
+
+
+def issue_server(
+    directory: Path,
+    names: Sequence[str],
+    addresses: Sequence[Address],
+    ca_key: Path | None = None,
+) -> None:
+    """Makes `server.crt` for these DNS names and addresses, and `server.key` if it is not there.
+
+    A `server.crt` of this authority is replaced, so this is how one is renewed. `ca_key` is where
+    the authority's key is, if not beside its certificate. CertificateError when the authority is
+    missing or unfit, or the certificate that is there is someone else's.
+    """
+    alternatives: list[x509.GeneralName] = []
+    for name in dict.fromkeys(names):
+        if not DNS_NAME.fullmatch(name):
+            raise CertificateError(f"{name!r} is no DNS name; write it in ASCII (xn--…)")
+        alternatives.append(x509.DNSName(name.rstrip(".")))
+    alternatives += [x509.IPAddress(address) for address in dict.fromkeys(addresses)]
+    if not alternatives:
+        raise CertificateError("a server's certificate needs a name or an address")
+    first = names[0] if names else str(addresses[0])
+    with _opened(directory, ca_key) as authority:
+        authority.certify(
+            directory / "server",
+            first[:_MAX_COMMON_NAME],
+            "server",
+            x509.SubjectAlternativeName(alternatives),
+        )
+
+
+def issue_client(directory: Path, name: str, ca_key: Path | None = None) -> None:
+    """Makes `clients/NAME.crt`, whose common name is `name`, and its key if it is not there.
+
+    After a revocation the key is a new one. CertificateError as for `issue_server`, and when
+    `name` cannot be a file's name.
+    """
+    check_client_name(name)
+    path = directory / "clients" / name
+    with _opened(directory, ca_key) as authority:
+        make_directory(path.parent)
+        authority.certify(path, name, "client")
+
+
+def sign(
+    directory: Path, request: bytes, name: str | None = None, ca_key: Path | None = None
+) -> Path:
+    """Makes `clients/NAME.crt` of a request (PKCS #10, PEM or DER) made where the key is.
+
+    Of the request only the key is taken over, and its common name unless `name` is given. Returns
+    the certificate's path. CertificateError when the request is malformed, its signature is wrong
+    or its key unfit, or there is a certificate of another key under this name.
+    """
+    wanted = load_request(request)
+    name = wanted.name if name is None else name
+    if not name:
+        raise CertificateError("the request has no common name to name the client by; give a name")
+    check_client_name(name)
+    path = directory / "clients" / name
+    with _opened(directory, ca_key) as authority:
+        make_directory(path.parent)
+        authority.certify(path, name, "client", key=wanted.key)
+    return path.with_name(f"{name}.crt")
+
+
+def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
+    """Makes `server.crt`, or `clients/NAME.crt`, anew for the same key and names.
+
+    CertificateError when it is not there, was revoked or is someone else's.
+    """
+    if name == "server":
+        path = directory / "server"
+    else:
+        check_client_name(name)
+        path = directory / "clients" / name
+    certificate_file = path.with_name(f"{path.name}.crt")
+    if not certificate_file.exists():
+        raise CertificateError(
+            f"there is no {certificate_file} to be renewed; `appliance cert issue` makes one"
+        )
+    with _opened(directory, ca_key) as authority:
+        before = load_certificates(certificate_file)[0]
+        kind: Kind = "server" if name == "server" else "client"
+        authority.certify(
+            path, common_name(before) or name, kind, _alternatives(before), before.public_key()
+        )
+
+
+def revoke(directory: Path, what: str, ca_key: Path | None = None) -> list[Issued]:
+    """Revokes what a name, a serial number or a certificate's file stands for, and writes `ca.crl`.
+
+    A name stands for all certificates of the client that have not expired: renewing leaves the one
+    before valid. Returns those that were revoked now. CertificateError when nothing is.
+    """
+    with _opened(directory, ca_key) as authority:
+        chosen = authority.find(what)
+        fresh = [entry for entry in chosen if entry.revoked is None]
+        if not fresh:
+            raise CertificateError(f"{what} was revoked on {chosen[0].revoked:%Y-%m-%d} already")
+        now = _now()
+        revoked = [dataclasses.replace(entry, revoked=now) for entry in fresh]
+        # First what takes effect: when the rest fails, the command can be given again.
+        authority.write_crl([*authority.entries, *revoked])
+        serials = {entry.serial: entry for entry in revoked}
+        known = [serials.pop(entry.serial, entry) for entry in authority.entries]
+        authority.save([*known, *serials.values()])
+        return revoked
+
+
+def write_crl(directory: Path, ca_key: Path | None = None) -> int:
+    """Makes `ca.crl` anew, an empty one if need be; returns how many certificates it revokes."""
+    with _opened(directory, ca_key) as authority:
+        return authority.write_crl(authority.entries)
+
+
+def issued(directory: Path) -> list[Issued]:
+    """All certificates of the authority that is there now, the oldest first.
+
+    Those of before there was a list of them are found by their files.
+    """
+    certificate = load_certificates(directory / "ca.crt")[0]
+    return _entries(directory, certificate)
+
+
+def write_readme(directory: Path) -> None:
+    """Writes `README.md`: what each file is, who may have it, how clients get `ca.crt`."""
+    readme.write_readme(directory, CERTIFICATE_VALID)
+
+
+def check_client_name(name: str) -> None:
+    """CertificateError when a client's certificate cannot have this name."""
+    if not _FILE_NAME.fullmatch(name) or len(name) > _MAX_COMMON_NAME:
+        raise CertificateError(
+            f"{name!r} cannot name a client's certificate; use up to {_MAX_COMMON_NAME} letters, "
+            "digits and _ . @ + -, and begin with a letter or digit"
+        )
+    if name in _RESERVED:
+        raise CertificateError(f"{name!r} cannot name a client's certificate: it means another one")
+
+
+def common_name(certificate: x509.Certificate) -> str | None:
+    """The one common name of the subject; None when there is none, or several."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if len(names) == 1 else None
+
+
+@dataclass(frozen=True)
+class _Authority:
+    """The authority with its key, while nobody else changes the directory."""
+
+    directory: Path
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+    entries: list[Issued]
+
+    def certify(
+        self,
+        path: Path,
+        common_name: str,
+        kind: Kind,
+        alternatives: x509.SubjectAlternativeName | None = None,
+        key: CertificatePublicKeyTypes | None = None,
+    ) -> None:
+        """Make `path`.crt for this public key, or for that of `path`.key, made if need be."""
+        certificate_file = path.with_name(f"{path.name}.crt")
+        key_file = path.with_name(f"{path.name}.key")
+        if certificate_file.exists():
+            before = load_certificates(certificate_file)[0]
+            if not issued_by(before, self.certificate):
+                raise CertificateError(
+                    f"{certificate_file} is not of this appliance's authority; move it away first"
+                )
+            self._check_same_key(certificate_file, before, key)
+        new: ec.EllipticCurvePrivateKey | None = None
+        if key is None:
+            own = self._own_key(key_file)
+            if own is None:
+                own = new = ec.generate_private_key(ec.SECP256R1())
+            key = own.public_key()
+        elif self._is_compromised(key):
+            raise CertificateError(
+                f"the key of {path.name!r} was revoked with its certificate; a new key is needed"
+            )
+        certificate = self._sign(key, common_name, kind, alternatives)
+        if new is not None:
+            write_key(key_file, new, replace=True)
+        for made_of_it in (".p12", ".pem"):  # of the certificate before
+            path.with_name(path.name + made_of_it).unlink(missing_ok=True)
+        # The list first: what is in nobody's list cannot be revoked by its name.
+        entry = registry.record(certificate, self.certificate, path.name, kind)
+        self.save([*self.entries, entry])
+        write_certificate(certificate_file, certificate)
+
+    def _check_same_key(
+        self, file: Path, before: x509.Certificate, key: CertificatePublicKeyTypes | None
+    ) -> None:
+        if key is None or key == before.public_key() or self._is_compromised(before.public_key()):
+            return
+        raise CertificateError(
+            f"{file} is of another key; revoke it first, or give this client another name"
+        )
+
+    def _own_key(self, file: Path) -> ec.EllipticCurvePrivateKey | None:
+        """The key of that file; None when it is to be a new one."""
+        if not file.exists():
+            return None
+        key = load_key(file)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise CertificateError(f"{file} must be an elliptic curve key, as made here")
+        return None if self._is_compromised(key.public_key()) else key
+
+    def _is_compromised(self, key: CertificatePublicKeyTypes) -> bool:
+        """Whether a certificate of this key was revoked: who has that device has the key."""
+        revoked = {entry.key for entry in self.entries if entry.revoked is not None}
+        return fingerprint(key) in revoked
+
+    def _sign(
+        self,
+        key: CertificatePublicKeyTypes,
+        common_name: str,
+        kind: Kind,
+        alternatives: x509.SubjectAlternativeName | None,
+    ) -> x509.Certificate:
+        now = _now()
+        end = min(now + CERTIFICATE_VALID, self.certificate.not_valid_after_utc)
+        purpose = {
+            "server": ExtendedKeyUsageOID.SERVER_AUTH,
+            "client": ExtendedKeyUsageOID.CLIENT_AUTH,
+        }[kind]
+        builder = (
+            _builder(_name(common_name), self.certificate.subject, key, now, end)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+            .add_extension(self._key_identifier(), critical=False)
+        )
+        if alternatives is not None:
+            builder = builder.add_extension(alternatives, critical=False)
+        return builder.sign(self.key, hashes.SHA256())
+
+    def _key_identifier(self) -> x509.AuthorityKeyIdentifier:
+        extensions = self.certificate.extensions
+        identifier = extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+        return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier)
+
+    def save(self, entries: Sequence[Issued]) -> None:
+        """Write the list, with what is in it of authorities before this one."""
+        own = fingerprint(self.certificate.public_key())
+        others = [entry for entry in registry.load(self.directory) if entry.authority != own]
+        registry.save(self.directory, [*others, *entries])
+
+    def write_crl(self, entries: Sequence[Issued]) -> int:
+        """Make `ca.crl` of these and what is in the one that is there."""
+        path = self.directory / "ca.crl"
+        now = _now()
+        number = int(now.timestamp())  # grows also when the file was lost
+        dates: dict[int, datetime] = {}
+        if path.exists():
+            for before in parse_crls(path, read(path, CRL_SIZE), [self.certificate]):
+                dates |= {item.serial_number: item.revocation_date_utc for item in before}
+                for extension in before.extensions:
+                    if isinstance(extension.value, x509.CRLNumber):
+                        number = max(number, extension.value.crl_number + 1)
+        dates |= {e.serial: e.revoked for e in entries if e.revoked and e.serial not in dates}
+        builder = (
+            x509.CertificateRevocationListBuilder()
+            .issuer_name(self.certificate.subject)
+            .last_update(now)
+            # Nobody is there in the field to make a new one, and it is made anew when there is
+            # something to be said.
+            .next_update(self.certificate.not_valid_after_utc)
+            .add_extension(x509.CRLNumber(number), critical=False)
+            .add_extension(self._key_identifier(), critical=False)
+        )
+        for serial, date in dates.items():
+            builder = builder.add_revoked_certificate(
+                x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(date).build()
+            )
+        crl = builder.sign(self.key, hashes.SHA256())
+        write(path, crl.public_bytes(Encoding.PEM), 0o644)
+        return len(dates)
+
+    def find(self, what: str) -> list[Issued]:
+        """The certificates that a name, a file or a serial number stands for, one at least."""
+        now = _now()
+        found = [e for e in self.entries if e.name == what and (e.expires > now or e.revoked)]
+        if found:
+            return found
+        if Path(what).is_file():
+            certificate = load_certificates(Path(what))[0]
+            if not issued_by(certificate, self.certificate):
+                raise CertificateError(f"{what} is not of this appliance's authority")
+            name = common_name(certificate) or "unnamed"
+            entry = registry.record(certificate, self.certificate, name, "client")
+            return [e for e in self.entries if e.serial == entry.serial] or [entry]
+        match = _SERIAL.fullmatch(what)
+        serial = int(match[1].replace(":", ""), 16) if match else None
+        found = [e for e in self.entries if e.serial == serial]
+        if not found:
+            known = {e.name for e in self.entries if e.expires > now and e.kind == "client"}
+            raise CertificateError(
+                f"there is no certificate {what!r}, neither by its name nor by its serial number, "
+                f"and no such file; valid ones: {', '.join(sorted(known)) or 'none'}"
+            )
+        return found
+
+
+@contextlib.contextmanager
+def _opened(directory: Path, ca_key: Path | None) -> Iterator[_Authority]:
+    """The authority, to be used by one at a time."""
+    certificate_file = directory / "ca.crt"
+    key_file = ca_key or directory / "ca.key"
+    certificate = load_certificates(certificate_file)[0]
+    if not key_file.exists():
+        raise CertificateError(
+            f"there is no {key_file}: only with the authority's key are certificates made and "
+            "revoked; put it back for as long, or say where it is (--ca-key FILE)"
+        )
+    key = load_key(key_file)
+    if certificate.public_key() != key.public_key():
+        raise CertificateError(
+            f"{key_file} is not the key of {certificate_file}; put back the right one, or make a "
+            "new authority in an empty directory"
+        )
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise CertificateError(f"{key_file} must be an elliptic curve key, as made here")
+    problem = out_of_time(certificate_file, certificate, _now())
+    if problem:
+        raise CertificateError(problem)
+    with locked(directory):
+        yield _Authority(directory, certificate, key, _entries(directory, certificate))
+
+
+def _entries(directory: Path, authority: x509.Certificate) -> list[Issued]:
+    own = fingerprint(authority.public_key())
+    entries = [entry for entry in registry.load(directory) if entry.authority == own]
+    known = {entry.serial for entry in entries}
+    for file in (directory / "server.crt", *sorted((directory / "clients").glob("*.crt"))):
+        with contextlib.suppress(CertificateError):  # what is no certificate is not ours
+            certificate = load_certificates(file)[0]
+            if certificate.serial_number not in known and issued_by(certificate, authority):
+                kind: Kind = "server" if file.parent == directory else "client"
+                entries.append(registry.record(certificate, authority, file.stem, kind))
+    return entries
+
+
+def _alternatives(certificate: x509.Certificate) -> x509.SubjectAlternativeName | None:
+    try:
+        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    except x509.ExtensionNotFound:
+        return None
+    return found.value
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: CertificatePublicKeyTypes,
+    now: datetime,
+    end: datetime,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BACKDATED)
+        .not_valid_after(end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _usage(signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _now() -> datetime:
+    now = datetime.now(timezone.utc).replace(microsecond=0)
+    if now < _NEVER_BEFORE:
+        raise CertificateError(
+            f"this computer's clock says {now:%Y-%m-%d}; set it first, or clients will find that "
+            "the certificates are not valid"
+        )
+    return now

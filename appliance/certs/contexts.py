@@ -1,0 +1,401 @@
+"""TLS of the listeners, made of files, and replaceable while they listen."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import ssl
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Final, Literal
+from weakref import WeakKeyDictionary
+
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from .files import (
+    CERTIFICATES_SIZE,
+    MALFORMED,
+    CertificateError,
+    issued_by,
+    load_key,
+    out_of_time,
+    parse_certificates,
+    read,
+)
+from .identity import UsernameFrom, username_of
+from .registry import fingerprint, serial_text
+from .revocation import CRL_SIZE, NOTHING_REVOKED, Revocations, load_revocations
+
+ClientCertificates = Literal["off", "optional", "required"]
+TlsVersion = Literal["1.2", "1.3"]
+
+#: Before its end a certificate is told of, and ours renewed.
+EXPIRES_SOON: Final = timedelta(days=30)
+
+# Ephemeral keys and authenticated encryption only. TLS 1.3 has nothing else.
+_TLS12_CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
+_LEAST_BITS: Final = 128
+_VERSIONS: Final = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """Where things are: `broker.tls` in appliance.yaml.
+
+    Without `crl` it is `ca.crl` beside `ca`, if there is one.
+    """
+
+    certificate: Path
+    key: Path
+    ca: Path | None = None
+    crl: Path | None = None
+
+    @property
+    def revocations(self) -> Path | None:
+        """The revocation list's file, which may not be there."""
+        return self.crl or (self.ca and self.ca.with_name("ca.crl"))
+
+
+@dataclass(frozen=True, slots=True)
+class TlsPolicy:
+    """What one listener asks of a connection; `ciphers` of TLS 1.2, in OpenSSL's words.
+
+    With `client_certificates` "optional" a client that shows a certificate is refused unless the
+    CA issued it, with "required" also one that shows none.
+    """
+
+    client_certificates: ClientCertificates = "off"
+    min_version: TlsVersion = "1.2"
+    ciphers: str | None = None
+
+
+@dataclass(frozen=True)
+class LoadedTls:
+    """Everything as it was read, and fits together."""
+
+    files: TlsFiles
+    policies: Mapping[str, TlsPolicy]
+    username_from: UsernameFrom
+    digest: bytes = field(repr=False)
+    chain: list[x509.Certificate]
+    authorities: list[x509.Certificate]
+    revocations: Revocations
+    contexts: Mapping[str, ssl.SSLContext]
+    #: Counts those that were in force one after the other.
+    generation: int
+
+    def warnings(self, now: datetime | None = None) -> list[str]:
+        """What has run out or does soon, each with what to do."""
+        return list(_warnings(self, now or datetime.now(timezone.utc)))
+
+
+class TlsContexts:
+    """TLS as the listeners use it now, by name of the listener.
+
+    `prepare` may run in any thread, so that a long revocation list keeps nobody waiting; all else
+    is the event loop's.
+    """
+
+    def __init__(
+        self,
+        files: TlsFiles,
+        policies: Mapping[str, TlsPolicy],
+        username_from: UsernameFrom = "none",
+    ) -> None:
+        """Reads the files; CertificateError has all that is wrong with them.
+
+        A certificate that is out of its time is used all the same, see `warnings`: a robot whose
+        clock is not set yet, or whose certificate has run out, can still be reached by those who
+        do not look at that, and on its other listeners.
+        """
+        self._trusted: WeakKeyDictionary[ssl.SSLContext, frozenset[x509.Certificate]]
+        self._trusted = WeakKeyDictionary()
+        self._loaded = _load(files, policies, username_from, None)
+        self._remember()
+
+    def prepare(
+        self,
+        files: TlsFiles | None = None,
+        policies: Mapping[str, TlsPolicy] | None = None,
+        username_from: UsernameFrom | None = None,
+    ) -> LoadedTls:
+        """Read the files as they are now, for `take`; changes nothing. What is not given stays.
+
+        CertificateError has all that is wrong. So is a server's certificate that was put here out
+        of its time, and that a revocation list has gone.
+        """
+        now = self._loaded
+        username_from = username_from or now.username_from
+        return _load(files or now.files, policies or now.policies, username_from, now)
+
+    def take(self, loaded: LoadedTls) -> bool:
+        """Let it hold for all connections to come; returns whether it is something new.
+
+        Those that are open are looked at with `refusal`. CertificateError when others were taken
+        after these were read: they may know of more revocations.
+        """
+        if loaded is self._loaded:
+            return False
+        if loaded.generation != self._loaded.generation + 1:
+            raise CertificateError("certificates were replaced meanwhile; to be read once more")
+        self._loaded = loaded
+        self._remember()
+        return True
+
+    def _remember(self) -> None:
+        for context in self._loaded.contexts.values():
+            self._trusted[context] = frozenset(self._loaded.authorities)
+
+    def reload(self) -> bool:
+        """Take over the files as they are now, all or nothing; see `prepare` and `take`."""
+        return self.take(self.prepare())
+
+    def context(self, listener: str) -> ssl.SSLContext:
+        """The settings for a connection that begins now."""
+        return self._loaded.contexts[listener]
+
+    def source(self, listener: str) -> functools.partial[ssl.SSLContext]:
+        """`context` of this listener, to be asked at each connection."""
+        return functools.partial(self.context, listener)
+
+    def refusal(self, tls: ssl.SSLObject) -> str:
+        """Why the client is not, or no longer, let in with its certificate; empty when it is."""
+        der = tls.getpeercert(binary_form=True)
+        if not der:
+            return ""
+        try:
+            certificate = x509.load_der_x509_certificate(der)
+            date = self._loaded.revocations.date(certificate)
+        except MALFORMED as error:
+            return f"its certificate cannot be read: {error}"
+        who = f"its certificate {serial_text(certificate.serial_number)}"
+        if date is not None:
+            return f"{who} was revoked on {date:%Y-%m-%d}"
+        trusted = self._loaded.authorities
+        before = self._trusted.get(tls.context, frozenset())
+        # Only when one was taken away is it asked by whom it is: a chain may go through one that
+        # the client has sent, and that is not known here.
+        if not trusted or before <= frozenset(trusted):
+            return ""
+        if any(issued_by(certificate, authority) for authority in trusted):
+            return ""
+        return f"{who} is of an authority that is trusted no longer"
+
+    def username(self, tls: ssl.SSLObject) -> str | None:
+        """The user that the client's certificate names; None when that is not asked for.
+
+        Raises:
+            ValueError: it names none.
+        """
+        source = self._loaded.username_from
+        if source == "none":
+            return None
+        der = tls.getpeercert(binary_form=True)
+        if not der:
+            return None
+        try:
+            return username_of(x509.load_der_x509_certificate(der), source)
+        except MALFORMED as error:
+            raise ValueError(str(error)) from None
+
+    def warnings(self, now: datetime | None = None) -> list[str]:
+        """What has run out or does soon, each with what to do."""
+        return self._loaded.warnings(now)
+
+    @property
+    def files(self) -> TlsFiles:
+        """The files that are in force."""
+        return self._loaded.files
+
+
+def server_context(
+    certificate: Path,
+    key: Path,
+    ca: Path | None = None,
+    client_certificates: ClientCertificates = "off",
+) -> ssl.SSLContext:
+    """The TLS settings of one listener; CertificateError also when a certificate has expired."""
+    loaded = load_tls(TlsFiles(certificate, key, ca), {"listener": TlsPolicy(client_certificates)})
+    return loaded.contexts["listener"]
+
+
+def load_tls(files: TlsFiles, policies: Mapping[str, TlsPolicy]) -> LoadedTls:
+    """Read everything and look at it strictly; CertificateError has all that is wrong."""
+    loaded = _load(files, policies, "none", None)
+    problems = list(_out_of_time(loaded, datetime.now(timezone.utc)))
+    if problems:
+        raise CertificateError(*problems)
+    return loaded
+
+
+def _load(
+    files: TlsFiles,
+    policies: Mapping[str, TlsPolicy],
+    username_from: UsernameFrom,
+    before: LoadedTls | None,
+) -> LoadedTls:
+    """What is in the files; `before` itself when it is the same."""
+    problems: list[str] = []
+    hashed = hashlib.sha256()
+    chain: list[x509.Certificate] = []
+    authorities: list[x509.Certificate] = []
+    revocations = NOTHING_REVOKED
+    with _collected(problems):
+        chain = _server_chain(files, hashed)
+    with _collected(problems):
+        if any(policy.client_certificates != "off" for policy in policies.values()):
+            authorities = _client_authorities(files, hashed)
+            revocations = _revocations(files, authorities, hashed, before)
+    digest = hashed.digest()
+    if before is not None and not problems:
+        wanted = (files, policies, username_from, digest)
+        if wanted == (before.files, before.policies, before.username_from, before.digest):
+            return before
+        if chain[0] != before.chain[0]:
+            problem = out_of_time(files.certificate, chain[0], datetime.now(timezone.utc))
+            problems += [problem] if problem else []
+    made: dict[TlsPolicy, ssl.SSLContext] = {}
+    readable = not problems
+    for name, policy in policies.items():
+        with _collected(problems, f"{name}: "):
+            if policy not in made:
+                made[policy] = _context(policy)
+                if readable:
+                    _add_certificates(made[policy], files, policy, authorities)
+    if problems:
+        raise CertificateError(*problems)
+    contexts = {name: made[policy] for name, policy in policies.items()}
+    generation = 0 if before is None else before.generation + 1
+    return LoadedTls(
+        files,
+        policies,
+        username_from,
+        digest,
+        chain,
+        authorities,
+        revocations,
+        contexts,
+        generation,
+    )
+
+
+@contextlib.contextmanager
+def _collected(problems: list[str], prefix: str = "") -> Iterator[None]:
+    try:
+        yield
+    except CertificateError as error:
+        problems += (prefix + problem for problem in error.problems)
+
+
+def _read(path: Path, limit: int, hashed: hashlib._Hash) -> bytes:
+    data = read(path, limit)
+    hashed.update(len(data).to_bytes(8, "big") + data)
+    return data
+
+
+def _server_chain(files: TlsFiles, hashed: hashlib._Hash) -> list[x509.Certificate]:
+    data = _read(files.certificate, CERTIFICATES_SIZE, hashed)
+    chain = parse_certificates(files.certificate, data)
+    key = load_key(files.key)
+    hashed.update(fingerprint(key.public_key()).encode())
+    if chain[0].public_key() != key.public_key():
+        raise CertificateError(
+            f"{files.key} is not the key of {files.certificate}; put the pair together"
+        )
+    return chain
+
+
+def _client_authorities(files: TlsFiles, hashed: hashlib._Hash) -> list[x509.Certificate]:
+    if files.ca is None:
+        raise CertificateError("client certificates need the CA that issued them (broker.tls.ca)")
+    return parse_certificates(files.ca, _read(files.ca, CERTIFICATES_SIZE, hashed))
+
+
+def _revocations(
+    files: TlsFiles,
+    authorities: list[x509.Certificate],
+    hashed: hashlib._Hash,
+    before: LoadedTls | None,
+) -> Revocations:
+    path = files.revocations
+    if path is not None and path.exists():
+        return load_revocations(path, _read(path, CRL_SIZE, hashed), authorities)
+    if before is not None and before.files == files and before.revocations:
+        raise CertificateError(
+            f"{path} is gone, by which {len(before.revocations)} certificates were revoked; "
+            "put it back (`appliance cert crl` makes ours anew), or start the appliance anew"
+        )
+    return NOTHING_REVOKED
+
+
+def _context(policy: TlsPolicy) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = _VERSIONS[policy.min_version]
+    context.options |= ssl.OP_NO_RENEGOTIATION | ssl.OP_NO_COMPRESSION
+    _set_ciphers(context, policy.ciphers)
+    return context
+
+
+def _add_certificates(
+    context: ssl.SSLContext,
+    files: TlsFiles,
+    policy: TlsPolicy,
+    authorities: list[x509.Certificate],
+) -> None:
+    try:
+        context.load_cert_chain(files.certificate, files.key)
+    except ssl.SSLError as error:
+        raise CertificateError(f"{files.certificate} cannot be used: {error.reason}") from error
+    if policy.client_certificates != "off":
+        # A company's CA for clients may well be one below its root.
+        context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+        pem = b"".join(authority.public_bytes(Encoding.PEM) for authority in authorities)
+        context.load_verify_locations(cadata=pem.decode())
+        required = policy.client_certificates == "required"
+        context.verify_mode = ssl.CERT_REQUIRED if required else ssl.CERT_OPTIONAL
+
+
+def _set_ciphers(context: ssl.SSLContext, wanted: str | None) -> None:
+    try:
+        context.set_ciphers(wanted or _TLS12_CIPHERS)
+    except ssl.SSLError:
+        raise CertificateError(
+            f"ciphers: OpenSSL knows none of {wanted!r}; `openssl ciphers -v` shows those there are"
+        ) from None
+    for cipher in context.get_ciphers():
+        if cipher["strength_bits"] < _LEAST_BITS or cipher["auth"] == "auth-null":
+            raise CertificateError(f"ciphers: {cipher['name']} is not safe; take it out")
+
+
+def _out_of_time(loaded: LoadedTls, now: datetime) -> Iterator[str]:
+    certificates = [(loaded.files.certificate, loaded.chain[0])]
+    if loaded.files.ca is not None:
+        certificates += [(loaded.files.ca, authority) for authority in loaded.authorities]
+    for path, certificate in certificates:
+        problem = out_of_time(path, certificate, now)
+        if problem:
+            yield problem
+
+
+def _warnings(loaded: LoadedTls, now: datetime) -> Iterator[str]:
+    yield from _out_of_time(loaded, now)
+    files = loaded.files
+    end = min(certificate.not_valid_after_utc for certificate in loaded.chain)
+    if now <= end < now + EXPIRES_SOON:
+        yield f"{files.certificate} expires on {end:%Y-%m-%d}; renew it"
+    for authority in loaded.authorities:
+        end = authority.not_valid_after_utc
+        if now <= end < now + EXPIRES_SOON:
+            yield f"{files.ca} expires on {end:%Y-%m-%d}, and all client certificates with it"
+    for who, end in loaded.revocations.ends:
+        if end < now:
+            yield (
+                f"{files.revocations} of {who} should have been replaced by {end:%Y-%m-%d}: what "
+                "it revokes stays revoked, what was revoked later is not known"
+            )
+    if loaded.authorities and files.crl is not None and not files.crl.exists():
+        yield f"there is no file {files.crl} (broker.tls.crl): no client certificate is revoked"

@@ -1,0 +1,72 @@
+"""A client's key and certificate in the forms that devices take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, PrivateFormat
+from cryptography.hazmat.primitives.serialization.pkcs12 import (
+    PBES,
+    serialize_key_and_certificates,
+)
+
+from .authority import check_client_name
+from .files import CertificateError, key_pem, load_certificates, load_key, write
+
+SHORTEST_PASSWORD: Final = 8
+_ROUNDS: Final = 100_000
+
+
+def check_password(password: str) -> None:
+    """CertificateError when the password is none for a file that gets around."""
+    if len(password) < SHORTEST_PASSWORD:
+        raise CertificateError(
+            f"a password of less than {SHORTEST_PASSWORD} characters is found by trying"
+        )
+
+
+def write_pkcs12(directory: Path, name: str, password: str) -> Path:
+    """Writes `clients/NAME.p12`: key, certificate and `ca.crt` (RFC 7292). Returns its path.
+
+    CertificateError when one of them is missing or unfit, or the password too short.
+    """
+    check_password(password)
+    path, key = _key_of(directory, name)
+    certificate = load_certificates(path.with_name(f"{name}.crt"))[0]
+    # Not AES, which is newer than many phones: iOS before 16, Android before 13 and Windows 10
+    # refuse it as a wrong password. The rounds make up for it, and the password.
+    encryption = (
+        PrivateFormat.PKCS12.encryption_builder()
+        .kdf_rounds(_ROUNDS)
+        .key_cert_algorithm(PBES.PBESv1SHA1And3KeyTripleDESCBC)
+        .hmac_hash(hashes.SHA1())
+        .build(password.encode())
+    )
+    authorities = load_certificates(directory / "ca.crt")
+    data = serialize_key_and_certificates(name.encode(), key, certificate, authorities, encryption)
+    target = path.with_name(f"{name}.p12")
+    write(target, data, 0o600)
+    return target
+
+
+def write_bundle(directory: Path, name: str) -> Path:
+    """Writes `clients/NAME.pem`: key, certificate and `ca.crt` in one. Returns its path."""
+    path, key = _key_of(directory, name)
+    files = (path.with_name(f"{name}.crt"), directory / "ca.crt")
+    certificates = [certificate for file in files for certificate in load_certificates(file)]
+    data = key_pem(key) + b"".join(c.public_bytes(Encoding.PEM) for c in certificates)
+    target = path.with_name(f"{name}.pem")
+    write(target, data, 0o600)
+    return target
+
+
+def _key_of(directory: Path, name: str) -> tuple[Path, ec.EllipticCurvePrivateKey]:
+    check_client_name(name)
+    path = directory / "clients" / f"{name}.key"
+    key = load_key(path)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise CertificateError(f"{path} must be an elliptic curve key, as made here")
+    return path, key

@@ -1,0 +1,99 @@
+"""What there is, for people who look at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Final, Literal
+
+from .authority import issued
+from .contexts import EXPIRES_SOON
+from .files import CertificateError, load_certificates
+from .registry import Issued, serial_text
+
+State = Literal["valid", "replaced", "expired", "revoked"]
+
+_RANK: Final = {"authority": 0, "server": 1, "client": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One certificate; `replaced` is valid too, but there is a newer one of the same name.
+
+    `file` is None when it is not here, or not the newest.
+    """
+
+    name: str
+    purpose: Literal["authority", "server", "client"]
+    state: State
+    serial: int
+    expires: datetime
+    days: int
+    revoked: datetime | None
+    file: Path | None
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is the one to be used under its name."""
+        return self.state == "valid"
+
+    @property
+    def ends_soon(self) -> bool:
+        """Whether it is time to think of the next one."""
+        return self.usable and self.days < EXPIRES_SOON.days
+
+    @property
+    def serial_text(self) -> str:
+        """The serial number as openssl prints it."""
+        return serial_text(self.serial)
+
+    def as_json(self) -> dict[str, object]:
+        """The same as plain values."""
+        return {
+            "name": self.name,
+            "for": self.purpose,
+            "state": self.state,
+            "serial": self.serial_text,
+            "expires": self.expires.isoformat(),
+            "days": self.days,
+            "revoked": self.revoked and self.revoked.isoformat(),
+            "file": self.file and str(self.file),
+        }
+
+
+def listed(directory: Path) -> list[Listed]:
+    """The authority, the server's certificates and the clients', by name, the newest first."""
+    now = datetime.now(timezone.utc)
+    path = directory / "ca.crt"
+    authority = load_certificates(path)[0]
+    end = authority.not_valid_after_utc
+    days, state = _left(end, now)
+    found = [Listed("ca", "authority", state, authority.serial_number, end, days, None, path)]
+    seen: set[tuple[str, str]] = set()
+    for entry in reversed(issued(directory)):
+        days, state = _left(entry.expires, now)
+        if entry.revoked is not None:
+            state = "revoked"
+        elif (entry.kind, entry.name) in seen and state == "valid":
+            state = "replaced"
+        seen.add((entry.kind, entry.name))
+        file = _file_of(directory, entry)
+        serial, end = entry.serial, entry.expires
+        found.append(Listed(entry.name, entry.kind, state, serial, end, days, entry.revoked, file))
+    return sorted(found, key=lambda item: (_RANK[item.purpose], item.name))
+
+
+def _left(end: datetime, now: datetime) -> tuple[int, State]:
+    return max((end - now).days, 0), "valid" if now <= end else "expired"
+
+
+def _file_of(directory: Path, entry: Issued) -> Path | None:
+    path = directory / "server.crt"
+    if entry.kind == "client":
+        path = directory / "clients" / f"{entry.name}.crt"
+    try:
+        there = load_certificates(path)[0].serial_number == entry.serial
+    except CertificateError:
+        return None
+    return path if there else None

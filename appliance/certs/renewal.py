@@ -1,0 +1,80 @@
+"""The server's own certificate, kept valid for this computer as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+
+from .addresses import Address, local_names
+from .authority import issue_server, issued
+from .contexts import EXPIRES_SOON, TlsFiles
+from .files import issued_by, load_certificates
+
+#: Names, and addresses, in one certificate. Those of before stay, as long as there is room: an
+#: interface that is down now comes up again.
+_MOST: Final = 64
+
+
+def keep_server_certificate(files: TlsFiles) -> str:
+    """Renews the server's certificate if that is due; returns why it was, or nothing.
+
+    It is 30 days before its end, when this computer has a name or an address that is not in it,
+    and, with a new key, when it was revoked. Only for certificates that `appliance init` makes;
+    another CA's are used as they are. May wait for the resolver, see `local_names`.
+
+    Raises:
+        CertificateError: it is due and cannot be done, or a file cannot be used.
+        OSError: a file cannot be written.
+    """
+    directory = files.certificate.parent
+    if not _is_ours(files, directory):
+        return ""
+    certificate = load_certificates(files.certificate)[0]
+    authority = load_certificates(directory / "ca.crt")[0]
+    names, addresses = (found[:_MOST] for found in local_names())
+    old_names, old_addresses = _subjects(certificate)
+    reason = ""
+    if any(e.serial == certificate.serial_number and e.revoked for e in issued(directory)):
+        reason = "it was revoked"
+    elif _ends_soon(certificate, authority):
+        reason = f"it would have ended on {certificate.not_valid_after_utc:%Y-%m-%d}"
+    else:
+        new = [str(n) for n in (*names, *addresses) if n not in (*old_names, *old_addresses)]
+        if new:
+            reason = f"this computer is also {', '.join(new)}"
+    if reason:
+        issue_server(
+            directory,
+            list(dict.fromkeys([*names, *old_names]))[:_MOST],
+            list(dict.fromkeys([*addresses, *old_addresses]))[:_MOST],
+        )
+    return reason
+
+
+def _is_ours(files: TlsFiles, directory: Path) -> bool:
+    """Whether `appliance init` makes these files, and the certificate is of that authority."""
+    if (files.certificate, files.key) != (directory / "server.crt", directory / "server.key"):
+        return False
+    authority = directory / "ca.crt"
+    if not authority.exists():
+        return False
+    return issued_by(load_certificates(files.certificate)[0], load_certificates(authority)[0])
+
+
+def _ends_soon(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    end = certificate.not_valid_after_utc
+    # One that ends with its authority would not last longer for being new.
+    return end - datetime.now(timezone.utc) < EXPIRES_SOON and end < authority.not_valid_after_utc
+
+
+def _subjects(certificate: x509.Certificate) -> tuple[Sequence[str], Sequence[Address]]:
+    try:
+        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return [], []
+    addresses = found.get_values_for_type(x509.IPAddress)
+    return found.get_values_for_type(x509.DNSName), [a for a in addresses if isinstance(a, Address)]

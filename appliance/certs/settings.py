@@ -1,0 +1,31 @@
+"""`broker.tls` of appliance.yaml, and what single listeners say otherwise."""
+
+from __future__ import annotations
+
+from appliance.config import Broker
+
+from .contexts import TlsFiles, TlsPolicy
+
+
+def listener_name(index: int) -> str:
+    """The listener of that number, as it is called in errors and asked for its context."""
+    return f"broker.listeners[{index}]"
+
+
+def tls_files(broker: Broker) -> TlsFiles:
+    """The files of all listeners."""
+    tls = broker.tls
+    return TlsFiles(tls.certificate, tls.key, tls.ca, tls.crl)
+
+
+def tls_policies(broker: Broker) -> dict[str, TlsPolicy]:
+    """What each listener with TLS asks of its connections; empty when none has TLS."""
+    return {
+        listener_name(index): TlsPolicy(
+            broker.client_certificates(listener),
+            listener.min_version or broker.tls.min_version,
+            listener.ciphers or broker.tls.ciphers,
+        )
+        for index, listener in enumerate(broker.listeners)
+        if listener.tls
+    }

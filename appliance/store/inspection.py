@@ -1,0 +1,197 @@
+"""What `appliance store` shows, exports and prunes."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import sqlite3
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from appliance.store import database
+from appliance.store.database import Rows
+from appliance.store.schema import (
+    DamagedError,
+    StoreError,
+    Table,
+    connect,
+    connect_to_read,
+    select,
+    version,
+)
+from appliance.store.writer import Batch, write
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSummary:
+    """One session; times are of the wall clock, None for a client that is connected."""
+
+    client_id: str
+    username: str | None
+    subscriptions: int
+    #: Messages that wait for it or are on their way, their payloads' bytes, and since when.
+    messages: int
+    size: int
+    oldest: float | None
+    ends_at: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What is kept; sizes in bytes."""
+
+    sessions: list[SessionSummary]
+    messages: int
+    payload_size: int
+    retained: int
+    retained_size: int
+    file_size: int
+
+
+def read(path: Path) -> Rows:
+    """All rows, while the appliance may be running.
+
+    Raises:
+        StoreError: there is no database, or it cannot be read.
+    """
+    if not path.exists():
+        raise StoreError(f"{path} is not there: nothing has been stored yet")
+    try:
+        with contextlib.closing(connect_to_read(path)) as connection:
+            version(connection)
+            connection.execute("BEGIN")
+            return [{row[0]: row for row in connection.execute(select(table))} for table in Table]
+    except (sqlite3.Error, DamagedError) as error:
+        raise StoreError(f"{path} cannot be read: {error}") from None
+
+
+def summarise(path: Path) -> Summary:
+    """What is kept in the database. Raises StoreError."""
+    rows = read(path)
+    messages = rows[Table.MESSAGE]
+
+    def payload_size(key: object) -> int:
+        row = messages.get(cast(int, key))
+        return len(cast(bytes, row[2])) if row is not None else 0
+
+    sessions = []
+    for key, client_id, username, expiry, ends_at, *_ in rows[Table.SESSION].values():
+        if not expiry:
+            continue
+        owed = [row[2] for row in rows[Table.OWED].values() if row[1] == key]
+        stored = [cast(float, messages[cast(int, m)][8]) for m in owed if m in messages]
+        sessions.append(
+            SessionSummary(
+                str(client_id),
+                cast("str | None", username),
+                sum(1 for row in rows[Table.SUBSCRIPTION].values() if row[1] == key),
+                len(owed),
+                sum(map(payload_size, owed)),
+                min(stored, default=None),
+                cast("float | None", ends_at),
+            )
+        )
+    retained = [row[1] for row in rows[Table.RETAINED].values()]
+    return Summary(
+        sorted(sessions, key=lambda session: session.client_id),
+        len(messages),
+        sum(map(payload_size, messages)),
+        len(retained),
+        sum(map(payload_size, retained)),
+        database.size_on_disk(path),
+    )
+
+
+def export(path: Path) -> Iterator[dict[str, object]]:
+    """Every session and every retained message as what JSON can say. Raises StoreError."""
+    rows = read(path)
+
+    def message(key: object) -> dict[str, object]:
+        row = rows[Table.MESSAGE].get(cast(int, key))
+        if row is None:
+            return {}
+        _, topic, payload, qos, retain, _, _, expires_at, stored_at = row
+        told: dict[str, object] = {"topic": topic, "qos": qos, "retain": bool(retain)}
+        told |= {"stored_at": stored_at, "expires_at": expires_at}
+        try:
+            told["payload"] = cast(bytes, payload).decode()
+        except UnicodeDecodeError:
+            told["payload_base64"] = base64.b64encode(cast(bytes, payload)).decode()
+        return told
+
+    for row in rows[Table.SESSION].values():
+        key, client_id, username, expiry, ends_at, will, will_delay, will_at = row
+        mine = {
+            table: [row for row in rows[table].values() if row[1] == key]
+            for table in (Table.SUBSCRIPTION, Table.OWED, Table.RECEIVED)
+        }
+        yield {
+            "session": client_id,
+            "user": username,
+            "expiry": expiry,
+            "ends_at": ends_at,
+            "will": message(will) | {"delay": will_delay, "due_at": will_at} if will else None,
+            "subscriptions": [
+                {"filter": row[2], "qos": row[3], "identifier": row[7]}
+                for row in mine[Table.SUBSCRIPTION]
+            ],
+            "messages": [
+                message(row[2]) | {"qos": row[3], "packet_id": row[7]}
+                for row in sorted(mine[Table.OWED], key=lambda row: cast(int, row[0]))
+            ],
+            "unreleased": [message(row[3]) | {"packet_id": row[2]} for row in mine[Table.RECEIVED]],
+        }
+    for row in rows[Table.RETAINED].values():
+        yield {"retained": message(row[1])}
+
+
+def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[int, int]:
+    """Delete what waits for sessions for longer than so many seconds; without that, sessions.
+
+    With `client_ids` of theirs only. Returns how many sessions and messages are gone.
+
+    Raises:
+        StoreError: an appliance is running, there is no database, or no such client.
+        sqlite3.Error, OSError: it cannot be written.
+    """
+    rows = read(path)
+    chosen = {
+        key: row
+        for key, row in rows[Table.SESSION].items()
+        if not client_ids or row[1] in client_ids
+    }
+    missing = set(client_ids) - {row[1] for row in chosen.values()}
+    if missing:
+        raise StoreError(f"no session of {', '.join(map(repr, sorted(missing)))} is kept")
+    descriptor = database.lock(path)
+    if descriptor is None:
+        raise StoreError(f"{path} is in use: stop the appliance first")
+    try:
+        batch = Batch(0, 1 << 62)
+        messages = rows[Table.MESSAGE]
+        limit = None if older_than is None else time.time() - older_than
+        gone = 0
+        for key, row in rows[Table.OWED].items():
+            stored = messages.get(cast(int, row[2])) if row[2] is not None else None
+            if row[1] in chosen and (
+                limit is None or (stored is not None and cast(float, stored[8]) < limit)
+            ):
+                batch.remove(Table.OWED, key)
+                gone += 1
+        if limit is None:
+            for key in chosen:
+                batch.remove(Table.SESSION, key)
+            for table in (Table.SUBSCRIPTION, Table.RECEIVED):
+                for key, row in rows[table].items():
+                    if row[1] in chosen:
+                        batch.remove(table, key)
+        # Messages that nothing refers to any more go at the appliance's next start.
+        with contextlib.closing(connect(path)) as connection:
+            write(connection, batch)
+    finally:
+        os.close(descriptor)
+    return (len(chosen) if limit is None else 0), gone

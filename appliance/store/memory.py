@@ -1,0 +1,65 @@
+"""The store that keeps nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from appliance.broker.message import Message
+from appliance.broker.session import Delivery, Held, Session
+from appliance.mqtt.packets import Subscription
+
+
+class MemoryStore:
+    """The `Store` that keeps nothing beyond the broker's own memory, so that nothing is staged."""
+
+    def __init__(self) -> None:
+        self.staged = False
+        self.fresh = False
+        self.batch = 1
+        self.committed = 0
+
+    def listen(self, callback: Callable[[bool], None]) -> None:
+        """There is nothing to tell."""
+
+    def hurry(self) -> None:
+        """Nothing is staged."""
+
+    def has_room(self, size: int) -> bool:
+        """The broker's own limits are all there are."""
+        return True
+
+    def session_saved(self, session: Session) -> None:
+        """The broker has it."""
+
+    def session_removed(self, session: Session) -> None:
+        """The broker has forgotten it."""
+
+    def subscribed(self, session: Session, subscription: Subscription) -> None:
+        """The session has it."""
+
+    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+        """The session has forgotten it."""
+
+    def retained(self, message: Message) -> None:
+        """The broker has it."""
+
+    def queued(self, session: Session, delivery: Delivery) -> None:
+        """The session has it."""
+
+    def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        """The session knows."""
+
+    def settled(self, session: Session, delivery: Delivery) -> None:
+        """The session has forgotten it."""
+
+    def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+        """The session knows."""
+
+    def completed(self, session: Session, packet_id: int) -> None:
+        """The session has forgotten it."""
+
+    def held(self, session: Session, packet_id: int, held: Held) -> None:
+        """The session has it."""
+
+    def unheld(self, session: Session, packet_id: int) -> None:
+        """The session has forgotten it."""

@@ -1,0 +1,119 @@
+"""What each part is told of appliance.yaml."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from appliance.amqtt_broker import plugin_kinds
+from appliance.broker.ports import Features, Limits
+from appliance.certs import TlsContexts
+from appliance.certs.settings import listener_name
+from appliance.config import Settings, TopicRoute
+from appliance.listeners import Admission, ListenerSettings
+from appliance.ros.bridge import RouteSettings
+from appliance.ros.rules import CommandRules, OnSilence
+
+
+def access_files(settings: Settings) -> tuple[Path | None, Path | None]:
+    """The users file and the ACL file; None where plugins do its work and it is missing."""
+    broker = settings.broker
+    authenticating, ruling = plugin_kinds(broker.plugins)
+    return (
+        None if authenticating and not broker.users.exists() else broker.users,
+        None if ruling and not broker.acl.exists() else broker.acl,
+    )
+
+
+def broker_limits(settings: Settings) -> Limits:
+    """What a client can make grow."""
+    limits = settings.broker.limits
+    return Limits(
+        connections=limits.connections,
+        packet_size=limits.packet_size,
+        memory=limits.memory,
+        queue_messages=limits.queue_messages,
+        queue_bytes=limits.queue_bytes,
+        queue_full=limits.queue_full,
+        keep=0 if limits.keep == "latest" else limits.keep,
+        inflight=limits.inflight,
+        sessions=limits.sessions,
+        subscriptions=limits.subscriptions,
+        topic_length=limits.topic_length,
+        topic_levels=limits.topic_levels,
+        retained_messages=limits.retained_messages,
+        retained_bytes=limits.retained_bytes,
+        session_expiry=round(limits.session_expiry),
+        topic_alias=limits.topic_alias,
+        keep_alive=round(limits.keep_alive),
+    )
+
+
+def features(settings: Settings) -> Features:
+    """What the standard leaves to the operator."""
+    return Features(
+        check_payload_format=settings.broker.check_payload_format,
+        reason_strings=settings.broker.reason_strings,
+        response_information=settings.broker.response_information or "",
+    )
+
+
+def admission(settings: Settings) -> Admission:
+    """How many clients may come, and how fast."""
+    limits = settings.broker.limits
+    return Admission(
+        limits.connections,
+        limits.connect_timeout,
+        limits.connections_per_address,
+        limits.connection_rate,
+        limits.publish_rate,
+    )
+
+
+def listener_settings(settings: Settings, tls: TlsContexts | None) -> list[ListenerSettings]:
+    """Where is listened, with the TLS that holds when a client comes."""
+    return [
+        ListenerSettings(
+            listener.bind.host,
+            listener.bind.port,
+            tls.source(listener_name(index)) if listener.tls and tls else None,
+            listener.protocol,
+            listener.bind.path,
+            listener.mode,
+        )
+        for index, listener in enumerate(settings.broker.listeners)
+    ]
+
+
+def routes(settings: Settings) -> list[RouteSettings]:
+    """The ways between ROS and MQTT."""
+    return [
+        RouteSettings(
+            ros=route.ros,
+            to=route.to,
+            mqtt=route.topic(settings.robot),
+            type=route.type,
+            encoding=route.encoding,
+            rate=route.rate,
+            qos=route.qos,
+            retain=route.retain,
+            keep=route.keep,
+            rules=_command_rules(route) if route.command_keys else None,
+        )
+        for route in settings.bridge.topics
+    ]
+
+
+def _command_rules(route: TopicRoute) -> CommandRules:
+    silence = route.on_silence
+    return CommandRules(
+        expire=route.expire,
+        take_retained=route.take_retained,
+        exclusive=route.exclusive,
+        lease=route.lease,
+        on_silence=OnSilence(silence.after, json.dumps(silence.publish), silence.disconnect)
+        if silence
+        else None,
+        clamp=tuple((path, low, high) for path, (low, high) in route.clamp.items()),
+        allow=tuple((path, tuple(values)) for path, values in route.allow.items()),
+    )

@@ -1,0 +1,95 @@
+"""A few kills and a full disk; `python tests/durability` has as many as are wanted."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from durability.harm import HARMS
+from durability.ordeal import Ordeal
+
+
+def test_nothing_acknowledged_is_lost_by_kills(tmp_path: Path) -> None:
+    report = Ordeal(tmp_path, seed=1).run(kills=5)
+    assert not report.problems, f"{report}\n" + "\n".join(report.problems)
+    assert report.acknowledged > 100, report
+
+
+def test_it_starts_whatever_was_done_to_its_files(tmp_path: Path) -> None:
+    report = Ordeal(tmp_path, seed=2, harm=HARMS["anything"]).run(kills=5)
+    assert not report.problems, f"{report}\n" + "\n".join(report.problems)
+    assert report.starts == 6
+
+
+@contextlib.contextmanager
+def small_disk(path: Path) -> Iterator[Path]:
+    path.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=16m,mode=700", "tmpfs", str(path)]
+    if os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only root may mount a small disk")
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["runs on", "killed while full"])
+def test_a_full_disk_loses_nothing(tmp_path: Path, killed: bool) -> None:
+    """Refused while it is full, goes on by itself when it is not, and keeps all that it took."""
+    with small_disk(tmp_path / "disk") as disk:
+        ordeal = FullDisk(tmp_path / "home", disk, killed)
+        report = ordeal.run(0)
+        assert not report.problems, f"{report}\n" + "\n".join(report.problems)
+        log = ordeal.broker.log
+    assert report.refused > 0, "MQTT 5 was told 0x97"
+    assert "CANNOT BE WRITTEN" in log
+    if not killed:
+        assert report.starts == 1 and "can be written again" in log
+
+
+class FullDisk(Ordeal):
+    """Something else fills the disk under load, and makes room again."""
+
+    def __init__(self, directory: Path, disk: Path, killed: bool) -> None:
+        directory.mkdir()
+        super().__init__(directory, seed=3, store={"path": str(disk / "state/store.db")})
+        self._disk = disk
+        self._killed = killed
+
+    async def settle(self) -> None:
+        for subscriber in self.subscribers:
+            subscriber.leaves = False
+        for publisher in self.publishers:
+            publisher.pause = 0.01
+        await self._until(lambda: all(len(p.acknowledged) > 20 for p in self.publishers), "a start")
+        for _ in range(2):
+            self._fill()
+            refused = sum(self.world.refused.values())
+            await self._until(lambda: sum(self.world.refused.values()) > refused + 20, "refusals")  # noqa: B023
+            await asyncio.sleep(0.5)
+            if self._killed:
+                self.world.up.clear()
+                await asyncio.to_thread(self._kill)
+                await asyncio.to_thread(self._start)
+                self.world.up.set()
+                await asyncio.sleep(0.5)
+            (self._disk / "other").unlink()
+            acknowledged = {p: len(p.acknowledged) for p in self.publishers}
+            await self._until(
+                lambda: all(len(p.acknowledged) > n for p, n in acknowledged.items()),  # noqa: B023
+                "it goes on",
+            )
+        await super().settle()
+
+    def _fill(self) -> None:
+        with (self._disk / "other").open("wb", buffering=0) as file, contextlib.suppress(OSError):
+            for size in (65536, 4096, 1):
+                with contextlib.suppress(OSError):
+                    while True:
+                        file.write(bytes(size))

@@ -1,0 +1,154 @@
+"""A broker with its store on disk, in the event loop of a test, and what both know, to compare."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import Any
+
+from broker.conftest import FakeAccess, Peer
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Limits
+from appliance.broker.session import Delivery, Session
+from appliance.store import SqliteStore
+
+
+class House:
+    """`start` builds the broker out of what the directory has; times are those of the loop."""
+
+    def __init__(self, directory: Path, limits: Limits | None = None, **options: Any) -> None:
+        self.path = directory / "state/store.db"
+        self.limits = limits or Limits()
+        self.options = options
+
+    def start(self) -> House:
+        self.store = SqliteStore(self.path, **{"durability": "process", **self.options})
+        self.store.open()
+        self.access = FakeAccess()
+        self.broker = Broker(self.access, self.store, self.limits)
+        self.tick()
+        self.store.restore(self.broker)
+        return self
+
+    def tick(self, ahead: float = 0.0) -> None:
+        self.broker.tick(asyncio.get_running_loop().time() + ahead)
+
+    def peer(self, version: int = 5) -> Peer:
+        return Peer(self.broker, version)
+
+    async def join(self, client_id: str, version: int = 5, **options: Any) -> Peer:
+        peer = self.peer(version)
+        peer.say_connect(client_id, **options)
+        peer.client.accept(peer.user)
+        self.broker.flush()
+        await self.written()
+        return peer
+
+    async def written(self) -> None:
+        """All that was staged is committed."""
+        store = self.store
+        for _ in range(1000):
+            if store._failing or not (store._writing or store._open):
+                return
+            store.hurry()
+            await asyncio.sleep(0.002)
+        raise AssertionError("the store does not come to an end")
+
+    async def stop(self) -> None:
+        await self.store.close()
+
+    def twin(self, directory: Path) -> House:
+        """What would be there had the process been killed now."""
+        copy = House(directory, self.limits, **self.options)
+        copy.path.parent.mkdir(parents=True)
+        for name in (self.path.name, f"{self.path.name}-wal"):
+            if (self.path.parent / name).exists():
+                shutil.copyfile(self.path.parent / name, copy.path.parent / name)
+        return copy.start()
+
+
+def state(broker: Broker) -> dict[str, Any]:
+    """All of it that is to outlive a restart."""
+    return {
+        "sessions": {
+            name: _session(broker, session)
+            for name, session in broker.sessions.items()
+            if session.identity is not None and session.persistent
+        },
+        "retained": {topic: _message(message) for topic, message in broker.retained.find("#")},
+        "bytes": broker.retained_bytes,
+    }
+
+
+def _session(broker: Broker, session: Session) -> dict[str, Any]:
+    def delivery(owed: Delivery | None) -> Any:
+        if owed is None:
+            return None
+        message, qos, retain, ids, share = owed
+        group = share.filter if share and share.filter in broker._shares else None
+        return _message(message), qos, retain, ids or None, group
+
+    will = session.will
+    return {
+        "identity": session.identity,
+        "expiry": session.expiry,
+        "ends_at": session.ends_at,
+        "will": (_message(will.message), will.delay) if will is not None else None,
+        "will_at": session.will_at,
+        "subscriptions": session.subscriptions,
+        "inflight": [(number, delivery(each)) for number, each in session.inflight.items()],
+        "queue": [delivery(each) for each in session.queue],
+        "received": {
+            number: (
+                _message(held.message),
+                # of those that are still there
+                {each.filter for each in broker._shares.values() if each in held.full}
+                | {
+                    each.client_id
+                    for each in broker.sessions.values()
+                    if each in held.full and each.persistent
+                },
+            )
+            for number, held in session.received.items()
+        },
+        "bytes": session.bytes,
+    }
+
+
+def _message(message: Message) -> Any:
+    return (
+        message.topic,
+        message.payload,
+        message.qos,
+        message.retain,
+        message.properties or None,
+        message.properties_wire,
+        message.expires_at,
+    )
+
+
+def difference(before: Any, after: Any, path: str = "") -> list[str]:
+    """Where two states are not the same, for people."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        found = []
+        for key in {**before, **after}:
+            found += difference(before.get(key), after.get(key), f"{path}/{key}")
+        return found
+    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        found = []
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            found += difference(one, other, f"{path}/{number}")
+        return found
+    return [] if _same(before, after) else [f"{path}: {before!r} before, {after!r} after"]
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Equal, and times nearly so: they were on the wall clock meanwhile."""
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) < 0.1
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return bool(one == other)

@@ -1,0 +1,97 @@
+"""`appliance store`, on the database of an appliance that runs, and of one that does not."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from appliance_process import ACL, ApplianceProcess
+from raw_client import RawClient
+
+from appliance import cli
+from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[ApplianceProcess]:
+    process = ApplianceProcess(tmp_path, acl=ACL)
+    process.start()
+    for name in ("first", "second"):
+        with RawClient(process, 4) as client:
+            client.connect(name, clean=False)
+            client.send(Subscribe(1, [Subscription("r2d2/a", 1)]))
+            client.receive()
+    with RawClient(process, 4) as client:
+        client.connect("publisher")
+        for number, payload in enumerate((b"text", b"\xff\0"), 1):
+            client.send(Publish("r2d2/a", payload, 1, number == 1, packet_id=number))
+            assert isinstance(client.decode(client.receive()), Puback)
+    yield process
+    process.stop()
+
+
+@dataclass
+class Told:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def store(process: ApplianceProcess, *arguments: str) -> Told:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main(["store", *arguments, "-c", str(process.config)])
+        except SystemExit as end:
+            return Told(int(end.code or 0), out.getvalue(), err.getvalue())
+
+
+def entries(process: ApplianceProcess) -> dict[str, dict[str, object]]:
+    lines = map(json.loads, store(process, "export").stdout.splitlines())
+    return {line["session"]: line for line in lines if "session" in line}
+
+
+def test_what_is_kept_is_shown_and_exported_while_it_runs(process: ApplianceProcess) -> None:
+    shown = store(process)
+    assert shown.returncode == 0
+    assert "2 sessions, 2 retained messages" in shown.stdout and "'first'" in shown.stdout
+    lines = [json.loads(line) for line in store(process, "export").stdout.splitlines()]
+    first = next(line for line in lines if line.get("session") == "first")
+    assert first["user"] == "alice" and first["expiry"] == 7 * 86400 and first["ends_at"]
+    assert first["subscriptions"] == [{"filter": "r2d2/a", "qos": 1, "identifier": 0}]
+    text, binary = first["messages"]
+    assert text["payload"] == "text" and binary["payload_base64"] == "/wA="
+    retained = {line["retained"]["topic"] for line in lines if "retained" in line}
+    assert retained == {"r2d2/a", "r2d2/_appliance/state"}
+
+
+def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -> None:
+    refused = store(process, "prune", "--client", "first")
+    assert refused.returncode == 1 and "stop the appliance first" in refused.stderr
+    process.stop()
+    missing = store(process, "prune", "--client", "nobody")
+    assert missing.returncode == 1 and "no session of 'nobody'" in missing.stderr
+    assert "0 sessions and 0 messages" in store(process, "prune", "--older-than", "1 h").stdout
+    done = store(process, "prune", "--client", "first", "--older-than", "0 s")
+    assert "0 sessions and 2 messages" in done.stdout
+    assert [len(each["messages"]) for each in entries(process).values()] == [0, 2]  # type: ignore[arg-type]
+    assert "1 sessions and 0 messages" in store(process, "prune", "--client", "first").stdout
+    assert set(entries(process)) == {"second"}
+    assert store(process, "prune").returncode == 2
+    process.start()
+    with RawClient(process, 4) as client:
+        assert client.connect("second", clean=False)[2] == 1
+        assert len([packet for packet in client.drain() if isinstance(packet, Publish)]) == 2
+
+
+def test_nothing_stored_yet_is_told(process: ApplianceProcess) -> None:
+    process.stop()
+    for path in (process.directory / "state").iterdir():
+        path.unlink()
+    told = store(process)
+    assert told.returncode == 1 and "nothing has been stored yet" in told.stderr

@@ -1,0 +1,386 @@
+"""What was there is there again: every field, after every sequence of events."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+from broker.conftest import Peer, check_accounts, lasting
+
+from appliance.broker.ports import Limits
+from appliance.mqtt.codec import Properties, Property
+from appliance.mqtt.packets import (
+    Disconnect,
+    Puback,
+    Pubcomp,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Subscribe,
+    Subscription,
+    Unsubscribe,
+    Will,
+)
+from store.house import House, difference, state
+
+
+@pytest_asyncio.fixture
+async def house(tmp_path: Path) -> AsyncIterator[House]:
+    house = House(tmp_path / "first", Limits(inflight=4)).start()
+    yield house
+    await house.stop()
+
+
+async def restarted(house: House, directory: Path) -> House:
+    await house.written()
+    return house.twin(directory)
+
+
+PROPERTIES: Properties = {
+    Property.MESSAGE_EXPIRY_INTERVAL: 1000,
+    Property.CONTENT_TYPE: "text/plain",
+    Property.CORRELATION_DATA: b"\0\1",
+    Property.PAYLOAD_FORMAT_INDICATOR: 1,
+    Property.RESPONSE_TOPIC: "answer",
+    Property.USER_PROPERTY: [("a", "b"), ("a", "c")],
+}
+
+
+async def test_every_field_comes_back(house: House, tmp_path: Path) -> None:
+    will = Will("will", b"gone", 1, True, {Property.WILL_DELAY_INTERVAL: 60, **PROPERTIES})
+    client = await house.join("client", will=will, **lasting(5, 1000))
+    options = Subscription("a/+", 2, True, True, 2)
+    client.send(Subscribe(1, [options], {Property.SUBSCRIPTION_IDENTIFIER: [7]}))
+    client.send(Subscribe(2, [Subscription("$share/group/b", 1)]))
+    publisher = await house.join("publisher", **lasting(5))
+    for number in range(3):
+        for qos in (1, 2):
+            packet_id = 10 * number + qos
+            publisher.send(
+                Publish("a/x", b"%d" % number, qos, True, False, packet_id, dict(PROPERTIES))
+            )
+            publisher.send(Pubrel(packet_id))
+    publisher.send(Publish("b", b"shared", 1, packet_id=90))
+    publisher.send(Publish("a/y", b"unreleased", 2, packet_id=91, properties=dict(PROPERTIES)))
+    await house.written()
+    messages = [packet for packet in client.received() if isinstance(packet, Publish)]
+    assert [message.qos for message in messages] == [1, 2, 1, 2]
+    client.send(Puback(messages[0].packet_id), Pubrec(messages[1].packet_id))
+    client.lose()
+    before = state(house.broker)
+    session = before["sessions"]["client"]
+    assert [each is None for _, each in session["inflight"]].count(True) == 1
+    assert session["will_at"] is not None and session["queue"]
+    assert before["sessions"]["publisher"]["received"]
+    twin = await restarted(house, tmp_path / "twin")
+    after = state(twin.broker)
+    assert not difference(before["sessions"].pop("client"), after["sessions"].pop("client"))
+    # Its client was connected, and counts as gone since now.
+    assert after["sessions"]["publisher"].pop("ends_at") is not None
+    assert before["sessions"]["publisher"].pop("ends_at") is None
+    assert not difference(before, after)
+    check_accounts(twin.broker)
+    await twin.stop()
+
+
+@pytest.mark.parametrize("version", [4, 5])
+async def test_what_was_in_flight_comes_again_with_its_id(
+    house: House, tmp_path: Path, version: int
+) -> None:
+    """[MQTT-4.4.0-1], [MQTT-3.3.1-1]: with DUP, in its order, and nothing before its turn."""
+    client = await house.join("client", version, **lasting(version))
+    client.send(Subscribe(1, [Subscription("a", 2)]))
+    publisher = await house.join("publisher")
+    for number in range(6):
+        publisher.publish("a", b"%d" % number, 0)
+        publisher.send(Publish("a", b"%d" % number, 1 + number % 2, packet_id=number + 1))
+        publisher.send(Pubrel(number + 1))
+    await house.written()
+    sent = [p for p in client.received() if isinstance(p, Publish) and p.qos]
+    client.send(Pubrec(sent[1].packet_id))
+    twin = await restarted(house, tmp_path / "twin")
+    again = await twin.join("client", version, **lasting(version))
+    _, released, *rest = again.received()
+    assert isinstance(released, Pubrel) and released.packet_id == sent[1].packet_id
+    expected = [(p.packet_id, p.payload, p.qos, True) for p in (sent[0], *sent[2:])]
+    assert [(p.packet_id, p.payload, p.qos, p.dup) for p in rest] == expected  # type: ignore[attr-defined]
+    for packet in rest:
+        assert isinstance(packet, Publish) and packet.packet_id
+        again.send(*[(Puback if packet.qos == 1 else Pubrec)(packet.packet_id)])
+        if packet.qos == 2:
+            again.send(Pubcomp(packet.packet_id))
+    again.send(Pubcomp(released.packet_id))
+    await twin.written()
+    others = [p for p in again.received() if isinstance(p, Publish)]
+    assert [(p.payload, p.dup) for p in others] == [(b"4", False), (b"5", False)]
+    await twin.stop()
+
+
+async def test_a_qos_2_message_is_released_after_the_restart_once(
+    house: House, tmp_path: Path
+) -> None:
+    subscriber = await house.join("subscriber", **lasting(5))
+    subscriber.send(Subscribe(1, [Subscription("a", 2)]))
+    publisher = await house.join("publisher", **lasting(5))
+    publisher.send(Publish("a", b"x", 2, packet_id=5))
+    twin = await restarted(house, tmp_path / "twin")
+    publisher = await twin.join("publisher", **lasting(5))
+    publisher.received()
+    publisher.send(Publish("a", b"x", 2, False, True, 5))
+    publisher.only(Pubrec)
+    publisher.send(Pubrel(5), Pubrel(5))
+    await twin.written()
+    assert [type(packet) for packet in publisher.received()] == [Pubcomp, Pubcomp]
+    assert len(twin.broker.sessions["subscriber"].queue) == 1
+    await twin.stop()
+
+
+async def test_a_will_is_published_after_a_crash(house: House, tmp_path: Path) -> None:
+    """5.0 section 3.1.2.5: a server that failed may do so after its restart; its delay counts."""
+    watcher = await house.join("watcher", **lasting(5))
+    watcher.send(Subscribe(1, [Subscription("will/+", 1)]))
+    await house.join("lasting", will=Will("will/now", b"", 1), **lasting(5))
+    delayed = Will("will/late", b"", 1, properties={Property.WILL_DELAY_INTERVAL: 60})
+    await house.join("delayed", will=delayed, **lasting(5))
+    await house.join("clean", will=Will("will/clean", b"", 1))
+    twin = await restarted(house, tmp_path / "twin")
+    queue = twin.broker.sessions["watcher"].queue
+    twin.tick()
+    assert {delivery[0].topic for delivery in queue} == {"will/now", "will/clean"}
+    assert set(twin.broker.sessions) == {"watcher", "lasting", "delayed"}
+    twin.tick(30)
+    assert len(queue) == 2
+    twin.tick(61)
+    assert len(queue) == 3
+    third = await restarted(twin, tmp_path / "third")
+    third.tick(200)
+    assert len(third.broker.sessions["watcher"].queue) == 3, "each of them once"
+    await third.stop()
+    await twin.stop()
+
+
+async def test_a_clean_stop_keeps_sessions_and_sends_no_will(house: House, tmp_path: Path) -> None:
+    watcher = await house.join("watcher", **lasting(5))
+    watcher.send(Subscribe(1, [Subscription("will", 1)]))
+    await house.join("client", will=Will("will", b"", 1), **lasting(5))
+    house.broker.close(lambda session: session.close_link(0x8B, ""))  # type: ignore[arg-type]
+    twin = await restarted(house, tmp_path / "twin")
+    twin.tick(1)
+    assert set(twin.broker.sessions) == {"watcher", "client"}
+    assert not twin.broker.sessions["watcher"].queue
+    assert twin.broker.sessions["client"].will is None
+    await twin.stop()
+
+
+async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
+    """What expired while the robot was switched off is gone."""
+    clock = 1_000_000.0
+    house = House(tmp_path / "first", wall=lambda: clock).start()
+    for name, seconds in (("short", 100), ("long", 1000)):
+        client = await house.join(name, **lasting(5, seconds))
+        client.send(Subscribe(1, [Subscription("a", 1)]))
+        client.lose()
+    expiry = {Property.MESSAGE_EXPIRY_INTERVAL: 200}
+    publisher = await house.join("publisher")
+    publisher.send(Publish("a", b"short", 1, True, packet_id=1, properties=dict(expiry)))
+    publisher.send(Publish("a", b"long", 1, packet_id=2))
+    await house.written()
+    clock += 300
+    twin = house.twin(tmp_path / "twin")
+    twin.tick()
+    assert set(twin.broker.sessions) == {"long"}
+    assert not len(twin.broker.retained)
+    client = await twin.join("long", **lasting(5))
+    payloads = [p.payload for p in client.received() if isinstance(p, Publish)]
+    assert payloads == [b"long"]
+    await twin.stop()
+    await house.stop()
+
+
+async def test_the_clock_is_set_after_the_boot(tmp_path: Path) -> None:
+    """A robot without a clock of its own learns the time from the network, later."""
+    clock = 1000.0
+    house = House(tmp_path / "first", wall=lambda: clock).start()
+    client = await house.join("client", **lasting(5, 100))
+    client.lose()
+    await house.written()
+    clock = 1_800_000_000.0
+    house.store._check_clock()
+    await house.written()
+    twin = house.twin(tmp_path / "twin")
+    twin.tick()
+    assert "client" in twin.broker.sessions
+    await twin.stop()
+    await house.stop()
+
+
+async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:
+    await house.written()
+    commits = house.store.commits
+    client = await house.join("client")
+    client.send(Subscribe(1, [Subscription("#", 2)]))
+    client.received()
+    publisher = await house.join("publisher", 4)
+    publisher.received()
+    publisher.publish("a", qos=1)
+    publisher.publish("a", qos=2)
+    publisher.publish("$SYS/x", qos=0, retain=True)
+    assert len(client.drain()) == 2
+    assert not house.store._open and house.store.commits == commits and not house.store.staged
+
+
+async def test_a_payload_is_stored_once(house: House) -> None:
+    for number in range(20):
+        client = await house.join(f"client{number}", **lasting(5))
+        client.send(Subscribe(1, [Subscription("a", 1)]))
+        client.lose()
+    publisher = await house.join("publisher")
+    publisher.send(Publish("a", bytes(100_000), 1, True, packet_id=1))
+    await house.written()
+    size = house.path.stat().st_size + house.path.with_name("store.db-wal").stat().st_size
+    assert size < 1_000_000
+    assert len(house.store._messages) == 1
+
+
+async def test_nothing_is_left_when_all_is_settled(house: House, tmp_path: Path) -> None:
+    client = await house.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a", 2)]))
+    await house.written()
+    client.received()
+    publisher = await house.join("publisher", **lasting(5))
+    for number in range(1, 9):
+        publisher.send(Publish("a", b"x", 1 + number % 2, packet_id=number), Pubrel(number))
+    for _ in range(40):
+        await house.written()
+        for packet in client.received():
+            if isinstance(packet, Publish):
+                answer = Puback if packet.qos == 1 else Pubrec
+                client.send(answer(packet.packet_id))
+            elif isinstance(packet, Pubrel):
+                client.send(Pubcomp(packet.packet_id))
+    assert not house.store._messages and house.store.bytes == 0
+    twin = await restarted(house, tmp_path / "twin")
+    contents = state(twin.broker)["sessions"]
+    assert not contents["client"]["inflight"] and not contents["client"]["queue"]
+    await twin.stop()
+
+
+class Chaos:
+    """Random clients that do what clients do, right or wrong, to one broker."""
+
+    NAMES = ("a", "b", "c", "d")
+    TOPICS = ("t/1", "t/2", "u")
+    FILTERS = ("t/+", "#", "u", "$share/g/t/#", "$share/g/u", "t/1")
+
+    def __init__(self, house: House, seed: int) -> None:
+        self.house = house
+        self.dice = random.Random(seed)
+        self.peers: dict[str, Peer] = {}
+        self.unanswered: dict[str, list[Publish | Pubrel]] = {}
+
+    async def step(self) -> None:
+        dice = self.dice
+        name = dice.choice(self.NAMES)
+        peer = self.peers.get(name)
+        if peer is None or peer.wire.closed:
+            await self._connect(name)
+            return
+        self._listen(name, peer)
+        action = dice.choice(
+            [self._publish] * 5
+            + [self._answer] * 5
+            + [self._subscribe, self._subscribe, self._unsubscribe, self._leave, self._lose]
+        )
+        action(name, peer)
+
+    async def _connect(self, name: str) -> None:
+        dice = self.dice
+        version = dice.choice((4, 5))
+        options = lasting(version, dice.choice((50, 5000)))
+        if dice.random() < 0.2:
+            options = {}
+        if dice.random() < 0.3:
+            delay = {Property.WILL_DELAY_INTERVAL: 100} if version == 5 else None
+            options["will"] = Will(dice.choice(self.TOPICS), b"will", 1, False, delay)
+        self.unanswered[name] = []
+        self.peers[name] = await self.house.join(name, version, **options)
+
+    def _listen(self, name: str, peer: Peer) -> None:
+        for packet in peer.received():
+            if isinstance(packet, Publish | Pubrel) and getattr(packet, "qos", 1):
+                self.unanswered[name].append(packet)
+
+    def _publish(self, name: str, peer: Peer) -> None:
+        dice = self.dice
+        qos = dice.choice((0, 1, 1, 2))
+        payload = b"%d" % dice.randrange(10**6) if dice.random() < 0.9 else b""
+        properties = dict(PROPERTIES) if peer.version == 5 and dice.random() < 0.3 else None
+        number = dice.randrange(1, 5) if qos else None
+        topic = dice.choice(self.TOPICS)
+        retain = dice.random() < 0.3
+        peer.send(Publish(topic, payload, qos, retain, False, number, properties))
+        if qos == 2 and dice.random() < 0.7 and not peer.wire.closed:
+            peer.send(Pubrel(number))  # type: ignore[arg-type]
+
+    def _answer(self, name: str, peer: Peer) -> None:
+        waiting = self.unanswered[name]
+        while waiting and not peer.wire.closed:
+            packet = waiting.pop(0)
+            if isinstance(packet, Pubrel):
+                peer.send(Pubcomp(packet.packet_id))
+            else:
+                assert packet.packet_id is not None
+                peer.send((Puback if packet.qos == 1 else Pubrec)(packet.packet_id))
+            if self.dice.random() < 0.3:
+                return
+
+    def _subscribe(self, name: str, peer: Peer) -> None:
+        dice = self.dice
+        topic_filter = dice.choice(self.FILTERS)
+        subscription = Subscription(topic_filter, dice.randrange(3))
+        properties: Properties | None = None
+        if peer.version == 5:
+            subscription.retain_handling = dice.randrange(3)
+            subscription.retain_as_published = dice.random() < 0.5
+            subscription.no_local = dice.random() < 0.3 and not topic_filter.startswith("$")
+            if dice.random() < 0.5:
+                properties = {Property.SUBSCRIPTION_IDENTIFIER: [dice.randrange(1, 300)]}
+        peer.send(Subscribe(1, [subscription], properties))
+
+    def _unsubscribe(self, name: str, peer: Peer) -> None:
+        peer.send(Unsubscribe(1, [self.dice.choice(self.FILTERS)]))
+
+    def _leave(self, name: str, peer: Peer) -> None:
+        if self.dice.random() < 0.5:
+            peer.send(Disconnect())
+
+    def _lose(self, name: str, peer: Peer) -> None:
+        peer.lose()
+
+
+@pytest.mark.parametrize("seed", range(6))
+async def test_whatever_happens_is_there_again(tmp_path: Path, seed: int) -> None:
+    house = House(tmp_path / "first", Limits(inflight=3, queue_messages=8)).start()
+    chaos = Chaos(house, seed)
+    for number in range(6):
+        for _ in range(60):
+            await chaos.step()
+            if chaos.dice.random() < 0.1:
+                await asyncio.sleep(0)
+        await house.written()
+        before = state(house.broker)
+        twin = house.twin(tmp_path / f"twin{number}")
+        after = state(twin.broker)
+        for name, session in before["sessions"].items():
+            if session["ends_at"] is None:  # it was connected
+                for entry in (session, after["sessions"][name]):
+                    entry["ends_at"] = entry["will_at"] = None
+        assert not difference(before, after)
+        check_accounts(twin.broker)
+        assert twin.store.bytes == house.store.bytes
+        await twin.stop()
+    await house.stop()

@@ -1,0 +1,259 @@
+"""Brute force: guessers are slowed, and nobody who has the right password is kept out by them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+import pytest
+from test_scram import ScramClient
+
+from appliance.access import FileAccess, Passwords, check_password
+from appliance.access import checks as checks_module
+from appliance.access import guesses as guesses_module
+from appliance.access import passwords as passwords_module
+from appliance.access.guesses import Guesses, Recent
+from appliance.broker.ports import Accepted, Identity, Refusal
+from appliance.mqtt.reason import ReasonCode
+
+ALICE_C = Identity("alice", "c")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    users = Passwords(tmp_path / "users.passwd")
+    users.set("alice", "geheim")
+    users.save()
+    acl = tmp_path / "acl.conf"
+    acl.write_text("user alice\ntopic read a/#\n")
+    return users.path, acl
+
+
+@pytest.fixture
+def access(files: tuple[Path, Path]) -> Iterator[FileAccess]:
+    access = FileAccess(*files, "r2d2")
+    yield access
+    access.close()
+
+
+def count_checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    checks: list[str] = []
+
+    def check(stored: str, password: bytes) -> bool:
+        checks.append(stored)
+        return check_password(stored, password)
+
+    monkeypatch.setattr(passwords_module, "check_password", check)
+    return checks
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_an_address_that_guesses_is_slowed_more_and_more_and_forgiven() -> None:
+    clock = Clock()
+    guesses = Guesses(6, clock)
+    waits = []
+    for _ in range(16):
+        wait = guesses.turn("10.0.0.1:1")
+        assert wait is not None
+        waits.append(wait)
+        clock.now += wait
+        guesses.failed("10.0.0.1:2", "alice")
+    assert waits[:7] == [0.0] * 7
+    assert all(0 < first < second for first, second in pairwise(waits[8:12]))
+    assert max(waits) <= guesses_module.LONGEST_DELAY
+    assert guesses.turn("10.0.0.1:3", patience=0.0) is None
+    assert guesses.turn("10.0.0.1:3", "another line", patience=0.0) == 0.0
+    assert guesses.turn("10.0.0.2:1", patience=0.0) == 0.0
+    clock.now += 200
+    assert [guesses.turn("10.0.0.1:3") for _ in range(3)] == [0.0] * 3
+    assert guesses.hold_up("alice") == 0.0
+
+
+def test_a_user_that_many_guess_at_is_held_up_for_a_bounded_time() -> None:
+    guesses = Guesses(6, Clock())
+    for number in range(100):
+        guesses.failed(f"10.0.0.{number}", "alice")
+    assert guesses.hold_up("alice") == guesses_module.USER_PATIENCE
+    # Beside each other: the second does not wait for the first.
+    assert guesses.hold_up("alice") == guesses_module.USER_PATIENCE
+    assert guesses.hold_up("bob") == 0.0
+    assert guesses.turn("10.0.0.200", patience=0.0) == 0.0
+
+
+def test_what_is_remembered_of_guessers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guesses_module, "REMEMBERED", 100)
+    guesses = Guesses(6, Clock())
+    for number in range(1000):
+        guesses.failed(f"10.0.{number // 250}.{number % 250}", "x" * 60_000 + str(number))
+    assert len(guesses._networks) == len(guesses._users) == 100
+    assert sum(map(len, guesses._users)) == 100 * 16
+    recent = Recent(10)
+    for number in range(100):
+        recent.add(b"%d" % number)
+    assert b"99" in recent and b"90" in recent and b"89" not in recent
+
+
+def guessing(access: FileAccess, address: str, username: str = "alice") -> None:
+    """Make as if so many guesses had failed that the next ones wait for minutes."""
+    for _ in range(60):
+        access.guesses.failed(address, username)
+    for line in ("", "SCRAM-SHA-256"):
+        while access.guesses.turn(address, line, patience=60.0) is not None:
+            pass
+
+
+def code_of(answer: Identity | Refusal) -> ReasonCode:
+    return answer.code if isinstance(answer, Refusal) else ReasonCode.SUCCESS
+
+
+async def test_guesses_do_not_keep_out_who_was_here_before_nor_another_address(
+    access: FileAccess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.1)
+    guessing(access, "10.0.0.1:1")
+    checks = count_checks(monkeypatch)
+    # Nothing is hashed for who guesses on, and it learns nothing about users.
+    for username in ("alice", "eve"):
+        answer = await access.authenticate(username, b"guess", "c", "10.0.0.1:2")
+        assert code_of(answer) == ReasonCode.SERVER_BUSY
+    assert not checks
+    # alice was never here, and comes in from elsewhere, after the time that she can be held up.
+    began = time.monotonic()
+    assert await access.authenticate("alice", b"geheim", "c", "10.0.0.2:1") == ALICE_C
+    assert 0.1 <= time.monotonic() - began < 1
+    # And now even from where it is guessed, at once.
+    began = time.monotonic()
+    assert await access.authenticate("alice", b"geheim", "c", "10.0.0.1:3") == ALICE_C
+    assert time.monotonic() - began < 0.1
+    assert len(checks) == 1
+
+
+async def test_who_comes_again_does_not_wait_behind_those_who_guess(
+    access: FileAccess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.0)
+    guessing(access, "10.0.0.1:1", "eve")
+    right = "alice", b"geheim", "c", "10.0.0.1:1"
+    assert code_of(await access.authenticate(*right)) == ReasonCode.SERVER_BUSY
+    for number in range(2000):  # two seconds of a flood
+        guess = b"%d" % number
+        answer = await access.authenticate("alice", guess, "c", "10.0.0.1:1")
+        assert code_of(answer) == ReasonCode.SERVER_BUSY
+    assert await access.authenticate(*right) == ALICE_C
+
+
+async def test_a_device_with_a_wrong_password_costs_one_hash_and_slows_nobody(
+    access: FileAccess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks = count_checks(monkeypatch)
+    wrong = "alice", b"old password", "c", "10.0.0.1:1"
+    for _ in range(100):
+        assert code_of(await access.authenticate(*wrong)) == ReasonCode.NOT_AUTHORIZED
+    assert len(checks) == 1
+    assert access.guesses.delay("10.0.0.1") == access.guesses.hold_up("alice") == 0.0
+
+
+async def test_a_password_that_was_wrong_may_be_right_after_a_reload(
+    access: FileAccess, files: tuple[Path, Path]
+) -> None:
+    new = "alice", b"new", "c", "::1"
+    assert code_of(await access.authenticate(*new)) == ReasonCode.NOT_AUTHORIZED
+    passwords = Passwords.load(files[0])
+    passwords.set("alice", "new")
+    passwords.save()
+    access.reload()
+    assert await access.authenticate(*new) == ALICE_C
+
+
+async def test_a_proof_is_a_guess_too(files: tuple[Path, Path]) -> None:
+    passwords = Passwords.load(files[0])
+    passwords.set("sally", "geheim", for_scram=True)
+    passwords.save()
+    access = FileAccess(*files, "r2d2", failed_logins=5)
+
+    def log_in(password: str, address: str | None, user: str = "sally") -> ReasonCode | None:
+        exchange = access.exchange("SCRAM-SHA-256", address)
+        assert exchange is not None
+        client = ScramClient(user, password)
+        outcome = exchange.step(client.first())
+        if isinstance(outcome, bytes):
+            outcome = exchange.step(client.final(outcome))
+        assert isinstance(outcome, Accepted | Refusal)
+        return outcome.code if isinstance(outcome, Refusal) else None
+
+    codes = [log_in("wrong", "10.0.0.1:1", user) for user in ["sally", "eve"] * 5]
+    assert codes[:5] == [ReasonCode.NOT_AUTHORIZED] * 5
+    assert codes[-2:] == [ReasonCode.SERVER_BUSY] * 2  # for who is a user and who is not
+    assert log_in("geheim", "10.0.0.1:1") == ReasonCode.SERVER_BUSY
+    assert log_in("geheim", "10.0.0.2:1") is None
+    assert log_in("geheim", None) is None  # one who is there, and authenticates again
+    access.close()
+
+
+async def test_each_address_has_its_turn_and_its_place(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    access = FileAccess(*files, "r2d2", max_waiting=20)
+    go = threading.Event()
+
+    def check(stored: str, password: bytes) -> bool:
+        go.wait(10)
+        return password == b"geheim"
+
+    monkeypatch.setattr(passwords_module, "check_password", check)
+    ended: list[str] = []
+
+    async def log_in(password: bytes, address: str) -> ReasonCode:
+        answer = code_of(await access.authenticate("alice", password, "c", address))
+        ended.append(address)
+        return answer
+
+    flood = [asyncio.ensure_future(log_in(b"%d" % n, "10.0.0.1")) for n in range(25)]
+    await asyncio.sleep(0.05)
+    owner = asyncio.ensure_future(log_in(b"geheim", "10.0.0.2"))
+    await asyncio.sleep(0.05)
+    turned_away = len(ended)
+    go.set()
+    assert await owner == ReasonCode.SUCCESS
+    # One of the flood gave up its place, and no more than those with a thread came before.
+    assert ended.index("10.0.0.2") <= turned_away + access._checks._workers + 1
+    codes = await asyncio.gather(*flood)
+    assert codes.count(ReasonCode.SERVER_BUSY) == 25 - 20 - access._checks._workers + 1
+    access.close()
+
+
+async def test_a_stranger_cannot_tell_by_the_time_who_is_a_user(access: FileAccess) -> None:
+    """A wrong password takes as long for a user as for nobody, also when it comes again."""
+
+    async def seconds(username: str, password: bytes, address: str) -> float:
+        began = time.perf_counter()
+        assert isinstance(await access.authenticate(username, password, "c", address), Refusal)
+        return time.perf_counter() - began
+
+    first: dict[str, list[float]] = {"alice": [], "nobody": []}
+    for number in range(12):
+        for username, times in first.items():
+            times.append(await seconds(username, b"%d" % number, f"10.0.0.{number}"))
+    known, unknown = (median(times) for times in first.values())
+    assert 0.5 < known / unknown < 2
+
+
+def test_passwords_are_hashed_behind_everything_else(access: FileAccess) -> None:
+    priority = access._checks._pool.submit(
+        lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    )
+    process = os.getpriority(os.PRIO_PROCESS, os.getpid())
+    assert priority.result() == min(19, process + checks_module.NICE)
