@@ -369,7 +369,7 @@ ClientCertificates = Annotated[
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
-Encoding = Literal["json", "text", "cdr"]
+Encoding = Literal["json", "cbor", "text", "cdr", "binary"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
 Level = Literal["debug", "info", "warning", "error"]
@@ -521,10 +521,15 @@ class Broker(_Section):
 
 
 class RouteDefaults(_Section):
-    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto."""
+    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto.
+
+    `compression` is of payloads, and named to clients in the user property `content-encoding`.
+    """
 
     encoding: Encoding = "json"
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    bytes_per_second: Annotated[Size, Field(gt=0)] | None = None
+    compression: Literal["none", "zstd"] = "none"
     qos: Qos = None
     retain: Retain = None
     keep: Keep = "latest"
@@ -548,6 +553,7 @@ class TopicRoute(RouteDefaults):
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+    fields: list[FieldPath] = []
     expire: Annotated[Duration, Field(gt=0)] | None = None
     take_retained: bool = False
     exclusive: bool = False

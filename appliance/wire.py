@@ -44,6 +44,9 @@ OUTPUT_HIGH_WATER = 1024 * 1024
 #: this in a transport is not counted, so that writing costs nothing as long as clients read.
 OUTPUT_LOW_WATER = 16 * 1024
 
+#: Bytes that the system keeps for a client beside those that are on their way.
+SYSTEM_OUTPUT = 128 * 1024
+
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
 WRITE_PORTION = 512 * 1024
 
@@ -281,6 +284,7 @@ class ClientProtocol:
         self._paused = False
         self._counted = 0  # bytes in the ledger
         self._slow: asyncio.TimerHandle | None = None
+        self._has_told_behind = False  # and the client wants to know when it has caught up
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
         #: The connection under the transport, to be closed after it.
@@ -302,6 +306,12 @@ class ClientProtocol:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 # A client without keep alive whose computer is gone is found out by the system.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+                # What the system has taken cannot be overtaken any more: without this it takes
+                # megabytes for a slow client, some seconds' worth.
+                if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+                    connection.setsockopt(
+                        socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT
+                    )
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
@@ -615,10 +625,17 @@ class ClientProtocol:
         if self._transport is None:
             return
         self._write_on()
-        if self._slow is None or self._paused or self._closing:
+        if self._paused or self._closing:
+            return
+        if self._slow is None:
+            if self._has_told_behind:
+                self._has_told_behind = False
+                self._client.caught_up()
+                self._broker.flush()
             return
         self._slow.cancel()
         self._slow = None
+        self._has_told_behind = False
         self._choked = False
         self._client.resume_writing()
         self._broker.flush()
@@ -717,6 +734,11 @@ class ClientProtocol:
                 self._unshared += len(chunk)
         self._write_on()
 
+    def is_behind(self) -> bool:
+        """Whether the transport has asked for a pause."""
+        self._has_told_behind |= self._paused
+        return self._paused
+
     def close(self) -> None:
         """Write out what waits, then close."""
         if self._transport is None or self._closing:
@@ -772,6 +794,10 @@ class _Gone:
 
     def write(self, chunks: list[bytes]) -> None:
         """Nobody reads it."""
+
+    def is_behind(self) -> bool:
+        """Nothing waits for anybody."""
+        return False
 
     def close(self) -> None:
         """It is closed."""

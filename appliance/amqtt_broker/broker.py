@@ -133,6 +133,10 @@ class _NoLink:
     def pubrel(self, packet_id: int) -> None:
         """Nor is this."""
 
+    def is_behind(self) -> bool:
+        """It takes everything at once."""
+        return False
+
     def later(self) -> None:
         """Nor is this."""
 

@@ -113,6 +113,10 @@ class Link(Protocol):
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""
 
+    def is_behind(self) -> bool:
+        """Whether a large message of QoS 0 has to wait in the session, as what was sent before has
+        not gone out; `Session.pump` is called when it has."""
+
     def later(self) -> None:
         """Call `Session.pump` once more when the other clients have had their turn."""
 

@@ -21,14 +21,16 @@ import orjson
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
-from appliance.ros.definitions import describe
+from appliance.ros.definitions import UnknownTypeError, describe
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, RouteSettings, ToMqtt, ToRos
 from appliance.ros.mailbox import Counters, Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.schema import json_schema, topic_of
 
 __all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus"]
 
@@ -38,6 +40,8 @@ CLIENT_ID = "_bridge"
 
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
+
+SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
 #: Every so many looks at the graph (some 2 s) the number of endpoints is not trusted: one may have
 #: been replaced by another.
@@ -49,7 +53,8 @@ class RouteStatus:
     """What a route carries in one direction, and what it has counted since the start.
 
     `bytes` are payload on MQTT; `dropped` did not fit into the mailbox, `throttled` were above the
-    rate, `errors` could not be converted or published. For commands see `Counters`.
+    rate or the budget of bytes, `skipped` not sent to slow clients, `errors` could not be converted
+    or published. For commands see `Counters`.
     """
 
     settings: RouteSettings
@@ -59,6 +64,7 @@ class RouteStatus:
     bytes: int
     dropped: int
     throttled: int
+    skipped: int
     errors: int
     last_error: str | None
     expired: int
@@ -100,6 +106,9 @@ class Bridge:
         self._broker = broker
         self._loop = loop
         self._topic = f"{robot}/_appliance/routes"
+        self._schemas = f"{robot}/_appliance/schema/"
+        #: The types whose schemas are told.
+        self._told: set[str] = set()
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(lambda name: describe(node.load(name), node.load))
@@ -262,6 +271,7 @@ class Bridge:
                 route.counters.bytes,
                 route.counters.dropped,
                 route.counters.throttled,
+                route.counters.skipped,
                 route.counters.errors,
                 route.counters.last_error,
                 route.counters.expired,
@@ -285,7 +295,7 @@ class Bridge:
         session = self._session
         if session is None:
             return False
-        batch = self._mailbox.take(BATCH)
+        batch, has_more = self._mailbox.take(BATCH)
         publish = self._broker.publish
         for lane, message in batch:
             counters = lane.counters
@@ -293,13 +303,29 @@ class Bridge:
             counters.bytes += len(message.payload)
             publish(message, session)
         self._broker.flush()
-        return len(batch) == BATCH
+        return has_more
 
     def _announce(self, bridged: Sequence[Bridged]) -> None:
         if self._session is not None:
             payload = orjson.dumps(bridged)
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
+            self._tell_schemas({entry.type for entry in bridged}, self._session)
             self._broker.flush()
+
+    def _tell_schemas(self, types: set[str], session: Session) -> None:
+        for name in sorted(types ^ self._told):
+            payload = b""
+            if name in types:
+                try:
+                    payload = orjson.dumps(json_schema(self._converters.get(name).description))
+                except UnknownTypeError as error:  # which only `cdr` can carry
+                    log.warning("there is no schema of %s: %s", name, error)
+                    continue
+            topic = self._schemas + topic_of(name)
+            self._broker.publish(
+                Message(topic, payload, 0, True, SCHEMA_PROPERTIES if payload else None), session
+            )
+        self._told = types
 
     def _stopped(self, reason: str) -> None:
         self.problem = reason
@@ -420,6 +446,10 @@ class _Link:
 
     def pubrel(self, packet_id: int) -> None:
         """Its subscriptions are of QoS 0."""
+
+    def is_behind(self) -> bool:
+        """It takes everything at once."""
+        return False
 
     def later(self) -> None:
         """It asks for no retained messages, so that there is nothing to go on with."""

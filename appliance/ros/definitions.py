@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeAlias
 
 # Names end up in generated source (generate.py), so nothing but an identifier may pass.
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -118,6 +118,36 @@ class TypeDescription:
 
 ItemType = Primitive | String | WideString | TypeDescription
 FieldType = ItemType | Array | Sequence
+
+#: Some fields of a type by their names, and of these all (None) or some in turn.
+Selection: TypeAlias = "dict[str, Selection | None]"
+
+
+def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
+    """The selection of fields by their paths, `pose.position`; those of items of an array are
+    named as those of a message. Raises UnknownTypeError for a field that there is not."""
+    chosen: Selection = {}
+    for path in paths:
+        type_: FieldType = description
+        inside: Selection | None = chosen
+        *parents, last = path.split(".")
+        for depth, name in enumerate((*parents, last)):
+            item = type_.item if isinstance(type_, (Array, Sequence)) else type_
+            fields = item.fields if isinstance(item, TypeDescription) else ()
+            field = next((field for field in fields if field.name == name), None)
+            if field is None or not isinstance(item, TypeDescription):
+                there = ", ".join(field.name for field in fields) or "none"
+                raise UnknownTypeError(
+                    f"{description.name} has no field {path!r}: no {name!r}, there are {there}"
+                )
+            type_ = field.type
+            if inside is None:  # all of it is chosen already
+                continue
+            if depth == len(parents):
+                inside[name] = None
+            else:
+                inside = inside.setdefault(name, {})
+    return chosen
 
 
 def least_size(type_: FieldType) -> int:

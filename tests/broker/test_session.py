@@ -395,6 +395,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.writable = True
+        self.behind = False
         self.sent: list[tuple[bytes, int, int, bool]] = []
         self.released: list[int] = []
 
@@ -403,6 +404,9 @@ class Recorder:
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         return False
+
+    def is_behind(self) -> bool:
+        return self.behind
 
     def pubrel(self, packet_id: int) -> None:
         self.released.append(packet_id)
