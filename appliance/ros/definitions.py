@@ -8,11 +8,13 @@ ROS 1, or a test, writes descriptions directly.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TypeAlias
 
 # Names end up in generated source (generate.py), so nothing but an identifier may pass.
@@ -255,6 +257,8 @@ def import_message(name: str) -> type:
     if match is None:
         raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
     package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
+    if package not in sys.modules:
+        _look_in_workspaces(package)
     try:
         module = import_module(f"{package}.{kind}")
     except ImportError as error:
@@ -267,6 +271,20 @@ def import_message(name: str) -> type:
     if not isinstance(found, type) or not hasattr(found, "SLOT_TYPES"):
         raise UnknownTypeError(f"no {name}: the package {package} has no such {kind} type")
     return found
+
+
+def _look_in_workspaces(package: str) -> None:
+    """Let a package be imported from a workspace that only AMENT_PREFIX_PATH tells of.
+
+    A shell that sources a workspace has its Python packages in PYTHONPATH as well; a service, most
+    often, has not.
+    """
+    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        for place in (f"lib/{version}/site-packages", f"local/lib/{version}/dist-packages"):
+            folder = Path(prefix, place)
+            if prefix and str(folder) not in sys.path and (folder / package).is_dir():
+                sys.path.append(str(folder))
 
 
 def load_description(name: str) -> TypeDescription:
