@@ -23,11 +23,9 @@ from appliance.broker.message import Message
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import (
     CertificateError,
-    LoadedTls,
     TlsContexts,
     keep_server_certificate,
 )
-from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -96,8 +94,8 @@ class App:
         if is_open_with_secrets(settings):
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         authenticating, _ = plugin_kinds(broker_settings.plugins)
-        self._tls = tls = self._load_tls()
-        self._access = access = FileAccess(
+        tls = wiring.tls(settings)
+        access = FileAccess(
             *wiring.access_files(settings),
             settings.robot,
             broker_settings.anonymous,
@@ -126,10 +124,6 @@ class App:
         async def listen() -> None:
             wanted = wiring.listener_settings(settings, tls)
             self.addresses = await listeners.start(wanted)
-            for (host, port), listener in zip(self.addresses, wanted, strict=True):
-                kind = " for WebSocket" if listener.protocol == "websocket" else ""
-                where = host if listener.path else f"{host or '*'}:{port}"
-                log.info("listening%s on %s", kind, where)
 
         config = configuration(
             [(str(listener.bind), listener.tls) for listener in broker_settings.listeners],
@@ -163,25 +157,17 @@ class App:
         self._start_clock(loop)
         await frame.start()
         self._stack.push_async_callback(frame.shutdown)
-        if tls is not None:
-            self._keep_certificates(tls)
         self._start_bridge(loop)
         self._reload = Reload(
             Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )
+        if tls is not None:
+            self._beside(self._keep_certificates(tls))
         if settings.file is not None:
             await self._open_to_commands()
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
-
-    def _load_tls(self) -> TlsContexts | None:
-        """The TLS of the listeners, by their place in the configuration; None when none has it."""
-        broker = self.settings.broker
-        policies = tls_policies(broker)
-        if not policies:
-            return None
-        return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
 
     def _open_store(self) -> SqliteStore | None:
         wanted = self.settings.broker.store
@@ -191,10 +177,6 @@ class App:
         store.open()
         self._stack.push_async_callback(store.close)
         return store
-
-    def _keep_certificates(self, tls: TlsContexts) -> None:
-        """Renew the server's certificate when that is due, and tell of what has run out."""
-        self._beside(self._keep(tls))
 
     def _beside(self, work: Coroutine[object, object, None]) -> None:
         """Run this beside everything else, until the stop."""
@@ -206,7 +188,8 @@ class App:
 
         self._stack.push_async_callback(end)
 
-    async def _keep(self, tls: TlsContexts) -> None:
+    async def _keep_certificates(self, tls: TlsContexts) -> None:
+        """Renew the server's certificate when that is due, and tell of what has run out."""
         told: dict[str, float] = {}
         loop = asyncio.get_running_loop()
         reason = ""
@@ -215,7 +198,7 @@ class App:
             try:
                 reason = await asyncio.to_thread(keep_server_certificate, tls.files) or reason
                 if reason:
-                    self._take_tls(tls.prepare())
+                    await self._reload.renewed()
                     log.info("the server's certificate was renewed: %s", reason)
                     reason = ""
             except (CertificateError, OSError) as error:
@@ -227,13 +210,6 @@ class App:
                     told[text] = now
                     log.warning("%s", text)
             await asyncio.sleep(CERTIFICATE_CHECK)
-
-    def _take_tls(self, loaded: LoadedTls) -> None:
-        """Let these certificates hold, for the connections that are open too."""
-        assert self._tls is not None
-        if self._tls.take(loaded):
-            self._listeners.network.in_background(self._listeners.check_certificates())
-            log.info("certificates reloaded")
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""

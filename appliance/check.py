@@ -17,6 +17,8 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
+from appliance.store import StoreError
+from appliance.store.inspection import summarise
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Finding:
 def check(settings: Settings) -> Iterator[Finding]:
     """Everything there is to say about what these settings name, the good news included."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _audit, _plugins, _bridge]
+    parts = [_listeners, _access, _store, _audit, _plugins, _bridge]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:
@@ -95,6 +97,27 @@ def _access(settings: Settings) -> Iterator[Finding]:
     if rules is not None and users is not None and not others:
         for name in sorted({rule.user for rule in rules if rule.user} - set(users)):
             yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
+
+
+def _store(settings: Settings) -> Iterator[Finding]:
+    store = settings.broker.store
+    directory = next(path for path in store.path.parents if path.exists())
+    if store.durability == "off":
+        yield Finding("ok", "broker.store", "off: sessions and messages end with the process")
+    elif not directory.is_dir() or not os.access(directory, os.W_OK):
+        text = f"{directory} is no directory that can be written; the appliance's user must own it"
+        yield Finding("error", "broker.store.path", text)
+    elif not store.path.exists():
+        yield Finding("ok", str(store.path), "not there yet; the first start makes it")
+    else:
+        try:
+            kept = summarise(store.path)
+        except StoreError as error:
+            text = f"{error}; what can be read is kept at the next start, the file set aside"
+            yield Finding("warning", "broker.store.path", text)
+        else:
+            text = f"kept: sessions {len(kept.sessions)}, retained messages {kept.retained}"
+            yield Finding("ok", str(store.path), text)
 
 
 def _audit(settings: Settings) -> Iterator[Finding]:

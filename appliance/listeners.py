@@ -123,11 +123,17 @@ class Listeners:
         Raises:
             OSError: an address cannot be listened on; nothing has changed then.
         """
-        known = {door.settings.place: door for door in self._doors}
+        known = list(self._doors)
         doors: list[_Door] = []
         try:
             for listener in settings:
-                door = known.pop(listener.place, None) or _Door(self, listener)
+                # The first of several: those whose ports the system chose are told apart by order.
+                same = (door for door in known if door.settings.place == listener.place)
+                door = next(same, None)
+                if door is None:
+                    door = _Door(self, listener)
+                else:
+                    known.remove(door)
                 doors.append(door)
         except BaseException:
             self.drop(doors)
@@ -152,9 +158,13 @@ class Listeners:
         for door in before:
             if door not in doors:
                 door.close()
+                log.info("closed the listener on %s", door)
         for door, listener in zip(doors, settings, strict=True):
             door.use(listener)
             door.open()
+            if door not in before:
+                kind = " for WebSocket" if listener.protocol == "websocket" else ""
+                log.info("listening%s on %s", kind, door)
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Listen; returns the addresses, with the port that the system chose where it was 0.
@@ -272,6 +282,10 @@ class _Door:
         else:
             self._socket = listen(settings.host, settings.port)
             self.address = (settings.host, self._socket.getsockname()[1])
+
+    def __str__(self) -> str:
+        host, port = self.address
+        return host if self.settings.path is not None else f"{host or '*'}:{port}"
 
     def use(self, settings: ListenerSettings) -> None:
         """Let these settings hold for those who come from now on."""

@@ -107,11 +107,19 @@ class Reload:
                 if self._parts.audit is not None:
                     self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
                 raise
-            if changed:
-                log.info("reloaded: %s", ", ".join(changed))
-            else:
-                log.debug("reloaded: nothing has changed")
+            log.info("reloaded: %s", ", ".join(changed) or "nothing has changed")
             return changed
+
+    async def renewed(self) -> None:
+        """Take over the server's certificate, which is a new one.
+
+        Raises:
+            CertificateError: it, or another file of certificates, cannot be used.
+        """
+        async with self._turn:
+            tls = self._parts.tls
+            if tls is not None:
+                self._take_certificates(tls, await asyncio.to_thread(tls.prepare))
 
     async def _run(self) -> list[str]:
         parts = self._parts
@@ -130,11 +138,11 @@ class Reload:
         parts.settings = settings
         changed = [*_differences(before, settings)]
         parts.broker.use(wiring.broker_limits(settings), wiring.features(settings))
-        if parts.tls is not None and read.tls is not None and parts.tls.take(read.tls):
-            changed.append("certificates")
         parts.listeners.take(doors, wanted, wiring.admission(settings))
-        parts.listeners.network.in_background(parts.listeners.check_certificates())
-        changed += self._take_access(parts.access.adopt(read.rules))
+        if parts.tls is not None and read.tls is not None:
+            changed += self._take_certificates(parts.tls, read.tls)
+        rights = parts.access.adopt(read.rules)
+        changed += self._take_access(rights)
         if parts.bridge is not None:
             parts.bridge.replace(wiring.routes(settings))
         if before.log != settings.log:
@@ -142,8 +150,16 @@ class Reload:
         parts.broker.rules_changed()
         parts.broker.flush()
         if parts.audit is not None and changed:
-            parts.audit.changed(", ".join(changed))
+            parts.audit.changed(", ".join(changed), **asdict(rights))
         return changed
+
+    def _take_certificates(self, tls: TlsContexts, loaded: LoadedTls) -> list[str]:
+        """Let them hold for the connections that are open, too."""
+        if not tls.take(loaded):
+            return []
+        listeners = self._parts.listeners
+        listeners.network.in_background(listeners.check_certificates())
+        return ["certificates"]
 
     def _take_access(self, changes: Changes) -> list[str]:
         """Let connected clients have the rights that they have now, and no others."""
@@ -151,8 +167,6 @@ class Reload:
         for session in list(self._parts.broker.sessions.values()):
             if session.identity and session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
-        if self._parts.audit is not None and any(asdict(changes).values()):
-            self._parts.audit.changed("users and access rules", **asdict(changes))
         words = {
             "users_added": "new users: ",
             "users_removed": "users removed: ",

@@ -8,7 +8,7 @@ from pathlib import Path
 from appliance.amqtt_broker import plugin_kinds
 from appliance.broker.ports import Features, Limits
 from appliance.certs import TlsContexts
-from appliance.certs.settings import listener_name
+from appliance.certs.settings import listener_name, tls_files, tls_policies
 from appliance.config import Settings, TopicRoute
 from appliance.listeners import Admission, ListenerSettings
 from appliance.ros.bridge import RouteSettings
@@ -68,6 +68,19 @@ def admission(settings: Settings) -> Admission:
         limits.connection_rate,
         limits.publish_rate,
     )
+
+
+def tls(settings: Settings) -> TlsContexts | None:
+    """The TLS of the listeners, by their place in the configuration; None when none has it.
+
+    Raises:
+        CertificateError: a file is missing or wrong.
+    """
+    broker = settings.broker
+    policies = tls_policies(broker)
+    if not policies:
+        return None
+    return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
 
 
 def listener_settings(settings: Settings, tls: TlsContexts | None) -> list[ListenerSettings]:

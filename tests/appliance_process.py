@@ -155,7 +155,8 @@ class ApplianceProcess(BrokerProcess):
     """`appliance run` in a directory that `appliance init` has filled, without a ROS bus.
 
     alice is the user that init makes; `users` are more, by name and password. `acl` takes the
-    place of init's rules, and `broker` goes into appliance.yaml beside the listeners.
+    place of init's rules, and `broker` goes into appliance.yaml beside the listeners. Changed files
+    are left alone until it is told to reload, so that a test knows when that is.
     """
 
     name = "appliance"
@@ -184,6 +185,7 @@ class ApplianceProcess(BrokerProcess):
         listeners = [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
         settings["broker"] = {"listeners": listeners, **(broker or {})}
         settings["bridge"] = {"bus": "none"}
+        settings["reload_on_change"] = False
         self.config.write_text(yaml.safe_dump(settings))
 
     def start(self) -> None:

@@ -1032,7 +1032,7 @@ async def test_the_appliance_without_a_users_file(
         await asyncio.wait_for(client.connect(uri), PATIENCE)
         await client.subscribe([("+/_appliance/state", 1)])
         assert (await receive(client)).data == b"online"
-        app.reload()  # who is known to a plugin stays
+        await app.reload()  # who is known to a plugin stays
         await client.publish("a", b"x", qos=1)
         await client.disconnect()
     finally:

@@ -115,7 +115,7 @@ def test_a_reload_takes_rights_and_users_away_from_those_who_are_connected(proce
     users.remove("bob")
     users.save()
 
-    reload(process, "users and access rules reloaded")
+    reload(process, "reload: reloaded: users removed: bob, access rules")
 
     assert alice.publish("r2d2/arm") == ReasonCode.NOT_AUTHORIZED
     farewell = bob.read()

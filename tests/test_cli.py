@@ -11,6 +11,7 @@ import pytest
 
 from appliance import cli
 from appliance.access import Passwords
+from appliance.store import database
 
 
 def run(*arguments: str) -> int:
@@ -100,6 +101,23 @@ def test_check_changes_nothing(here: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in here.rglob("*")}
     run("check", "--show")
     assert {path: path.stat().st_mtime_ns for path in here.rglob("*")} == before
+
+
+def test_check_reads_the_store_and_leaves_nothing_beside_it(
+    here: Path, output: pytest.CaptureFixture[str]
+) -> None:
+    path = here / "state/store.db"
+    database.make_directory(path)
+    contents = database.read(path, "power")
+    assert contents.connection is not None
+    contents.connection.close()
+    files = sorted(path.parent.iterdir())
+    assert run("check") == 0
+    assert f"{path}: kept: sessions 0, retained messages 0" in output.readouterr().out
+    assert sorted(path.parent.iterdir()) == files
+    path.write_bytes(b"nonsense" * 1000)
+    assert run("check") == 0
+    assert f"warning broker.store.path: {path} cannot be read" in output.readouterr().out
 
 
 @pytest.mark.parametrize(

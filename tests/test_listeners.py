@@ -19,8 +19,7 @@ import uvloop
 import yaml
 from house import PATIENCE, Caller, House, make_contexts, until
 
-from appliance import config, listeners, sockets, wire
-from appliance.app import App
+from appliance import config, listeners, sockets, wire, wiring
 from appliance.broker.ports import Limits
 from appliance.listeners import Admission, ListenerSettings
 from appliance.mqtt.packets import (
@@ -527,8 +526,8 @@ broker:
     - {bind: "unix:/run/web.sock", protocol: websocket}
 """
     settings = config.loads(text, tmp_path / "appliance.yaml", {})
-    app = App(settings)
-    tls, plain, web, private, shared = app._listener_settings(app._load_tls())
+    listeners = wiring.listener_settings(settings, wiring.tls(settings))
+    tls, plain, web, private, shared = listeners
     assert (plain.host, plain.context, plain.protocol, plain.path) == ("::1", None, "mqtt", None)
     assert tls.context is not None and tls.context().verify_mode == ssl.CERT_OPTIONAL
     # Asked for a certificate that it does not have, a browser gives up.

@@ -89,7 +89,7 @@ def topics(client: RawClient) -> list[str]:
     return [packet.topic for packet in received if "/_appliance/" not in packet.topic]
 
 
-def reload(robot: ApplianceProcess, *, says: str = "access rules reloaded") -> None:
+def reload(robot: ApplianceProcess, *, says: str = "reload: reloaded: ") -> None:
     assert robot._process is not None
     count = len([line for line in robot.log.splitlines() if says in line])
     robot._process.send_signal(signal.SIGHUP)

@@ -1108,11 +1108,11 @@ def test_a_user_that_is_removed_in_the_middle(robot: ApplianceProcess, dial: Dia
     try:
         write(users, before.replace(f"user:{PENCIL}\n", ""))
         os.kill(robot.pid, signal.SIGHUP)
-        robot.wait_for_log("users and access rules reloaded")
+        robot.wait_for_log("reload: reloaded: ")
         client.send(auth(CONTINUE, final))
         assert client.receive() == REFUSED[0x87]
     finally:
         write(users, before)
         os.kill(robot.pid, signal.SIGHUP)
-        robot.wait_for_log("users and access rules reloaded", 2)
+        robot.wait_for_log("reload: reloaded: ", 2)
     logged_in(dial(), "removed")

@@ -416,7 +416,7 @@ class Broker:
     def _restore_owed(self, entry: Kept) -> None:
         def delivery(owed: Owed) -> Delivery:
             share = self._shares.get(owed.share) if owed.share is not None else None
-            return owed.message, owed.qos, owed.retain, owed.subscription_ids, share
+            return Delivery(owed.message, owed.qos, owed.retain, owed.subscription_ids, share)
 
         assert entry.session is not None
         entry.session.restore(
@@ -684,7 +684,8 @@ class Broker:
             session, qos, as_published, ids = target
             qos = min(qos, message.qos)
             if qos and route.allowed and session not in full and not session.has_room(message):
-                session.deliver_promised((message, qos, message.retain and as_published, ids, None))
+                retain = message.retain and as_published
+                session.deliver_promised(Delivery(message, qos, retain, ids, None))
             else:
                 targets.append(target)
         shares: list[tuple[Share, list[Target]]] = []
@@ -693,7 +694,8 @@ class Broker:
             if asked and share not in full and not any(m[0].has_room(message) for m in asked):
                 session, qos, as_published, ids = next((m for m in asked if m[0].link), asked[0])
                 retain = message.retain and as_published
-                session.deliver_promised((message, min(qos, message.qos), retain, ids, share))
+                qos = min(qos, message.qos)
+                session.deliver_promised(Delivery(message, qos, retain, ids, share))
             else:
                 shares.append((share, members))
         self.publish_to(targets, replace(route, shares=shares), message, origin)
@@ -865,7 +867,7 @@ class Broker:
             else:
                 subscription = session.subscriptions[topic_filter]
                 ids = [subscription.identifier] if subscription.identifier else None
-                yield message, min(message.qos, subscription.qos), True, ids, None
+                yield Delivery(message, min(message.qos, subscription.qos), True, ids, None)
 
     def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:
         """Unsubscribe; returns 0x00, or 0x11 when there was no such subscription."""

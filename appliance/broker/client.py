@@ -10,7 +10,7 @@ import math
 import uuid
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 from appliance.broker.broker import Broker, Route
 from appliance.broker.handshake import (
@@ -22,7 +22,7 @@ from appliance.broker.handshake import (
 )
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
-from appliance.broker.session import LARGE_MESSAGE, Held, Session
+from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
     PUBACK,
@@ -730,7 +730,7 @@ class Client:
         session = self.session
         if first & 0x06 or session is None or not self.is_behind():
             return False
-        session.keep_latest((message, 0, bool(first & 1), subscription_ids, None))
+        session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
         return True
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:

@@ -7,7 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Limits, Link, Store
@@ -18,9 +18,23 @@ if TYPE_CHECKING:
     from appliance.broker.broker import Route
     from appliance.broker.shared import Share
 
-#: message, QoS, retain flag, subscription identifiers of the subscriptions that matched, and the
-#: shared subscription that chose this session among others
-Delivery: TypeAlias = "tuple[Message, int, bool, list[int] | None, Share | None]"
+
+class Delivery(NamedTuple):
+    """A message on its way to one session.
+
+    On the data path it is a plain tuple, made with `cast`, which costs a fifth. The compiled broker
+    has to know it by a class nevertheless: it would take a tuple apart between two functions and
+    make another, and the store tells deliveries apart by their identity.
+    """
+
+    message: Message
+    qos: int
+    retain: bool
+    #: Of the subscriptions that matched.
+    subscription_ids: list[int] | None
+    #: The shared subscription that chose this session among others.
+    share: Share | None
+
 
 #: Retained messages that a new subscription is sent in one turn of the event loop, and those it may
 #: not see that are passed over: some milliseconds, then it is the turn of other clients.
@@ -277,7 +291,7 @@ class Session:
             if link.writable:  # then replays wait for the window only, which is no matter of QoS 0
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
-            return self.keep_latest((message, 0, retain, subscription_ids, share))
+            return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
         # `_fits` and `_count`, written out here and in `_send`: two calls less a message.
         ledger = self.ledger
         size = message.size
@@ -291,12 +305,14 @@ class Session:
                 and not self.queue
                 and not self.replays
             ):
-                self._send(link, (message, qos, retain, subscription_ids, share))
+                self._send(link, cast(Delivery, (message, qos, retain, subscription_ids, share)))
                 return True
             if len(self.queue) < ledger.limits.queue_messages:
-                return self._enqueue((message, qos, retain, subscription_ids, share))
+                return self._enqueue(
+                    cast(Delivery, (message, qos, retain, subscription_ids, share))
+                )
         if ledger.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
-            return self._enqueue((message, qos, retain, subscription_ids, share))
+            return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
         if ledger.limits.queue_full == "disconnect" and link is not None:
             ledger.overflowed.append(self)
         self._drop(message)

@@ -7,6 +7,7 @@ import contextlib
 import os
 import sqlite3
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from appliance.store import database
 from appliance.store.database import Rows
 from appliance.store.schema import (
     DamagedError,
+    Row,
     StoreError,
     Table,
     connect,
@@ -78,17 +80,19 @@ def summarise(path: Path) -> Summary:
         row = messages.get(cast(int, key))
         return len(cast(bytes, row[2])) if row is not None else 0
 
+    subscriptions = _by_session(rows, Table.SUBSCRIPTION)
+    owed_to = _by_session(rows, Table.OWED)
     sessions = []
     for key, client_id, username, expiry, ends_at, *_ in rows[Table.SESSION].values():
         if not expiry:
             continue
-        owed = [row[2] for row in rows[Table.OWED].values() if row[1] == key]
+        owed = [row[2] for row in owed_to[key]]
         stored = [cast(float, messages[cast(int, m)][8]) for m in owed if m in messages]
         sessions.append(
             SessionSummary(
                 str(client_id),
                 cast("str | None", username),
-                sum(1 for row in rows[Table.SUBSCRIPTION].values() if row[1] == key),
+                len(subscriptions[key]),
                 len(owed),
                 sum(map(payload_size, owed)),
                 min(stored, default=None),
@@ -104,6 +108,14 @@ def summarise(path: Path) -> Summary:
         sum(map(payload_size, retained)),
         database.size_on_disk(path),
     )
+
+
+def _by_session(rows: Rows, table: Table) -> defaultdict[object, list[Row]]:
+    """The rows of a table that belongs to sessions, by the session's key."""
+    found: defaultdict[object, list[Row]] = defaultdict(list)
+    for row in rows[table].values():
+        found[row[1]].append(row)
+    return found
 
 
 def export(path: Path) -> Iterator[dict[str, object]]:
@@ -123,12 +135,11 @@ def export(path: Path) -> Iterator[dict[str, object]]:
             told["payload_base64"] = base64.b64encode(cast(bytes, payload)).decode()
         return told
 
+    subscriptions = _by_session(rows, Table.SUBSCRIPTION)
+    owed_to = _by_session(rows, Table.OWED)
+    received = _by_session(rows, Table.RECEIVED)
     for row in rows[Table.SESSION].values():
         key, client_id, username, expiry, ends_at, will, will_delay, will_at = row
-        mine = {
-            table: [row for row in rows[table].values() if row[1] == key]
-            for table in (Table.SUBSCRIPTION, Table.OWED, Table.RECEIVED)
-        }
         yield {
             "session": client_id,
             "user": username,
@@ -137,13 +148,13 @@ def export(path: Path) -> Iterator[dict[str, object]]:
             "will": message(will) | {"delay": will_delay, "due_at": will_at} if will else None,
             "subscriptions": [
                 {"filter": row[2], "qos": row[3], "identifier": row[7]}
-                for row in mine[Table.SUBSCRIPTION]
+                for row in subscriptions[key]
             ],
             "messages": [
                 message(row[2]) | {"qos": row[3], "packet_id": row[7]}
-                for row in sorted(mine[Table.OWED], key=lambda row: cast(int, row[0]))
+                for row in sorted(owed_to[key], key=lambda row: cast(int, row[0]))
             ],
-            "unreleased": [message(row[3]) | {"packet_id": row[2]} for row in mine[Table.RECEIVED]],
+            "unreleased": [message(row[3]) | {"packet_id": row[2]} for row in received[key]],
         }
     for row in rows[Table.RETAINED].values():
         yield {"retained": message(row[1])}

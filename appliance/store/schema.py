@@ -166,7 +166,10 @@ def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
     """Open the database to read it, while the appliance may be running. Raises sqlite3.Error."""
-    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_TIMEOUT)
+    # SQLite would make the files beside it that a database in use has, and leave them there.
+    in_use = path.with_name(f"{path.name}-wal").exists()
+    mode = "mode=ro" if in_use else "mode=ro&immutable=1"
+    return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, timeout=BUSY_TIMEOUT)
 
 
 def _migrate(connection: sqlite3.Connection, path: Path) -> None:

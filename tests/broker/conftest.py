@@ -405,6 +405,7 @@ def waiting_bytes(broker: Broker) -> int:
 def held_bytes(session: Session) -> int:
     """All that the session holds, counted anew."""
     waiting = [delivery[0] for delivery in (*session.queue, *session.latest.values())]
+    waiting += [delivery[0] for delivery in session.large.values()]
     waiting += [delivery[0] for delivery in session.inflight.values() if delivery is not None]
     waiting += [held.message for held in session.received.values()]
     if session.will is not None:

@@ -95,7 +95,7 @@ def context_of(process: ApplianceProcess, certificate: str | None) -> ssl.SSLCon
     return context
 
 
-def reload(process: ApplianceProcess, pattern: str = "users and access rules reloaded") -> None:
+def reload(process: ApplianceProcess, pattern: str = "reload: reloaded: ") -> None:
     before = process.log.count(pattern)
     os.kill(process.pid, signal.SIGHUP)
     process.wait_for_log(pattern, before + 1)
@@ -366,7 +366,7 @@ def test_the_servers_certificate_is_replaced_under_load(process: ApplianceProces
             for _ in range(3):
                 before = len(acknowledged)
                 certs.renew(directory, "server")
-                reload(process, "certificates reloaded")
+                reload(process, "reload: reloaded: certificates")
                 seen.add(serial())
                 eventually(lambda b=before: len(acknowledged) > b + 20, "the load goes on")
         finally:

@@ -12,7 +12,7 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity
-from appliance.listeners import Listeners, ListenerSettings
+from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.packets import Connect, Pingreq, Publish, Subscribe, Subscription
 
 PATIENCE = 10.0
@@ -122,9 +122,7 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
     async def let_in(connect: Connect, *_: object) -> Identity:
         return Identity(connect.username, connect.client_id)
 
-    listeners = Listeners(
-        broker, let_in, lambda method, address: None, connections=10, connect_timeout=PATIENCE
-    )
+    listeners = Listeners(broker, let_in, lambda method, address: None, Admission(10, PATIENCE))
     settings = ListenerSettings("127.0.0.1", 0, None, protocol="websocket")
     ((host, port),) = await listeners.start([settings])
     async with contextlib.AsyncExitStack() as stack:

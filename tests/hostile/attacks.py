@@ -641,7 +641,7 @@ async def topic_aliases(fight: Fight) -> None:
 # --- retained messages
 
 
-@attack(r"no room to retain")
+@attack(r"no room to retain", said_after=3.0)
 async def retained_flood(fight: Fight) -> None:
     """Retained messages, small ones to ever new topics and large ones, beyond the limit."""
 
@@ -967,13 +967,13 @@ async def refused_publishes(fight: Fight) -> None:
     await fight.together(*(publish(number) for number in range(10)))
 
 
-@attack(r"client 'forbidden.*may not subscribe")
+@attack(r"client 'curious.*may not subscribe")
 async def refused_subscriptions(fight: Fight) -> None:
     """Filters that the rules refuse, thousands a second, and ones that are wrong."""
     wrong = [AREA + "/a#b", "$share//x", "$share/g", "a+/b"]
 
     async def subscribe(number: int) -> None:
-        line = await fight.join(f"forbidden-{number}")
+        line = await fight.join(f"curious-{number}")
         async for turn in fight.rounds():
             wanted = [Subscription(f"c3po/{turn}/{index}") for index in range(500)]
             wanted += [Subscription("c3po/" + "long" * 15_000)]

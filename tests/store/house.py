@@ -13,6 +13,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits
 from appliance.broker.session import Delivery, Session
+from appliance.broker.shared import Share
 from appliance.store import SqliteStore
 
 
@@ -104,8 +105,12 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         "received": {
             number: (
                 _message(held.message),
-                # of those that are still there
-                {each.filter for each in broker._shares.values() if each in held.full}
+                # of those that are still there, or there again: a group is known by its name
+                {
+                    each.filter
+                    for each in held.full
+                    if isinstance(each, Share) and each.filter in broker._shares
+                }
                 | {
                     each.client_id
                     for each in broker.sessions.values()
