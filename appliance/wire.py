@@ -44,7 +44,8 @@ OUTPUT_HIGH_WATER = 1024 * 1024
 #: this in a transport is not counted, so that writing costs nothing as long as clients read.
 OUTPUT_LOW_WATER = 16 * 1024
 
-#: Bytes that the system keeps for a client beside those that are on their way.
+#: Bytes that the system keeps, beside those that are on their way, for a client that is sent large
+#: messages of QoS 0.
 SYSTEM_OUTPUT = 128 * 1024
 
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
@@ -284,6 +285,7 @@ class ClientProtocol:
         self._paused = False
         self._counted = 0  # bytes in the ledger
         self._slow: asyncio.TimerHandle | None = None
+        self._is_system_limited = False
         self._has_told_behind = False  # and the client wants to know when it has caught up
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
@@ -306,12 +308,6 @@ class ClientProtocol:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 # A client without keep alive whose computer is gone is found out by the system.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-                # What the system has taken cannot be overtaken any more: without this it takes
-                # megabytes for a slow client, some seconds' worth.
-                if hasattr(socket, "TCP_NOTSENT_LOWAT"):
-                    connection.setsockopt(
-                        socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT
-                    )
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
@@ -736,8 +732,20 @@ class ClientProtocol:
 
     def is_behind(self) -> bool:
         """Whether the transport has asked for a pause."""
+        if not self._is_system_limited:
+            self._limit_system_output()
         self._has_told_behind |= self._paused
         return self._paused
+
+    def _limit_system_output(self) -> None:
+        """What the system has taken cannot be overtaken any more, and for a slow client it takes
+        megabytes, some seconds' worth."""
+        self._is_system_limited = True
+        if self._transport is None:
+            return
+        connection = self._transport.get_extra_info("socket")
+        if connection.family != socket.AF_UNIX and hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT)
 
     def close(self) -> None:
         """Write out what waits, then close."""
