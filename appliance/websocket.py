@@ -21,6 +21,9 @@ SUBPROTOCOLS = ("mqtt", "mqttv3.1")
 #: The largest head of an HTTP request, in bytes: a browser's, with all the cookies it may have.
 HEAD_LIMIT = 16 * 1024
 
+#: What the names of the headers begin with that a WebSocket is asked for with.
+_OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
+
 #: Seconds that frames are taken apart before it is the turn of other clients, and the bytes of them
 #: that this is asked for at a time: at worst, as frames may be empty, two milliseconds.
 TURN = 0.001
@@ -150,6 +153,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if request.path.partition("?")[0] != PATH:
             self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
             return False
+        for name, value in request.headers.raw_items():
+            # What is not ASCII is for other headers, and the library would stumble over it.
+            if name.lower().startswith(_OWN_HEADERS) and not value.isascii():
+                self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
+                return False
         response = frames.accept(request)
         if response.status_code != 101:
             self._send_refusal(response, str(frames.handshake_exc))

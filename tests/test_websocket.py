@@ -247,6 +247,12 @@ async def test_paths(house: House, caplog):
             b"400 ",
             b"too many HTTP headers",
         ),
+        (REQUEST.replace(b"Key: ", b"Key: \xff"), b"400 ", b"Sec-WebSocket-Key"),
+        (REQUEST.replace(b"Version: ", b"Version: \xff"), b"400 ", b"what is not ASCII"),
+        (REQUEST.replace(b"Upgrade: ", b"Upgrade: \xff"), b"400 ", b"what is not ASCII"),
+        (REQUEST.replace(b"Protocol: ", b"Protocol: \xff"), b"400 ", b"what is not ASCII"),
+        (REQUEST.replace(b"/mqtt", b"/\xff", 1), b"404 ", b"/mqtt"),
+        (REQUEST.replace(b"Sec-WebSocket-Protocol", b"\xff"), b"400 ", b"invalid HTTP header"),
     ],
 )
 async def test_what_is_no_upgrade(house: House, request_, status, body, caplog):

@@ -1,6 +1,6 @@
-"""python tests/fuzz [--minutes 10] [--seed N] [--only codec|states|sessions] [--cases N]
+"""python tests/fuzz [--minutes 10] [--seed N] [--only codec|states|sessions|strangers] [--cases N]
 
-The minutes are shared among the three. What is found is printed, and saved as hex beside the seed;
+The minutes are shared among the four. What is found is printed, and saved as hex beside the seed;
 `--only KIND --seed SEED --cases 1` does the same again for the codec and the states.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import random
 import sys
 import tempfile
@@ -21,12 +22,18 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import codec
 import sessions
 import states
+import strangers
 from codec import Found
 
 #: Seconds between two lines of progress.
 PROGRESS = 10.0
 
 IN_PROCESS = {"codec": codec.one_case, "states": states.one_case}
+LIVE = {"sessions": sessions.Siege, "strangers": strangers.Strangers}
+
+#: Seconds that an appliance is under siege before another one is, so that what is found can be
+#: found again; for strangers all the time, as who cannot come in leaves nothing behind.
+AT_ONCE = {"sessions": 60.0, "strangers": math.inf}
 
 
 def run_cases(
@@ -53,24 +60,25 @@ def run_cases(
     return found_something
 
 
-def run_sessions(seed: int, seconds: float) -> int:
+def run_live(name: str, seed: int, seconds: float) -> int:
     """Sessions against a live appliance; returns how often something was found."""
     end = time.monotonic() + seconds
     found_something = 0
     count = 0
     while (left := end - time.monotonic()) > 1 and found_something < 10:
         with tempfile.TemporaryDirectory() as directory:
-            siege = sessions.Siege(Path(directory))
+            siege = LIVE[name](Path(directory))
             try:
-                siege.run(random.Random(seed), min(left, 60.0))
+                siege.run(random.Random(seed), min(left, AT_ONCE[name]))
             except Found as found:
                 found_something += 1
-                save("sessions", seed, found)
+                save(name, seed, found)
             count += siege.count
             heard = siege.canary.heard
         seed += 1
         print(
-            f"sessions: {count} sessions, the canary was heard {heard} times, "
+            f"{name}: {count} sessions, the canary was heard {heard} times, memory "
+            f"{siege.base >> 20} MiB soon after the start and {siege.memory >> 20} MiB at the end, "
             f"{found_something} found",
             flush=True,
         )
@@ -96,18 +104,18 @@ def main() -> int:
     parser = argparse.ArgumentParser("python tests/fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=None)
-    parser.add_argument("--only", action="append", choices=["codec", "states", "sessions"])
+    parser.add_argument("--only", action="append", choices=[*IN_PROCESS, *LIVE])
     parser.add_argument("--cases", type=int, default=sys.maxsize, help="of codec and states")
     arguments = parser.parse_args()
     seed = random.SystemRandom().randrange(10**9) if arguments.seed is None else arguments.seed
     print(f"seed {seed}", flush=True)
     logging.disable(logging.CRITICAL)
-    wanted = arguments.only or ["codec", "states", "sessions"]
+    wanted = arguments.only or [*IN_PROCESS, *LIVE]
     seconds = arguments.minutes * 60 / len(wanted)
     found = 0
     for name in wanted:
-        if name == "sessions":
-            found += run_sessions(seed, seconds)
+        if name in LIVE:
+            found += run_live(name, seed, seconds)
         else:
             found += run_cases(name, IN_PROCESS[name], seed, seconds, arguments.cases)
     return 1 if found else 0

@@ -15,6 +15,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from appliance_process import ApplianceProcess
 from codec import Found
@@ -90,7 +91,8 @@ class Session:
     """What is sent on one connection, in which pieces, and how it ends."""
 
     version: int
-    tls: bool
+    #: "plain", "tls", or what `Siege.open` knows beside these.
+    transport: str
     login: bytes
     pieces: list[bytes]
     end: str
@@ -98,7 +100,7 @@ class Session:
     answer: bytearray = field(default_factory=bytearray)
 
     def __str__(self) -> str:
-        told = [f"version {self.version}", f"tls {self.tls}", f"end {self.end}"]
+        told = [f"version {self.version}", self.transport, f"end {self.end}"]
         told += [f"login {self.login.hex()}", *(piece.hex() for piece in self.pieces)]
         return "\n".join(told)
 
@@ -130,7 +132,8 @@ def make_session(rng: random.Random, password: bytes) -> Session:
             data = data[: rng.randrange(len(data) + 1)]
     end = rng.choice(("close", "close", "abort", "half", "linger"))
     pieces = chunks(rng, data)
-    return Session(version, rng.random() < 0.3, login, pieces, end, rng.random() < 0.9)
+    transport = "tls" if rng.random() < 0.3 else "plain"
+    return Session(version, transport, login, pieces, end, rng.random() < 0.9)
 
 
 class Canary:
@@ -198,13 +201,15 @@ async def _read_packet(reader: asyncio.StreamReader, version: int) -> Packet | N
 class Siege:
     """An appliance, and sessions without end against it."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, **broker: Any) -> None:
         self.appliance = ApplianceProcess(
             directory,
             users={USER: "knows the password"},
             acl=ACL,
-            broker={"limits": LIMITS},
+            broker={"limits": LIMITS, **broker},
         )
+        #: Bytes of memory soon after the start, and at the end.
+        self.base = self.memory = 0
         self.count = 0
         self.last: deque[Session] = deque(maxlen=REMEMBERED)
         self.canary = Canary()
@@ -223,12 +228,37 @@ class Siege:
         self.appliance.start()
         try:
             self._context = self.appliance.tls_context()
+            self.prepare()
             asyncio.run(self._run(rng, seconds))
+            self.examine()
         finally:
             try:
                 self.appliance.stop()
             except AssertionError as error:
                 raise Found(str(error)[-3000:], *self._remembered()) from error
+
+    def prepare(self) -> None:
+        """What is done before the first session."""
+
+    def examine(self) -> None:
+        """What is looked at behind the last. Raises Found."""
+
+    def make(self, rng: random.Random) -> Session:
+        """The next session."""
+        return make_session(rng, self.appliance.passwords[USER].encode())
+
+    async def open(self, transport: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """A connection."""
+        appliance = self.appliance
+        if transport == "plain":
+            return await asyncio.open_connection("127.0.0.1", appliance.plain_port)
+        return await asyncio.open_connection(
+            "127.0.0.1", appliance.port, ssl=self._context, server_hostname="localhost"
+        )
+
+    def check(self, session: Session) -> None:
+        """What was answered. Raises Found."""
+        check_answer(session)
 
     async def _run(self, rng: random.Random, seconds: float) -> None:
         stop = asyncio.Event()
@@ -236,27 +266,27 @@ class Siege:
         singing = asyncio.ensure_future(self.canary.sing(self.appliance.plain_port, password, stop))
         end = time.monotonic() + seconds
         warm = time.monotonic() + min(seconds / 4, 60.0)
-        base = 0
         running: set[asyncio.Future[None]] = set()
         try:
             while time.monotonic() < end and not singing.done():
                 while len(running) < AT_A_TIME:
                     self.count += 1
-                    running.add(asyncio.ensure_future(self._play(make_session(rng, self._secret))))
+                    running.add(asyncio.ensure_future(self._play(self.make(rng))))
                 done, running = await asyncio.wait(
                     running, return_when=asyncio.FIRST_COMPLETED, timeout=PATIENCE
                 )
                 for task in done:
                     task.result()
                 self._look_into_log()
-                if not base and time.monotonic() > warm:
-                    base = self.resident
+                if not self.base and time.monotonic() > warm:
+                    self.base = self.resident
             await asyncio.gather(*running)
             stop.set()
             await singing
             self._look_into_log()
-            grown = self.resident - base
-            if base and grown > GROWTH:
+            self.memory = self.resident
+            grown = self.memory - self.base
+            if self.base and grown > GROWTH:
                 raise Found(f"memory grew by {grown >> 20} MiB", *self._remembered())
         except _InLog as found:
             culprits = await self._narrow_down() or self._remembered()
@@ -268,10 +298,6 @@ class Siege:
             for task in (*running, singing):
                 task.cancel()
             await asyncio.gather(*running, singing, return_exceptions=True)
-
-    @property
-    def _secret(self) -> bytes:
-        return self.appliance.passwords[USER].encode()
 
     def _remembered(self) -> list[bytes]:
         return [str(session).encode() for session in self.last]
@@ -300,15 +326,9 @@ class Siege:
     async def _play(self, session: Session) -> None:
         """The session from its begin to its end, whatever the broker does."""
         self.last.append(session)
-        appliance = self.appliance
         try:
             async with _time_limit():
-                reader, writer = await asyncio.open_connection(
-                    "127.0.0.1",
-                    appliance.port if session.tls else appliance.plain_port,
-                    ssl=self._context if session.tls else None,
-                    server_hostname="localhost" if session.tls else None,
-                )
+                reader, writer = await self.open(session.transport)
         except (OSError, asyncio.TimeoutError):
             return  # the one before, with the same id, is still being thrown out
         reading: asyncio.Future[None] | None = None
@@ -338,7 +358,7 @@ class Siege:
             if reading is not None:
                 reading.cancel()
                 await asyncio.gather(reading, return_exceptions=True)
-        _check_answer(session)
+        self.check(session)
 
 
 async def _read_all(reader: asyncio.StreamReader, into: bytearray) -> None:
@@ -370,7 +390,7 @@ async def _time_limit():
         timer.cancel()
 
 
-def _check_answer(session: Session) -> None:
+def check_answer(session: Session) -> None:
     """All whole packets in it can be read, and may come from a server."""
     data = bytes(session.answer)
     version = session.version

@@ -12,6 +12,7 @@ import codec
 import pytest
 import sessions
 import states
+import strangers
 from codec import Found
 
 SECONDS = 4.0
@@ -35,8 +36,9 @@ def test_in_this_process(one_case: Callable[[random.Random], None]) -> None:
         seed += 1
 
 
-def test_sessions(tmp_path: Path) -> None:
-    siege = sessions.Siege(tmp_path)
+@pytest.mark.parametrize("kind", [sessions.Siege, strangers.Strangers])
+def test_sessions(kind: type[sessions.Siege], tmp_path: Path) -> None:
+    siege = kind(tmp_path)
     try:
         siege.run(random.Random(0), SECONDS)
     except Found as found:
