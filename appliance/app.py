@@ -21,6 +21,7 @@ from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plug
 from appliance.audit import Audit
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import InsideLink
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import (
     CertificateError,
@@ -155,7 +156,7 @@ class App:
             tls,
         )
         self._stack.push_async_callback(listeners.stop)
-        self._inside = broker.attach("_appliance", _Deaf())
+        self._inside = broker.attach("_appliance", InsideLink())
         self._start_clock(loop)
         await frame.start()
         self._stack.push_async_callback(frame.shutdown)
@@ -320,28 +321,6 @@ class App:
     def request_stop(self) -> None:
         """Let `run` end."""
         self._stopping.set()
-
-
-class _Deaf:
-    """The link of the session that the appliance itself publishes with: it receives nothing."""
-
-    writable = True
-
-    def publish(self, *_: object) -> None:
-        """It subscribes to nothing, so this is not called."""
-
-    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """Nor is this."""
-        return False
-
-    def pubrel(self, packet_id: int) -> None:
-        """Nor is this."""
-
-    def later(self) -> None:
-        """Nor is this."""
-
-    def close(self, reason: object, message: str) -> None:
-        """There is no connection to close."""
 
 
 def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:

@@ -59,6 +59,7 @@ COMMAND_KEYS = (
     "allow",
 )
 """The keys of a route that say when a command may reach ROS, and with what in it."""
+
 OPEN_WITH_SECRETS = (
     "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
     "take them from environment variables, ${NAME}"
@@ -454,7 +455,7 @@ RosNames = Annotated[
     PlainSerializer(lambda names: names if isinstance(names, str) else list(names)),
 ]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
-Encoding = Literal["json", "text", "cdr"]
+Encoding = Literal["json", "cbor", "text", "cdr", "binary"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
 Level = Literal["debug", "info", "warning", "error"]
@@ -606,10 +607,15 @@ class Broker(_Section):
 
 
 class RouteDefaults(_Section):
-    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto."""
+    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto.
+
+    `compression` is of payloads, and named to clients in the user property `content-encoding`.
+    """
 
     encoding: Encoding = "json"
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    bytes_per_second: Annotated[Size, Field(gt=0)] | None = None
+    compression: Literal["none", "zstd"] = "none"
     qos: Qos = None
     retain: Retain = None
     keep: Keep = "latest"
@@ -633,6 +639,7 @@ class TopicRoute(RouteDefaults):
     to: Direction
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
     mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+    fields: list[FieldPath] = []
     expire: Annotated[Duration, Field(gt=0)] | None = None
     take_retained: bool = False
     exclusive: bool = False

@@ -44,6 +44,10 @@ OUTPUT_HIGH_WATER = 1024 * 1024
 #: this in a transport is not counted, so that writing costs nothing as long as clients read.
 OUTPUT_LOW_WATER = 16 * 1024
 
+#: Bytes that the system keeps, beside those that are on their way, for a client that is sent large
+#: messages of QoS 0.
+SYSTEM_OUTPUT = 128 * 1024
+
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
 WRITE_PORTION = 512 * 1024
 
@@ -281,6 +285,8 @@ class ClientProtocol:
         self._paused = False
         self._counted = 0  # bytes in the ledger
         self._slow: asyncio.TimerHandle | None = None
+        self._is_system_limited = False
+        self._has_told_behind = False  # and the client wants to know when it has caught up
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
         #: The connection under the transport, to be closed after it.
@@ -615,10 +621,17 @@ class ClientProtocol:
         if self._transport is None:
             return
         self._write_on()
-        if self._slow is None or self._paused or self._closing:
+        if self._paused or self._closing:
+            return
+        if self._slow is None:
+            if self._has_told_behind:
+                self._has_told_behind = False
+                self._client.caught_up()
+                self._broker.flush()
             return
         self._slow.cancel()
         self._slow = None
+        self._has_told_behind = False
         self._choked = False
         self._client.resume_writing()
         self._broker.flush()
@@ -717,6 +730,23 @@ class ClientProtocol:
                 self._unshared += len(chunk)
         self._write_on()
 
+    def is_behind(self) -> bool:
+        """Whether the transport has asked for a pause."""
+        if not self._is_system_limited:
+            self._limit_system_output()
+        self._has_told_behind |= self._paused
+        return self._paused
+
+    def _limit_system_output(self) -> None:
+        """What the system has taken cannot be overtaken any more, and for a slow client it takes
+        megabytes, some seconds' worth."""
+        self._is_system_limited = True
+        if self._transport is None:
+            return
+        connection = self._transport.get_extra_info("socket")
+        if connection.family != socket.AF_UNIX and hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT)
+
     def close(self) -> None:
         """Write out what waits, then close."""
         if self._transport is None or self._closing:
@@ -772,6 +802,10 @@ class _Gone:
 
     def write(self, chunks: list[bytes]) -> None:
         """Nobody reads it."""
+
+    def is_behind(self) -> bool:
+        """Nothing waits for anybody."""
+        return False
 
     def close(self) -> None:
         """It is closed."""

@@ -118,6 +118,10 @@ def routes(settings: Settings) -> list[RouteSettings]:
             qos=route.qos,
             retain=route.retain,
             keep=route.keep,
+            compression=route.compression,
+            fields=tuple(route.fields),
+            bytes_per_second=route.bytes_per_second,
+            largest=settings.broker.limits.packet_size,
             rules=_command_rules(route) if route.command_keys else None,
         )
         for route in settings.bridge.topics

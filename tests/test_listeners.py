@@ -240,7 +240,7 @@ async def test_a_slow_reader_is_bounded_and_delays_nobody(house: House, tls):
         assert isinstance(heard, Publish) and heard.payload[:4] == b"%04d" % n
         largest = max(largest, protocol._output_size())
     assert largest < 4 * MIB
-    assert len(protocol._client.session.latest) == 1  # type: ignore[union-attr]
+    assert len(protocol._client.session.large) == 1  # type: ignore[union-attr]
     numbers = []
     while not numbers or numbers[-1] != 99:
         heard = await slow.hear()

@@ -22,7 +22,7 @@ from transitions import MachineError
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Access, Identity, Refusal
+from appliance.broker.ports import Access, Identity, InsideLink, Refusal
 from appliance.broker.session import Session
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
@@ -118,28 +118,6 @@ def _typed(path: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return typed
 
 
-class _NoLink:
-    """The link of a session that publishes and never receives, or that nobody is connected to."""
-
-    writable = True
-
-    def publish(self, *_: object) -> None:
-        """It subscribes to nothing, so this is not called."""
-
-    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """Nor is this."""
-        return False
-
-    def pubrel(self, packet_id: int) -> None:
-        """Nor is this."""
-
-    def later(self) -> None:
-        """Nor is this."""
-
-    def close(self, reason: object, message: str) -> None:
-        """There is no connection to close."""
-
-
 class ApplianceBroker(amqtt.broker.Broker):
     """An `amqtt.broker.Broker` whose data path is ours, for `App` to start and stop.
 
@@ -221,7 +199,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             self.transitions.start()
         except MachineError as error:
             raise BrokerError(f"Broker instance can't be started: {error}") from error
-        self._inside = self.broker.attach("_amqtt", _NoLink())
+        self._inside = self.broker.attach("_amqtt", InsideLink())
         if self.plugins_manager.plugins:
             self.broker.access = self._access
             if self._events.about_clients:
@@ -436,7 +414,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         Raises:
             BrokerError: it cannot be kept.
         """
-        link = _NoLink()
+        link = InsideLink()
         expiry = self.broker.limits.session_expiry
         if not expiry:
             raise BrokerError("no session outlives its connection (broker.limits.session_expiry)")

@@ -10,7 +10,7 @@ import math
 import uuid
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 from appliance.broker.broker import Broker, Route
 from appliance.broker.handshake import (
@@ -22,7 +22,7 @@ from appliance.broker.handshake import (
 )
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
-from appliance.broker.session import Held, Session
+from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
     PUBACK,
@@ -107,6 +107,10 @@ class Wire(Protocol):
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, one behind the other."""
+
+    def is_behind(self) -> bool:
+        """Whether some of it waits here, as the network takes no more; when it does,
+        `Client.caught_up` is called, or `Client.resume_writing`."""
 
     def close(self) -> None:
         """Write what was written so far, then close."""
@@ -684,11 +688,17 @@ class Client:
         if version == 5 and (
             subscription_ids or message.expires_at is not None or self._aliases is not None
         ):
+            if message.size > LARGE_MESSAGE and self._wait_for_its_turn(
+                message, first, subscription_ids
+            ):
+                return
             out.append(self._encode(first, packet_id, message, subscription_ids))
         else:
             if message.wire_key == version << 8 | first:
                 out.append(message.wire_head)
             else:
+                if message.size > LARGE_MESSAGE and self._wait_for_its_turn(message, first, None):
+                    return
                 out.append(message.head(version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
@@ -702,6 +712,26 @@ class Client:
         counters = self._counters
         counters.publish_sent += 1
         counters.publish_bytes_sent += len(message.payload)
+
+    def is_behind(self) -> bool:
+        """Whether the network has yet to take what it was given, or will be at the flush."""
+        if self._out_size > LARGE_MESSAGE:
+            self._full = True
+            return True
+        return self.wire.is_behind()
+
+    def _wait_for_its_turn(
+        self, message: Message, first: int, subscription_ids: list[int] | None
+    ) -> bool:
+        """Give a large message of QoS 0 back to the session when the client is behind.
+
+        What comes then, and is newer or smaller, is not behind it.
+        """
+        session = self.session
+        if first & 0x06 or session is None or not self.is_behind():
+            return False
+        session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
+        return True
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
@@ -856,6 +886,11 @@ class Client:
         """The network takes bytes again: send what waited."""
         self.writable = True
         if self.session is not None and self.session.link is self:
+            self.session.pump()
+
+    def caught_up(self) -> None:
+        """The network has taken all it was given: send the large messages that waited for that."""
+        if self.writable and self.session is not None and self.session.link is self:
             self.session.pump()
 
     def later(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from appliance.mqtt.codec import (
     Properties,
     Property,
@@ -102,6 +104,9 @@ class Message:
         """Seconds from its arrival until it was published, see `Late`."""
         return 0.0
 
+    def dropped(self) -> None:
+        """A session has given it up, whose client was too slow; see `Watched`."""
+
     @property
     def properties_wire(self) -> bytes:
         """The properties as they stand in an MQTT 5 packet, between packet id and payload."""
@@ -164,6 +169,26 @@ class Message:
             body += packet_id.to_bytes(2, "big")
         body += encode_varint(len(properties)) + properties + self.payload
         return bytes((first,)) + encode_varint(len(body)) + body
+
+
+class Watcher(Protocol):
+    """Counts what slow clients are not sent."""
+
+    skipped: int
+
+
+class Watched(Message):
+    """A message of a part of the appliance that counts what slow clients are not sent of it.
+
+    Whoever makes one sets `watcher`.
+    """
+
+    __slots__ = ("watcher",)
+
+    watcher: Watcher
+
+    def dropped(self) -> None:
+        self.watcher.skipped += 1
 
 
 class Late(Message):

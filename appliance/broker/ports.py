@@ -113,11 +113,53 @@ class Link(Protocol):
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""
 
+    def is_behind(self) -> bool:
+        """Whether a large message of QoS 0 has to wait in the session, as what was sent before has
+        not gone out; `Session.pump` is called when it has."""
+
     def later(self) -> None:
         """Call `Session.pump` once more when the other clients have had their turn."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """Tell the client why, where the protocol can, and end the connection."""
+
+
+class InsideLink:
+    """The link of a session that a part of the appliance has: it takes everything at once.
+
+    As it is it takes nothing, which is enough for who only publishes. Whoever subscribes overrides
+    `publish`, and does so with QoS 0 and without asking for retained messages.
+    """
+
+    writable = True
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """A message that was subscribed to."""
+
+    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
+        """It takes messages, not packets."""
+        return False
+
+    def pubrel(self, packet_id: int) -> None:
+        """It has no QoS 2."""
+
+    def is_behind(self) -> bool:
+        """It takes everything at once."""
+        return False
+
+    def later(self) -> None:
+        """It has no retained messages to go on with."""
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """There is no connection to close."""
 
 
 class Store(Protocol):

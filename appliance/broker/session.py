@@ -40,6 +40,10 @@ class Delivery(NamedTuple):
 #: not see that are passed over: some milliseconds, then it is the turn of other clients.
 REPLAYED_A_TURN = 512
 
+#: Bytes from which on a message is large: an image or a map, not a state or a command. To a slow
+#: client it goes when everything else that waits has gone, see `Link.is_behind`.
+LARGE_MESSAGE = 32 * 1024
+
 #: What a subscription takes, roughly, in bytes: itself, and each level that its filter has.
 SUBSCRIPTION_SIZE = 600
 LEVEL_SIZE = 350
@@ -175,6 +179,7 @@ class Session:
         "expiry",
         "identity",
         "inflight",
+        "large",
         "latest",
         "ledger",
         "link",
@@ -223,6 +228,9 @@ class Session:
         #: QoS 0, waiting for a slow client, oldest first: the newest of each topic, or by number
         #: when the limit `keep` says how many.
         self.latest: dict[str | int, Delivery] = {}
+        #: The large ones among these, unless the limit `keep` says how many wait: then their order
+        #: is kept.
+        self.large: dict[str | int, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
         self.received: dict[int, Held] = {}
         self.bytes = 0
@@ -263,6 +271,7 @@ class Session:
             and link.writable
             and not self.queue
             and not self.latest
+            and not self.large
             and len(self.inflight) < self.window
         )
 
@@ -282,7 +291,7 @@ class Session:
             if link.writable:  # then replays wait for the window only, which is no matter of QoS 0
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
-            return self._keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
+            return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
         # `_fits` and `_count`, written out here and in `_send`: two calls less a message.
         ledger = self.ledger
         size = message.size
@@ -306,7 +315,7 @@ class Session:
             return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
         if ledger.limits.queue_full == "disconnect" and link is not None:
             ledger.overflowed.append(self)
-        ledger.counters.publish_dropped += 1
+        self._drop(message)
         return False
 
     def deliver_promised(self, delivery: Delivery) -> None:
@@ -363,7 +372,7 @@ class Session:
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
-            ledger.counters.publish_dropped += 1
+            self._drop(oldest[0])
         return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
@@ -391,9 +400,9 @@ class Session:
             link.later()
         if not self.replays and not self.resends:
             self._pump_queue(link)
-        if self.latest:
+        if self.latest or self.large:
             self._pump_latest(link)
-        if self.unchecked and not (self.queue or self.latest or self.resends):
+        if self.unchecked and not (self.queue or self.latest or self.large or self.resends):
             self.unchecked = False
 
     def _pump_resends(self, link: Link) -> None:
@@ -426,8 +435,12 @@ class Session:
                 if delivery is None:
                     continue
                 message, qos, retain, subscription_ids, _ = delivery
-                if qos and self.inflight and not self.fits(message.size):
-                    # More of these when some are acknowledged.
+                if (
+                    self.inflight and not self.fits(message.size)
+                    if qos
+                    else message.size > LARGE_MESSAGE and link.is_behind()
+                ):
+                    # More of these when some are acknowledged, or what was sent has gone out.
                     self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
                     break
                 if qos:
@@ -457,8 +470,8 @@ class Session:
                 if is_old(delivery[0]):
                     self._uncount(delivery[0])
                     self._settled(delivery)
+                    self._drop(delivery[0])
             self.queue = kept
-            self.ledger.counters.publish_dropped += dropped
         return dropped
 
     def open_window(self, size: int) -> None:
@@ -524,9 +537,11 @@ class Session:
         link.publish(message, qos, packet_id, False, retain, subscription_ids)
 
     def _pump_latest(self, link: Link) -> None:
-        while self.latest and link.writable:
-            oldest = next(iter(self.latest))
-            message, _, retain, subscription_ids, _ = self.latest.pop(oldest)
+        while link.writable and (waiting := self.latest or self.large):
+            oldest = next(iter(waiting))
+            if waiting[oldest][0].size > LARGE_MESSAGE and link.is_behind():
+                return
+            message, _, retain, subscription_ids, _ = waiting.pop(oldest)
             self._uncount(message)
             if not (self.ledger.has_expired(message) or self._is_forbidden(message)):
                 link.publish(message, 0, 0, False, retain, subscription_ids)
@@ -538,7 +553,8 @@ class Session:
         self.ledger.counters.publish_dropped += 1
         return True
 
-    def _keep_latest(self, delivery: Delivery) -> bool:
+    def keep_latest(self, delivery: Delivery) -> bool:
+        """Let a QoS 0 message wait for a slow client; False when it was dropped, and counted."""
         message = delivery[0]
         limits = self.ledger.limits
         replaced: Delivery | None = None
@@ -548,18 +564,24 @@ class Session:
             if len(self.latest) >= limits.keep:
                 replaced = self.latest.pop(next(iter(self.latest)))
         else:
-            replaced = self.latest.pop(key, None)
+            replaced = self.latest.pop(key, None) or self.large.pop(key, None)
         if replaced is not None:
             self._uncount(replaced[0])
-            self.ledger.counters.publish_dropped += 1
-        room = limits.keep or len(self.latest) < limits.queue_messages
+            self._drop(replaced[0])
+        room = limits.keep or len(self.latest) + len(self.large) < limits.queue_messages
         if room and self.fits(message.size):
             message.settle()
             self._count(message)
-            self.latest[key] = delivery
+            is_large = message.size > LARGE_MESSAGE and not limits.keep
+            (self.large if is_large else self.latest)[key] = delivery
             return True
-        self.ledger.counters.publish_dropped += 1
+        self._drop(message)
         return False
+
+    def _drop(self, message: Message) -> None:
+        """Count a message that the client was too slow for."""
+        self.ledger.counters.publish_dropped += 1
+        message.dropped()
 
     def _count(self, message: Message) -> None:
         self.bytes += message.size
@@ -739,9 +761,10 @@ class Session:
 
     def forget_transient(self) -> None:
         """Drop what does not outlive the connection: QoS 0, and what is known of its topics."""
-        for delivery in self.latest.values():
-            self._uncount(delivery[0])
-        self.latest.clear()
+        for waiting in (self.latest, self.large):
+            for delivery in waiting.values():
+                self._uncount(delivery[0])
+            waiting.clear()
         for topic_filter in list(self.replays):
             if not self.subscriptions[topic_filter].qos:
                 del self.replays[topic_filter]
@@ -754,7 +777,7 @@ class Session:
         self.bytes = 0
         self.will = None
         self.subscriptions.clear()
-        for waiting in (self.queue, self.latest, self.inflight, self.received):
+        for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):
             waiting.clear()
         self.resends.clear()
         self.replays.clear()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from math import nan
 from typing import Any
@@ -26,6 +27,14 @@ _BOOLS = frozenset({bool})
 _INTEGERS = frozenset({int})
 _NUMBERS = frozenset({int, float})
 _NUMBERS_AND_NULL = frozenset({int, float, type(None)})
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """An array of numbers as it is in CDR, in little endian."""
+
+    primitive: Primitive
+    data: bytes
 
 
 def _octets(value: Any) -> bytes:
@@ -136,6 +145,51 @@ def readers(with_numpy: bool) -> dict[str, Any]:
         "base64": pybase64.b64encode_as_string,
         "read_wide_string": _read_wide_string,
         **{f"read_{p.name}": _reader(p, with_numpy) for p in PRIMITIVES.values()},
+    }
+
+
+def _as_it_is(value: bytes) -> bytes:
+    return value
+
+
+def _binary_reader(primitive: Primitive) -> Callable[[bytes, int, int], Any]:
+    """The function that reads `count` numbers at `q` without looking at them."""
+    size = primitive.size
+
+    def read_octets(b: bytes, q: int, count: int) -> bytes:
+        end = q + count
+        if end > len(b):
+            raise IndexError
+        return b[q:end]
+
+    def read_numbers(b: bytes, q: int, count: int) -> Numbers:
+        end = q + count * size
+        if end > len(b):
+            raise IndexError
+        return Numbers(primitive, b[q:end])
+
+    return read_octets if primitive.is_octet else read_numbers
+
+
+def _row(primitive: Primitive) -> Callable[..., Any]:
+    """The function that makes an array of numbers that have been read one by one."""
+    code = primitive.code
+    if primitive.name == "bool":
+        return lambda *values: list(values)
+    return lambda *values: Numbers(primitive, struct.pack(f"<{len(values)}{code}", *values))
+
+
+@cache
+def binary_readers() -> dict[str, Any]:
+    """What decoders call that leave arrays of numbers as they are; those of bools are lists."""
+    bools = PRIMITIVES["bool"]
+    return {
+        "LITTLE_ENDIAN": HEADER[:2],
+        "base64": _as_it_is,
+        "read_wide_string": _read_wide_string,
+        **{f"read_{p.name}": _binary_reader(p) for p in PRIMITIVES.values()},
+        "read_bool": _reader(bools, with_numpy=False),
+        **{f"numbers_{p.name}": _row(p) for p in PRIMITIVES.values()},
     }
 
 

@@ -19,17 +19,19 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
-from appliance.mqtt.reason import ReasonCode
 from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
-from appliance.ros.definitions import describe
+from appliance.ros.definitions import UnknownTypeError, describe
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
 __all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus", "TopicStatus"]
@@ -49,6 +51,8 @@ THOROUGH_LOOK = 5
 #: what is bridged is told again for the figures in it.
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
+
+SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
 
 class Bridge:
@@ -76,6 +80,9 @@ class Bridge:
         self._broker = broker
         self._loop = loop
         self._topic = f"{robot}/_appliance/routes"
+        self._schemas = f"{robot}/_appliance/schema/"
+        #: The types whose schemas are told.
+        self._told: set[str] = set()
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(lambda name: describe(node.load(name), node.load), node.now)
@@ -289,7 +296,7 @@ class Bridge:
         session = self._session
         if session is None:
             return False
-        batch = self._mailbox.take(BATCH)
+        batch, has_more = self._mailbox.take(BATCH)
         publish = self._broker.publish
         for lane, message in batch:
             counters = lane.counters
@@ -301,14 +308,16 @@ class Bridge:
             counters.bytes += len(message.payload)
             publish(message, session)
         self._broker.flush()
-        return len(batch) == BATCH
+        return has_more
 
     def _announce(self) -> None:
         """Tell what is bridged, if that or a figure in it has changed."""
-        payload = orjson.dumps([*self.topics(), *self.calls.bridged()])
+        topics = self.topics()
+        payload = orjson.dumps([*topics, *self.calls.bridged()])
         if self._session is not None and payload != self._announced:
             self._announced = payload
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
+            self._tell_schemas({topic.type for topic in topics}, self._session)
             self._broker.flush()
 
     def _meter(self) -> None:
@@ -319,6 +328,21 @@ class Bridge:
         if self._metered % METERS_TO_ANNOUNCE == 0:
             self._announce()
         self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
+
+    def _tell_schemas(self, types: set[str], session: Session) -> None:
+        for name in sorted(types ^ self._told):
+            payload = b""
+            if name in types:
+                try:
+                    payload = orjson.dumps(json_schema(self._converters.get(name).description))
+                except UnknownTypeError as error:  # which only `cdr` can carry
+                    log.warning("there is no schema of %s: %s", name, error)
+                    continue
+            topic = self._schemas + topic_of(name)
+            self._broker.publish(
+                Message(topic, payload, 0, True, SCHEMA_PROPERTIES if payload else None), session
+            )
+        self._told = types
 
     def _stopped(self, reason: str) -> None:
         self.problem = reason
@@ -438,10 +462,8 @@ class Bridge:
         self._post(self._announce)
 
 
-class _Link:
-    """The bridge as the link of its session: it takes everything at once, of one publisher."""
-
-    writable = True
+class _Link(InsideLink):
+    """The bridge as the link of its session, for what one client publishes."""
 
     def __init__(
         self, receive: Callable[[Message, bool, Session | None], None], origin: Session | None
@@ -460,16 +482,3 @@ class _Link:
     ) -> None:
         """A message for ROS."""
         self._receive(message, retain, self._origin)
-
-    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """It takes messages, not packets."""
-        return False
-
-    def pubrel(self, packet_id: int) -> None:
-        """Its subscriptions are of QoS 0."""
-
-    def later(self) -> None:
-        """It asks for no retained messages, so that there is nothing to go on with."""
-
-    def close(self, reason: ReasonCode, message: str) -> None:
-        """There is no connection to close."""

@@ -29,6 +29,7 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
@@ -132,10 +133,8 @@ class Offer:
 Receive: TypeAlias = Callable[[Session, Message], None]
 
 
-class Ear:
-    """The link for what one session publishes: it takes everything at once."""
-
-    writable = True
+class Ear(InsideLink):
+    """The link for what one session publishes."""
 
     def __init__(self, switchboard: Switchboard, origin: Session | None) -> None:
         self._switchboard = switchboard
@@ -153,19 +152,6 @@ class Ear:
         """A message to one of the topics that were asked for."""
         if self._origin is not None and subscription_ids:
             self._switchboard.receive(self._origin, message, subscription_ids[0])
-
-    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """It takes messages, not packets."""
-        return False
-
-    def pubrel(self, packet_id: int) -> None:
-        """Its subscriptions are of QoS 0."""
-
-    def later(self) -> None:
-        """It asks for no retained messages, so that there is nothing to go on with."""
-
-    def close(self, reason: ReasonCode, message: str) -> None:
-        """There is no connection to close."""
 
 
 class Switchboard:

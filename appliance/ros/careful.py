@@ -18,6 +18,7 @@ from typing import Any
 
 import pybase64
 
+from appliance.ros.arrays import Numbers
 from appliance.ros.definitions import (
     TIME,
     Array,
@@ -25,6 +26,7 @@ from appliance.ros.definitions import (
     FieldType,
     ItemType,
     Primitive,
+    Selection,
     Sequence,
     String,
     TypeDescription,
@@ -49,10 +51,11 @@ class ConversionError(ValueError):
 # --- CDR to values --------------------------------------------------------------------------
 
 
-def decode(description: TypeDescription, cdr: bytes) -> dict[str, Any]:
+def decode(description: TypeDescription, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
     """The value of a serialized message: byte order, alignment and strings as in plain CDR.
 
-    uint8[], byte[] and char[] come as base64, as in JSON. Bytes after the message are ignored,
+    uint8[], byte[] and char[] come as base64, as in JSON; when `binary`, as bytes, and other
+    arrays of numbers, but for bools, as `Numbers`. Bytes after the message are ignored,
     as every DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) comes with
     U+FFFD in it, as rclpy gives it. Raises ConversionError.
     """
@@ -60,15 +63,27 @@ def decode(description: TypeDescription, cdr: bytes) -> dict[str, Any]:
         raise ConversionError("", "truncated: not even CDR's header of four bytes")
     if cdr[0] != 0 or cdr[1] > 1:
         raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
-    return _Reader(cdr, "<" if cdr[1] else ">").structure(description, "")
+    return _Reader(cdr, "<" if cdr[1] else ">", binary).structure(description, "")
+
+
+def pick(value: Any, wanted: Selection) -> Any:
+    """What is wanted of a message's value, or of each in a list."""
+    if isinstance(value, list):
+        return [pick(item, wanted) for item in value]
+    return {
+        name: inside if wanted[name] is None else pick(inside, wanted[name] or {})
+        for name, inside in value.items()
+        if name in wanted
+    }
 
 
 class _Reader:
     """A position in the bytes of one message."""
 
-    def __init__(self, cdr: bytes, order: str) -> None:
+    def __init__(self, cdr: bytes, order: str, binary: bool) -> None:
         self._cdr = cdr
         self._order = order
+        self._binary = binary
         self._position = 4
 
     def structure(self, description: TypeDescription, path: str) -> dict[str, Any]:
@@ -98,8 +113,12 @@ class _Reader:
     def _items(self, item: ItemType, count: int, path: str) -> Any:
         if isinstance(item, Primitive):
             if item.is_octet:
-                return pybase64.b64encode_as_string(self._take(count, path))
-            return list(self._numbers(item, count, path))
+                octets = self._take(count, path)
+                return octets if self._binary else pybase64.b64encode_as_string(octets)
+            numbers = self._numbers(item, count, path)
+            if self._binary and item.name != "bool":
+                return Numbers(item, struct.pack(f"<{count}{item.code}", *numbers))
+            return list(numbers)
         return [self._value(item, f"{path}[{i}]") for i in range(count)]
 
     def _numbers(self, primitive: Primitive, count: int, path: str) -> tuple[Any, ...]:

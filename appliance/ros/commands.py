@@ -165,7 +165,7 @@ class Commands(ToRos):
             return
         convert, publisher = out
         try:
-            cdr = self._limited(convert(message.payload), origin)
+            cdr = self._limited(self._read(convert, message), origin)
             if self.echo is not None:
                 self.echo.sent(cdr)
             publisher.publish(cdr)

@@ -1,4 +1,4 @@
-"""ROS messages as MQTT payloads: JSON and text, to and from ROS's own serialized bytes (CDR).
+"""ROS messages as MQTT payloads: JSON, CBOR, text, to and from ROS's own serialized bytes (CDR).
 
     converters = Converters(load_description)
     twist = converters.get("geometry_msgs/msg/Twist")
@@ -16,20 +16,32 @@ JSON, beyond what the word says:
 - 64-bit integers are integers, which JavaScript reads as the nearest double;
 - a missing field takes its default; an unknown one is an error; of duplicates the last counts;
 - a builtin_interfaces/Time may be given as "now".
+
+CBOR is the same with other words for bytes and arrays of numbers, see cbor.py; it has NaN and
+infinities. And `binary` is a picture as it is: the bytes of the field `data`.
 """
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import orjson
 
-from appliance.ros.careful import ConversionError, accept, decode
-from appliance.ros.definitions import Primitive, String, TypeDescription, WideString
-from appliance.ros.generate import MISFIT, generate
+from appliance.ros import cbor
+from appliance.ros.careful import ConversionError, accept, decode, pick
+from appliance.ros.definitions import (
+    PRIMITIVES,
+    Primitive,
+    Sequence,
+    String,
+    TypeDescription,
+    WideString,
+    select,
+)
+from appliance.ros.generate import MISFIT, Binary, generate, generate_binary
 
 __all__ = ["ConversionError", "Converter", "Converters", "compile_converter"]
 
@@ -50,16 +62,43 @@ _FLOAT = re.compile(
 _BOOLS = {"true": True, "false": False}
 
 
+#: What is wrong with a type that cannot go as `binary`.
+NO_BINARY = "cannot go as binary: only a type with a field `data` of bytes, such as CompressedImage"
+
+_OCTETS = frozenset(p for p in PRIMITIVES.values() if p.is_octet)
+
+#: What pictures begin with; a WebP has its size between the two.
+_IMAGES = ((b"\xff\xd8\xff", b"", "jpeg"), (b"\x89PNG", b"", "png"), (b"RIFF", b"WEBP", "webp"))
+
+
+def image_format(data: bytes) -> str:
+    """`jpeg`, `png` or `webp`, or nothing when the bytes are something else."""
+    for start, later, name in _IMAGES:
+        if data.startswith(start) and data.startswith(later, 8):
+            return name
+    return ""
+
+
 class Converter:
     """Converts messages of one type. All methods raise ConversionError and nothing else.
 
-    `has_text` tells whether the type can go as text; `source` is the generated code, for reading.
+    With `fields`, paths such as `pose.position`, the `to_` methods give these only. `has_text` and
+    `has_binary` tell whether the type can go as these; `source` is the generated code, for reading.
     """
 
-    def __init__(self, description: TypeDescription, now: Callable[[], int]) -> None:
+    def __init__(
+        self, description: TypeDescription, now: Callable[[], int], fields: Iterable[str] = ()
+    ) -> None:
+        """Raises UnknownTypeError for a field that there is not."""
         self.description = description
         self._now = now
-        self._decode, self._decode_plain, self._encode, self.source = generate(description)
+        self._wanted = select(description, fields) or None
+        self._decode, self._decode_plain, self._encode, self.source = generate(
+            description, self._wanted
+        )
+        #: Made when they are first needed: few routes do.
+        self._binary: Binary | None = None
+        self._data: Binary | None = None
         self._has_float32_arrays = "read_float32" in self.source
         self._text_type = _text_type(description)
 
@@ -72,7 +111,7 @@ class Converter:
         try:
             payload = _dumps(self._decode(cdr), None, _NUMPY)
         except MISFIT:
-            return _dumps(decode(self.description, cdr))
+            return _dumps(self._decode_carefully(cdr))
         if self._has_float32_arrays and _TWICE_ROUNDED in payload:
             return _dumps(self._decode_plain(cdr))
         return payload
@@ -93,12 +132,63 @@ class Converter:
         try:
             return self._decode_plain(cdr)
         except MISFIT:
-            return decode(self.description, cdr)
+            return self._decode_carefully(cdr)
 
     def from_dict(self, value: object) -> bytes:
         """The serialized message of Python values, by the same rules as JSON; bytes for uint8[]
         will do too."""
         return self._encode(accept(self.description, value, self._now))
+
+    def to_cbor(self, cdr: bytes) -> bytes:
+        """The CBOR of a serialized message, in either byte order."""
+        if self._binary is None:
+            self._binary = generate_binary(self.description, self._wanted)
+        try:
+            value = self._binary.decode(cdr)
+        except MISFIT:
+            value = self._decode_carefully(cdr, binary=True)
+        return cbor.dumps(value)
+
+    def from_cbor(self, payload: bytes) -> bytes:
+        """The serialized message, in little endian, of its CBOR."""
+        value = cbor.loads(payload)
+        try:
+            return self._encode(value)
+        except MISFIT:
+            return self.from_dict(value)
+
+    def _decode_carefully(self, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
+        value = decode(self.description, cdr, binary=binary)
+        return value if self._wanted is None else pick(value, self._wanted)
+
+    @property
+    def has_binary(self) -> bool:
+        fields = {field.name: field.type for field in self.description.fields}
+        data = fields.get("data")
+        return isinstance(data, Sequence) and data.item in _OCTETS and data.bound is None
+
+    def to_binary(self, cdr: bytes) -> bytes:
+        """The bytes of the field `data`."""
+        if not self.has_binary:
+            raise ConversionError("", f"{self.description.name} {NO_BINARY}")
+        if self._data is None:
+            self._data = generate_binary(self.description, {"data": None})
+        try:
+            data = self._data.decode(cdr)["data"]
+        except MISFIT:
+            data = decode(self.description, cdr, binary=True)["data"]
+        assert isinstance(data, bytes)
+        return data
+
+    def from_binary(self, payload: bytes) -> bytes:
+        """The serialized message with these bytes as `data`, and as `format`, where there is one,
+        what they begin like: `jpeg`, `png`."""
+        if not self.has_binary:
+            raise ConversionError("", f"{self.description.name} {NO_BINARY}")
+        value: dict[str, object] = {"data": payload}
+        if any(field.name == "format" for field in self.description.fields):
+            value["format"] = image_format(payload)
+        return self.from_dict(value)
 
     def to_text(self, cdr: bytes) -> bytes:
         """The text of a message whose only field is `data`: true and false, the digits of a
@@ -146,15 +236,15 @@ class Converters:
     ) -> None:
         self._load = load
         self._now = now
-        self._converters: dict[str, Converter] = {}
+        self._converters: dict[tuple[str, tuple[str, ...]], Converter] = {}
 
-    def get(self, type_name: str) -> Converter:
-        """The converter of a type by its name, `std_msgs/msg/String`."""
-        converter = self._converters.get(type_name)
+    def get(self, type_name: str, fields: tuple[str, ...] = ()) -> Converter:
+        """The converter of a type by its name, `std_msgs/msg/String`, or of some of its fields."""
+        converter = self._converters.get((type_name, fields))
         if converter is None:
             # Two threads may both come here: one converter is then as good as the other.
-            converter = compile_converter(self._load(type_name), self._now)
-            self._converters[type_name] = converter
+            converter = Converter(self._load(type_name), self._now, fields)
+            self._converters[type_name, fields] = converter
         return converter
 
 

@@ -8,12 +8,14 @@ ROS 1, or a test, writes descriptions directly.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 # Names end up in generated source (generate.py), so nothing but an identifier may pass.
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -118,6 +120,36 @@ class TypeDescription:
 
 ItemType = Primitive | String | WideString | TypeDescription
 FieldType = ItemType | Array | Sequence
+
+#: Some fields of a type by their names, and of these all (None) or some in turn.
+Selection: TypeAlias = "dict[str, Selection | None]"
+
+
+def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
+    """The selection of fields by their paths, `pose.position`; those of items of an array are
+    named as those of a message. Raises UnknownTypeError for a field that there is not."""
+    chosen: Selection = {}
+    for path in paths:
+        type_: FieldType = description
+        inside: Selection | None = chosen
+        *parents, last = path.split(".")
+        for depth, name in enumerate((*parents, last)):
+            item = type_.item if isinstance(type_, (Array, Sequence)) else type_
+            fields = item.fields if isinstance(item, TypeDescription) else ()
+            field = next((field for field in fields if field.name == name), None)
+            if field is None or not isinstance(item, TypeDescription):
+                there = ", ".join(field.name for field in fields) or "none"
+                raise UnknownTypeError(
+                    f"{description.name} has no field {path!r}: no {name!r}, there are {there}"
+                )
+            type_ = field.type
+            if inside is None:  # all of it is chosen already
+                continue
+            if depth == len(parents):
+                inside[name] = None
+            else:
+                inside = inside.setdefault(name, {})
+    return chosen
 
 
 def least_size(type_: FieldType) -> int:
@@ -225,6 +257,8 @@ def import_message(name: str) -> type:
     if match is None:
         raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
     package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
+    if package not in sys.modules:
+        _look_in_workspaces(package)
     try:
         module = import_module(f"{package}.{kind}")
     except ImportError as error:
@@ -237,6 +271,20 @@ def import_message(name: str) -> type:
     if not isinstance(found, type) or not hasattr(found, "SLOT_TYPES"):
         raise UnknownTypeError(f"no {name}: the package {package} has no such {kind} type")
     return found
+
+
+def _look_in_workspaces(package: str) -> None:
+    """Let a package be imported from a workspace that only AMENT_PREFIX_PATH tells of.
+
+    A shell that sources a workspace has its Python packages in PYTHONPATH as well; a service, most
+    often, has not.
+    """
+    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        for place in (f"lib/{version}/site-packages", f"local/lib/{version}/dist-packages"):
+            folder = Path(prefix, place)
+            if prefix and str(folder) not in sys.path and (folder / package).is_dir():
+                sys.path.append(str(folder))
 
 
 def load_description(name: str) -> TypeDescription:

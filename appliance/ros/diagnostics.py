@@ -175,6 +175,7 @@ class Diagnostics:
         }
         if route.direction == "to_mqtt":
             values |= {"dropped": route.dropped, "throttled": route.throttled}
+            values["skipped"] = route.skipped
             if route.latency_ms is not None:
                 values["latency p50 (ms)"] = route.latency_ms.p50
                 values["latency p99 (ms)"] = route.latency_ms.p99

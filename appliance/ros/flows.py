@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
 
-from appliance.broker.message import Message
+from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, encode_string
 from appliance.ros.convert import ConversionError, Converters
@@ -32,13 +32,19 @@ from appliance.ros.node import (
     RosSubscription,
 )
 from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.payloads import (
+    CONTENT_TYPE,
+    Compression,
+    Encoding,
+    check,
+    claim,
+    packer,
+    unpacker,
+)
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 from appliance.ros.rules import CommandRules
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
-Encoding: TypeAlias = Literal["json", "text", "cdr"]
-
-CONTENT_TYPE = {"json": "application/json", "text": "text/plain", "cdr": "application/cdr"}
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
@@ -56,9 +62,11 @@ class RouteSettings:
     name, `**` of a path, and what begins with `!` is left out again. `mqtt` is a topic; a `{ros}`
     in it stands for the ROS name.
 
-    None is: no limit (`rate`, in Hz), found from the graph (`type`, which may have a `*` in it
-    too), as the publishers' QoS says (`qos`, `retain`). `keep` is how many messages of a topic wait
-    for a busy broker: the latest, or so many.
+    None is: no limit (`rate`, in Hz, and `bytes_per_second` of payload), found from the graph
+    (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
+    is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
+    paths of those that go to MQTT, all of them when there are none; what comes from MQTT has at
+    most `largest` bytes when it is decompressed.
     """
 
     ros: str | tuple[str, ...]
@@ -70,6 +78,10 @@ class RouteSettings:
     qos: int | None = None
     retain: bool | None = None
     keep: int | Literal["latest"] = "latest"
+    compression: Compression = "none"
+    fields: tuple[str, ...] = ()
+    bytes_per_second: int | None = None
+    largest: int = 16 * 1024 * 1024
     #: What holds for what goes to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 
@@ -336,12 +348,14 @@ class ToMqtt(Flow):
         self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
         self._due = 0.0
+        #: Bytes that may be sent now; fewer than none when a message was larger than that.
+        self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
+        self._budget_at = 0.0
         self._subscription: RosSubscription | None = None
-        self._convert: Callable[[bytes], bytes] | None = None
+        self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._topic_wire = encode_string(self.mqtt)
         self._qos = 0
         self._retain = False
-        self._properties: Properties | None = None
 
     def __str__(self) -> str:
         return f"{self.ros} → {self.mqtt}"
@@ -354,23 +368,18 @@ class ToMqtt(Flow):
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         self.close()
-        encoding = self.settings.encoding
-        self._convert = None
-        if encoding != "cdr":
-            converter = self._converters.get(type_name)
-            if encoding == "text" and not converter.has_text:
-                raise UnknownTypeError(_no_text(type_name))
-            self._convert = converter.to_json if encoding == "json" else converter.to_text
-        wanted_qos, wanted_retain = self.settings.qos, self.settings.retain
-        self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
-        self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        settings = self.settings
+        converter = None
+        if settings.encoding != "cdr":
+            converter = self._converters.get(type_name, settings.fields)
+            check(converter, settings.encoding, to_ros=False)
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        self._properties = {
-            Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
-            Property.USER_PROPERTY: about,
-        }
+        self._pack = packer(converter, settings.encoding, settings.compression, about)
+        wanted_qos, wanted_retain = settings.qos, settings.retain
+        self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
+        self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
         self._subscription = node.subscribe_raw(
             self.ros, type_name, qos, self.on_message, timed=True
         )
@@ -393,35 +402,36 @@ class ToMqtt(Flow):
         """
         if self.echo is not None and self.echo.is_own(cdr):
             return
-        if self._interval and not self._admit(monotonic()):
+        if (self._interval or self._bytes_per_second) and not self._admit(monotonic()):
             return
-        payload = cdr
-        if self._convert is not None:
-            try:
-                payload = self._convert(cdr)
-            except ConversionError as error:
-                self.fail(f"cannot be converted: {error}")
-                return
-        message = Message(
-            self.mqtt,
-            payload,
-            self._qos,
-            self._retain,
-            self._properties,
-            None,
-            self._topic_wire,
+        try:
+            payload, properties = self._pack(cdr)
+        except ConversionError as error:
+            self.fail(f"cannot be converted: {error}")
+            return
+        if self._bytes_per_second:
+            self._budget -= len(payload)
+        message = Watched(
+            self.mqtt, payload, self._qos, self._retain, properties, None, self._topic_wire
         )
+        message.watcher = self.counters
         if published_at:
             self._lane.timed = message, published_at
         self._mailbox.put(self._lane, message)
 
     def _admit(self, now: float) -> bool:
-        """Whether a message at that time keeps to the rate, as an average over uneven ones."""
-        if now < self._due:
+        """Whether a message at that time keeps to the rate, as an average over uneven ones, and to
+        the budget of bytes, of which those of a second can be saved up."""
+        if self._bytes_per_second:
+            saved = self._budget + (now - self._budget_at) * self._bytes_per_second
+            self._budget = min(saved, self._bytes_per_second)
+            self._budget_at = now
+        if now < self._due or self._budget < 0:
             self.counters.throttled += 1
             return False
-        late = now - self._due
-        self._due = (self._due if late < self._interval else now) + self._interval
+        if self._interval:
+            late = now - self._due
+            self._due = (self._due if late < self._interval else now) + self._interval
         return True
 
 
@@ -457,19 +467,12 @@ class ToRos(Flow):
         return publisher_qos(endpoints, self.settings.samples)
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        settings = self.settings
         converter = self._converters.get(type_name)
-        encoding = self.settings.encoding
-        if encoding == "text" and not converter.has_text:
-            raise UnknownTypeError(_no_text(type_name))
-
-        def checked(payload: bytes) -> bytes:
-            # Nodes end over a message that cannot be read, and rclpy does not look: we do.
-            converter.to_dict(payload)
-            return payload
-
-        convert = {"json": converter.from_json, "text": converter.from_text, "cdr": checked}
+        check(converter, settings.encoding, to_ros=True)
+        unpack = unpacker(converter, settings.encoding, settings.compression, settings.largest)
         publisher = node.create_publisher(self.ros, type_name, qos)
-        before, self._out = self._out, (convert[encoding], publisher)
+        before, self._out = self._out, (unpack, publisher)
         if before is not None:
             before[1].destroy()
         return ""
@@ -510,7 +513,7 @@ class ToRos(Flow):
         convert, publisher = out
         payload = message.payload
         try:
-            cdr = convert(payload)
+            cdr = self._read(convert, message)
             if self.echo is not None:
                 self.echo.sent(cdr)
             publisher.publish(cdr)
@@ -522,15 +525,28 @@ class ToRos(Flow):
             self.counters.messages += 1
             self.counters.bytes += len(payload)
 
+    def _read(self, convert: Callable[[bytes], bytes], message: Message) -> bytes:
+        """The message's CDR. Raises ConversionError, also for what says to be something else."""
+        properties = message.properties
+        if properties is None:
+            return convert(message.payload)
+        wanted = self._wanted
+        claimed = claim(properties, "ros-type")
+        if wanted is not None and claimed is not None and claimed != wanted[0]:
+            raise ConversionError("", f"it says to be {claimed}, {self.ros} carries {wanted[0]}")
+        try:
+            return convert(message.payload)
+        except ConversionError as error:
+            said = properties.get(Property.CONTENT_TYPE)
+            encoding = self.settings.encoding
+            if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
+                raise
+            problem = f"{error.problem} (it says to be {said}, and the route takes {encoding})"
+            raise ConversionError(error.path, problem) from None
+
     def _why_not(self) -> str:
         if self._wanted is not None:
             return "its type cannot be bridged"
         if self._count is None:
             return "ROS is not ready"
         return f"no node subscribes to {self.ros}, which would tell its type; the route can name it"
-
-
-def _no_text(type_name: str) -> str:
-    return (
-        f"{type_name} cannot go as text: only types with one field `data`, a number, bool or string"
-    )

@@ -6,6 +6,8 @@ part of the run. CDR aligns a number to its size, counted from the end of the fo
 While the position modulo 8 is known, a run has one layout; after a string it has up to eight, and
 the position picks one of them.
 
+Of a message of which only some fields are wanted, what is passed over is not read at all.
+
 Generated code never takes what careful.py would refuse. It need not take all else: it raises one of
 `MISFIT`, and the caller goes the careful way, which mends or names what was wrong.
 """
@@ -18,13 +20,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from appliance.ros.arrays import HEADER, WRITERS, readers
+from appliance.ros.arrays import HEADER, WRITERS, binary_readers, readers
 from appliance.ros.definitions import (
     PRIMITIVES,
     Array,
     FieldType,
     ItemType,
     Primitive,
+    Selection,
     Sequence,
     String,
     TypeDescription,
@@ -59,9 +62,26 @@ class Generated(NamedTuple):
     source: str
 
 
-def generate(description: TypeDescription) -> Generated:
-    """Generates and compiles the converters of a type."""
-    decoder, encoder = _Decoder(), _Encoder()
+class Binary(NamedTuple):
+    """The function that reads a type for encodings that have bytes, and its source. Octets are
+    bytes, and other arrays of numbers `arrays.Numbers`."""
+
+    decode: Callable[[bytes], dict[str, Any]]
+    source: str
+
+
+def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> Binary:
+    """Generates and compiles the reader of a type, or of some of its fields."""
+    decoder = _Decoder(wanted, "numbers_{}({})")
+    source = decoder.function(description)
+    namespace = {**decoder.constants, **binary_readers()}
+    exec(compile(source, f"<binary reader of {description.name}>", "exec"), namespace)
+    return Binary(namespace["decode"], source)
+
+
+def generate(description: TypeDescription, wanted: Selection | None = None) -> Generated:
+    """Generates and compiles the converters of a type; those that decode, of some of its fields."""
+    decoder, encoder = _Decoder(wanted), _Encoder()
     source = decoder.function(description) + "\n\n" + encoder.function(description)
     code = compile(source, f"<converters of {description.name}>", "exec")
     fast = {**decoder.constants, **readers(with_numpy=True)}
@@ -285,7 +305,15 @@ class _Generator:
 
 
 class _Decoder(_Generator):
-    """Writes `decode(b)`: the value of the message `b`."""
+    """Writes `decode(b)`: the value of the message `b`, or of the fields that are wanted.
+
+    `row` is what becomes of the name of a type and the names of numbers that are a row.
+    """
+
+    def __init__(self, wanted: Selection | None = None, row: str = "[{1}]") -> None:
+        super().__init__()
+        self._wanted = wanted
+        self._row = row
 
     def function(self, description: TypeDescription) -> str:
         self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
@@ -293,6 +321,40 @@ class _Decoder(_Generator):
         self._flush()
         self._line(f"return {value}")
         return "\n".join(["def decode(b):", *self._lines, ""])
+
+    def _pass(self, type_: FieldType) -> None:
+        """Lines that pass a value without reading it."""
+        item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
+        if isinstance(type_, TypeDescription):
+            if not type_.fields:
+                self._run.append(_Part(_PADDING, 1, ""))
+            for field in type_.fields:
+                self._pass(field.type)
+        elif isinstance(item, Primitive) and count * item.size <= _LONGEST_ROW:
+            self._run.append(_Part(Primitive("passed", "x" * item.size, item.size), count, ""))
+        elif isinstance(item, Primitive):
+            self._flush()
+            self._pass_numbers(item, str(count))
+        elif isinstance(type_, (String, WideString)):
+            size = self._number(_COUNT, "size")
+            self._flush()
+            self._terms.append(size if isinstance(type_, String) else f"{size} * 4")
+            self._phase = _ANYWHERE if isinstance(type_, String) else Phase(4, 0)
+        elif isinstance(type_, Sequence) and isinstance(type_.item, Primitive):
+            size = self._number(_COUNT, "size")
+            self._flush()
+            empty = self._phase
+            self._pass_numbers(type_.item, size)
+            self._phase = self._phase.join(empty)
+        else:
+            wanted, self._wanted = self._wanted, {}
+            self._value(type_, "passed")
+            self._wanted = wanted
+
+    def _pass_numbers(self, primitive: Primitive, count: str) -> None:
+        self._align(primitive.size, count)
+        self._terms.append(f"{count} * {primitive.size}")
+        self._phase = _loop_phase(primitive, self._phase)
 
     def _value(self, type_: FieldType, hint: str) -> str:
         """The expression for a value, good after the next flush, and lines before it."""
@@ -311,8 +373,16 @@ class _Decoder(_Generator):
     def _structure(self, description: TypeDescription) -> str:
         if not description.fields:
             self._run.append(_Part(_PADDING, 1, ""))
-        fields = description.fields
-        return "{" + ", ".join(f"{f.name!r}: {self._value(f.type, f.name)}" for f in fields) + "}"
+        wanted = self._wanted
+        values = []
+        for field in description.fields:
+            if wanted is not None and field.name not in wanted:
+                self._pass(field.type)
+                continue
+            self._wanted = wanted[field.name] if wanted is not None else None
+            values.append(f"{field.name!r}: {self._value(field.type, field.name)}")
+        self._wanted = wanted
+        return "{" + ", ".join(values) + "}"
 
     def _number(self, primitive: Primitive, hint: str) -> str:
         name = self._name(hint)
@@ -365,7 +435,8 @@ class _Decoder(_Generator):
             self._run.append(_Part(item, length, name))
             return f"base64({name})" if length > 1 else f"base64(bytes([{name}]))"
         if _is_row(array):
-            return "[" + ", ".join(self._number(item, hint) for _ in range(length)) + "]"
+            names = ", ".join(self._number(item, hint) for _ in range(length))
+            return self._row.format(item.name, names)
         self._flush()
         return self._numbers(item, str(length), hint)
 

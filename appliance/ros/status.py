@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from appliance.ros.figures import Counters, Latency
-from appliance.ros.flows import Bridged, Direction, Encoding, Flow, Route, RouteSettings
+from appliance.ros.flows import Bridged, Direction, Flow, Route, RouteSettings
+from appliance.ros.payloads import Encoding
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class TopicStatus:
     size: int
     dropped: int
     throttled: int
+    skipped: int
     errors: int
     latency_ms: LatencyStatus | None
 
@@ -54,6 +56,7 @@ class RouteStatus:
     bytes: int
     dropped: int
     throttled: int
+    skipped: int
     errors: int
     last_error: str | None
     expired: int
@@ -80,6 +83,7 @@ def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
         counters.bytes // counters.messages if counters.messages else 0,
         counters.dropped,
         counters.throttled,
+        counters.skipped,
         counters.errors,
         latency_status(counters.latency),
     )
@@ -99,6 +103,7 @@ def route_status(route: Route, flows: Sequence[Flow]) -> RouteStatus:
         total.bytes,
         total.dropped,
         total.throttled,
+        total.skipped,
         total.errors,
         total.last_error,
         total.expired,

@@ -156,6 +156,8 @@ class FakeWire:
         self.exchanges: dict[str, Exchange] = {}
         #: Turns of the loop that were asked for and have not come.
         self.laters = 0
+        #: Whether the network takes no more; then `caught_up` is the client's to be called.
+        self.behind = False
 
     def authenticate(self, connect: Connect) -> None:
         self.asked = connect
@@ -168,6 +170,9 @@ class FakeWire:
 
     def accepted(self) -> None:
         assert not self.closed
+
+    def is_behind(self) -> bool:
+        return self.behind
 
     def later(self) -> None:
         self.laters += 1
@@ -400,6 +405,7 @@ def waiting_bytes(broker: Broker) -> int:
 def held_bytes(session: Session) -> int:
     """All that the session holds, counted anew."""
     waiting = [delivery[0] for delivery in (*session.queue, *session.latest.values())]
+    waiting += [delivery[0] for delivery in session.large.values()]
     waiting += [delivery[0] for delivery in session.inflight.values() if delivery is not None]
     waiting += [held.message for held in session.received.values()]
     if session.will is not None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from appliance.broker.broker import Broker
-from appliance.broker.message import OVERHEAD, Message
+from appliance.broker.message import OVERHEAD, Message, Watched
 from appliance.broker.ports import Identity, Limits
 from appliance.broker.session import Held, Ledger, Session
 from appliance.mqtt.codec import Property
@@ -19,7 +19,7 @@ from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pub
 from appliance.mqtt.topics import matches
 from appliance.store import MemoryStore
 
-from .conftest import FakeAccess, FakeStore, Peer, check_accounts, lasting, waiting_bytes
+from .conftest import FakeAccess, FakeStore, Join, Peer, check_accounts, lasting, waiting_bytes
 
 NAMES = {"four": 4, "five": 5, "cinq": 5}
 TOPICS = ["t/1", "t/2", "u", "w"]
@@ -395,6 +395,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.writable = True
+        self.behind = False
         self.sent: list[tuple[bytes, int, int, bool]] = []
         self.released: list[int] = []
 
@@ -403,6 +404,9 @@ class Recorder:
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
         return False
+
+    def is_behind(self) -> bool:
+        return self.behind
 
     def pubrel(self, packet_id: int) -> None:
         self.released.append(packet_id)
@@ -479,3 +483,83 @@ def test_an_absent_client_gets_no_qos_0(session: Session):
     assert session.deliver(Message("a", b"x"), 1, False, None)
     session.pump()  # to nobody
     assert len(session.queue) == 1
+
+
+# --- large messages to a slow client
+
+LARGE = bytes(40_000)
+
+
+class Counted:
+    skipped = 0
+
+
+def watched(topic: str, payload: bytes, counted: Counted, retain: bool = False) -> Watched:
+    message = Watched(topic, payload, 0, retain)
+    message.watcher = counted
+    return message
+
+
+def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_not(
+    broker: Broker, join: Join, version: int
+):
+    peer, origin, counted = join(version=version), broker.attach("inside", Recorder()), Counted()
+    peer.subscribe("#")
+    peer.wire.behind = True
+    for payload in (LARGE + b"1", LARGE + b"2"):
+        broker.publish(watched("image", payload, counted), origin)
+    broker.publish(Message("state", b"s"), origin)
+    broker.flush()
+    assert peer.payloads() == [b"s"]
+    assert counted.skipped == broker.counters.publish_dropped == 1
+    peer.wire.behind = False
+    peer.client.caught_up()
+    broker.flush()
+    assert peer.payloads() == [LARGE + b"2"]
+
+
+def test_large_messages_go_one_by_one_and_behind_small_ones(broker: Broker, join: Join):
+    peer, origin = join(), broker.attach("inside", Recorder())
+    peer.subscribe("#")
+    peer.slow()
+    for topic, payload in (("a", LARGE), ("b", LARGE), ("state", b"1"), ("state", b"2")):
+        broker.publish(Message(topic, payload), origin)
+    broker.flush()
+    peer.fast()
+    assert peer.payloads() == [b"2", LARGE, LARGE]  # the network has taken each at once
+    peer.slow()
+    for topic in ("a", "b"):
+        broker.publish(Message(topic, LARGE), origin)
+    peer.wire.behind = True
+    peer.fast()
+    assert peer.payloads() == []
+    peer.wire.behind = False
+    peer.client.caught_up()
+    broker.flush()
+    assert peer.payloads() == [LARGE, LARGE]
+
+
+def test_retained_messages_that_are_large_are_all_sent(broker: Broker, join: Join):
+    origin = broker.attach("inside", Recorder())
+    for number in range(20):
+        broker.publish(Message(f"map/{number}", LARGE, 0, True), origin)
+    peer = join()
+    peer.wire.behind = True
+    peer.subscribe("map/#")
+    assert peer.payloads() == []
+    peer.wire.behind = False
+    peer.client.caught_up()
+    broker.flush()
+    assert len(peer.payloads()) == 20
+    assert broker.counters.publish_dropped == 0
+
+
+def test_a_client_that_leaves_takes_what_waits_for_it_along(broker: Broker, join: Join):
+    peer, origin = join(), broker.attach("inside", Recorder())
+    peer.subscribe("#")
+    peer.wire.behind = True
+    broker.publish(Message("image", LARGE), origin)
+    broker.flush()
+    assert waiting_bytes(broker) > len(LARGE)
+    peer.lose()
+    assert waiting_bytes(broker) == 0

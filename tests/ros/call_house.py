@@ -8,7 +8,7 @@ import time
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity
+from appliance.broker.ports import Action, Decision, Identity, InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge
@@ -56,10 +56,8 @@ class Rules:
         self.epoch += 1
 
 
-class Client:
+class Client(InsideLink):
     """An MQTT client; `calls` are answered as MQTT 5 does, `calls_311` by tokens."""
-
-    writable = True
 
     def __init__(self, broker, name, *subscriptions):
         self.broker = broker
@@ -81,12 +79,6 @@ class Client:
         self.received.append(message)
         if qos:  # in a turn of its own, as it would come through a network
             asyncio.get_running_loop().call_soon(self.session.puback, packet_id)
-
-    def mirror(self, packet, version, payload_size):
-        return False
-
-    def later(self):
-        raise AssertionError
 
     def close(self, reason, message):
         raise AssertionError

@@ -23,6 +23,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: the extra `ros`")
 
+import cbor2
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -218,6 +219,39 @@ def plain_value(slot, value, in_json: bool):
     return value
 
 
+def in_cbor(message):
+    """What a message is in CBOR, by the conventions, as cbor2 reads it with its own defaults."""
+    return {name: cbor_value(slot, getattr(message, name)) for name, slot in slots(message)}
+
+
+#: RFC 8746, typed arrays in little endian.
+CBOR_TAGS = {
+    "uint16": 69,
+    "uint32": 70,
+    "uint64": 71,
+    "int8": 72,
+    "int16": 77,
+    "int32": 78,
+    "int64": 79,
+    "float": 85,
+    "double": 86,
+}
+
+
+def cbor_value(slot, value):
+    kind = type(slot).__name__
+    if kind in ("BoundedSequence", "UnboundedSequence", "Array"):
+        item = slot.value_type
+        if is_octets(item):
+            return b"".join(x if isinstance(x, bytes) else bytes([x]) for x in value)
+        name = getattr(item, "typename", None)
+        if name in CBOR_TAGS:
+            packed = b"".join(struct.pack("<" + CODES[name], x) for x in value)
+            return cbor2.CBORTag(CBOR_TAGS[name], packed)
+        return [cbor_value(item, x) for x in value]
+    return in_cbor(value) if kind == "NamespacedType" else plain_value(slot, value, False)
+
+
 def same(a, b) -> bool:
     """Equal to the last type and item, NaN being equal to itself."""
     if isinstance(a, float) and isinstance(b, float):
@@ -274,6 +308,55 @@ def test_round_trip(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TYPES)
+def test_round_trip_in_cbor(name: str) -> None:
+    converter = CONVERTERS.get(name)
+    for message in messages(name):
+        cdr = write(message)
+        payload = converter.to_cbor(cdr)
+        assert same(cbor2.loads(payload), in_cbor(message))
+        assert converter.from_cbor(payload) == cdr  # NaN and infinities included
+        assert converter.to_cbor(write(message, ">")) == payload
+        # As a client writes it that knows nothing of typed arrays.
+        assert converter.from_cbor(cbor2.dumps(plain(message))) == cdr
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_some_fields(name: str) -> None:
+    """Whatever is left out: what is not comes as it would with all the others."""
+    rng = random.Random(name)
+    paths = list(field_paths(CONVERTERS.get(name).description))
+    for message in messages(name) if paths else ():
+        fields = tuple(rng.sample(paths, min(len(paths), rng.randint(1, 3))))
+        converter = CONVERTERS.get(name, fields)
+        expected = picked(plain(message, in_json=True), fields)
+        assert same(json.loads(converter.to_json(write(message))), expected)
+        for order in "<>":
+            cdr = write(message, order)
+            assert same(converter.to_dict(cdr), picked(plain(message), fields))
+            assert same(cbor2.loads(converter.to_cbor(cdr)), picked(in_cbor(message), fields))
+
+
+def field_paths(description, prefix=""):
+    for field in description.fields:
+        yield prefix + field.name
+        inside = getattr(field.type, "item", field.type)
+        if hasattr(inside, "fields"):
+            yield from field_paths(inside, f"{prefix}{field.name}.")
+
+
+def picked(value, paths):
+    """The naive way: every path by itself, and what was found put together."""
+    if isinstance(value, list):
+        return [picked(item, paths) for item in value]
+    found = {}
+    for name, inside in value.items():
+        rests = [path.partition(".")[2] for path in paths if path.partition(".")[0] == name]
+        if rests:
+            found[name] = inside if "" in rests else picked(inside, rests)
+    return found
+
+
+@pytest.mark.parametrize("name", TYPES)
 def test_the_generated_code_needs_no_help(name: str) -> None:
     """All messages but the odd ones go the fast way: without this, no other test would notice."""
     generated = generate(CONVERTERS.get(name).description)
@@ -303,9 +386,11 @@ def test_mutated_cdr(name: str) -> None:
             try:
                 expected = careful_decode(converter.description, mutant)
             except ConversionError:
-                with pytest.raises(ConversionError):
-                    converter.to_json(mutant)
+                for convert in (converter.to_json, converter.to_cbor):
+                    with pytest.raises(ConversionError):
+                        convert(mutant)
                 continue
+            cbor2.loads(converter.to_cbor(mutant))
             assert same(converter.to_dict(mutant), expected)
             orjson.loads(converter.to_json(mutant))
 
@@ -348,7 +433,7 @@ def spoiled(value, rng: random.Random):
 
 
 @pytest.mark.parametrize("name", TYPES)
-def test_mutated_json(name: str) -> None:
+def test_mutated_json_and_cbor(name: str) -> None:
     """The fast way takes nothing that the careful way refuses, and writes the same bytes."""
     converter = CONVERTERS.get(name)
     rng = random.Random(name)
@@ -368,7 +453,20 @@ def test_mutated_json(name: str) -> None:
             else:
                 assert converter.from_json(payload) == expected
                 deserialize_message(expected, type(message))
+            spoilt = cbor2.dumps(spoiled(value, rng))
+            try:
+                expected = converter.from_dict(cbor2.loads(spoilt))
+            except ConversionError as error:
+                with pytest.raises(ConversionError) as caught:
+                    converter.from_cbor(spoilt)
+                assert caught.value.path == error.path
+            else:
+                assert converter.from_cbor(spoilt) == expected
+                deserialize_message(expected, type(message))
         for _ in range(3):
             mutant = mutated(converter.to_json(write(message)), rng)
             with contextlib.suppress(ConversionError):
                 deserialize_message(converter.from_json(mutant), type(message))
+            mutant = mutated(converter.to_cbor(write(message)), rng)
+            with contextlib.suppress(ConversionError):
+                deserialize_message(converter.from_cbor(mutant), type(message))

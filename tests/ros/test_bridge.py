@@ -12,6 +12,7 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge, Bridged, RouteSettings
@@ -38,10 +39,8 @@ class Rules:
     epoch = 0
 
 
-class Client:
+class Client(InsideLink):
     """A session inside the appliance that keeps what it receives."""
-
-    writable = True
 
     def __init__(self, broker, name="client"):
         self.broker = broker

@@ -55,13 +55,6 @@ class All(dict):
         return import_message(name)
 
 
-class Subscriber(Client):
-    """A client inside the appliance that takes messages, and no packets."""
-
-    def mirror(self, packet, version, payload_size):
-        return False
-
-
 class Wire:
     """A network client's connection; what is written to it can be read as packets."""
 
@@ -139,7 +132,7 @@ class CommandHouse(House):
 async def house():
     house = CommandHouse()
     house.broker = Broker(AllAllowed(), MemoryStore())
-    house.client = Subscriber(house.broker)
+    house.client = Client(house.broker)
     yield house
     await house.bridge.stop()
     assert house.broker.departures == []

@@ -14,8 +14,8 @@ from appliance.ros.node import FakeNode
 from appliance.ros.rules import CommandRules
 
 pytest.importorskip("diagnostic_msgs.msg")
-from test_bridge import STRING, TWIST, House, string, to_mqtt, to_ros
-from test_commands import GO, All, AllAllowed, Driver, Subscriber
+from test_bridge import STRING, TWIST, Client, House, string, to_mqtt, to_ros
+from test_commands import GO, All, AllAllowed, Driver
 
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
@@ -42,7 +42,7 @@ class ToldHouse(House):
     def __init__(self):
         super().__init__()
         self.broker.detach(self.client.session)
-        self.client = Subscriber(self.broker)
+        self.client = Client(self.broker)
         self.broker.access = AllAllowed()
         self.node.types = Installed()
         self.listener = self.node.add_subscriber("/diagnostics", TYPE)

@@ -10,7 +10,7 @@ from appliance.ros.mailbox import Lane, Mailbox
 
 
 def payloads(taken):
-    return [message.payload for _, message in taken]
+    return [message.payload for _, message in taken[0]]
 
 
 def fill(box, lane, *items):
@@ -45,10 +45,10 @@ def test_wakes_once_until_empty():
     box, lane = Mailbox(lambda: wakes.append(1)), Lane(9, Counters())
     fill(box, lane, b"1", b"2", b"3")
     assert len(wakes) == 1
-    assert len(box.take(2)) == 2  # a full batch: the taker comes again by itself
+    assert box.take(2)[1]  # there is more: the taker comes again by itself
     fill(box, lane, b"4")
     assert len(wakes) == 1
-    assert len(box.take(9)) == 2
+    assert payloads(box.take(9)) == [b"3", b"4"]
     fill(box, lane, b"5")
     assert len(wakes) == 2
 
@@ -92,7 +92,7 @@ def test_two_threads_lose_nothing_uncounted():
     while sender.is_alive() or ready.is_set():
         if ready.wait(0.05):
             ready.clear()
-            while len(batch := box.take(64)) == 64:
+            while (batch := box.take(64))[1]:
                 taken += payloads(batch)
             taken += payloads(batch)
     sender.join()
@@ -100,3 +100,30 @@ def test_two_threads_lose_nothing_uncounted():
     assert numbers == sorted(set(numbers))
     assert len(numbers) + lane.counters.dropped == total
     assert numbers[-1] == total - 1
+
+
+def test_small_before_large_and_few_large_at_a_time():
+    box, images, states = Mailbox(lambda: None), Lane(9, Counters()), Lane(9, Counters())
+    image = b"i" * 600_000
+    fill(box, images, image, image, image)
+    fill(box, states, b"1", b"2")
+    assert payloads(box.take(9)) == [b"1", b"2", image, image]
+    fill(box, states, b"3")
+    assert payloads(box.take(9)) == [b"3", image]
+
+
+def test_a_topic_keeps_its_order_whatever_the_sizes():
+    box, lane, other = Mailbox(lambda: None), Lane(3, Counters()), Lane(9, Counters())
+    large = b"l" * 40_000
+    fill(box, lane, large, b"1", large, b"2")  # the first is dropped, and the lane is small now
+    fill(box, other, b"x")
+    assert payloads(box.take(9)) == [b"1", b"x", large, b"2"]
+    assert lane.counters.dropped == 1
+
+
+def test_what_is_replaced_keeps_its_turn():
+    box, often, others = Mailbox(lambda: None), Lane(1, Counters()), Lane(9, Counters())
+    fill(box, often, b"1")
+    fill(box, others, b"x")
+    fill(box, often, b"2")
+    assert payloads(box.take(1)) == [b"2"]

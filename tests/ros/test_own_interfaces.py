@@ -1,0 +1,131 @@
+"""An interface package of one's own, built here, is bridged both ways: nothing names it but the
+environment, as a workspace's does.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+from pathlib import Path
+
+import paho.mqtt.client as mqtt
+import pytest
+import yaml
+
+from appliance.environment import for_other_programs
+
+pytest.importorskip("rclpy")
+from appliance_process import HOST, ROBOT, ApplianceProcess
+from test_ros2 import Peer, domain, until
+
+__all__ = ["domain"]  # a fixture for all tests here
+
+DEFINITIONS = {
+    "Wheel": "uint8 LEFT=1\nuint8 side\nfloat32[<=4] slip\n",
+    "Drive": """\
+std_msgs/Header header
+string<=16 mode "idle"
+float64[2] speed
+Wheel[] wheels
+uint8[] blob
+""",
+}
+DRIVE = "rover_msgs/msg/Drive"
+
+#: What it takes beside what CDR says of itself: {"mode": "go", "wheels": [{"side": 1}], …}
+VALUE = {
+    "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "base"},
+    "mode": "go",
+    "speed": [0.5, -0.5],
+    "wheels": [{"side": 1, "slip": [0.25]}],
+    "blob": "AAEC",
+}
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    source, prefix = tmp_path / "rover_msgs", tmp_path / "install"
+    (source / "msg").mkdir(parents=True)
+    for name, text in DEFINITIONS.items():
+        (source / f"msg/{name}.msg").write_text(text)
+    builder = Path(__file__).parent / "interfaces.py"
+    arguments = [source, prefix, "rover_msgs", "std_msgs", "builtin_interfaces"]
+    built = subprocess.run(
+        [sys.executable, builder, *arguments],
+        env=for_other_programs(),
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return prefix
+
+
+@pytest.fixture
+def appliance(tmp_path, workspace, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{workspace}:{sys.prefix}")
+    (tmp_path / "house").mkdir()
+    appliance = ApplianceProcess(tmp_path / "house", acl=f"user alice\ntopic {ROBOT}/#\n")
+    settings = yaml.safe_load(appliance.config.read_text())
+    settings["bridge"] = {
+        "topics": [{"ros": "/state", "to": "mqtt"}, {"ros": "/drive", "to": "ros", "type": DRIVE}]
+    }
+    appliance.config.write_text(yaml.safe_dump(settings))
+    appliance.start()
+    yield appliance
+    appliance.stop()
+
+
+@pytest.fixture
+def client(appliance):
+    client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+    client.username_pw_set("alice", appliance.passwords["alice"])
+    client.received = queue.Queue()
+    client.on_message = lambda _, __, message: client.received.put(message)
+    client.on_connect = lambda *_: client.subscribe(f"{ROBOT}/#")
+    client.connect(HOST, appliance.plain_port)
+    client.loop_start()
+    yield client
+    client.disconnect()
+    client.loop_stop()
+
+
+def next_on(client, topic):
+    while True:
+        message = client.received.get(timeout=10)
+        if message.topic == topic:
+            return message
+
+
+async def test_both_ways(workspace, client, appliance):
+    peer = Peer()
+    site = next(workspace.glob("lib/python*/site-packages"))
+    await peer.start("rover", PYTHONPATH=str(site))
+    try:
+        await peer.do("subscribe", "/drive", DRIVE)
+        await peer.do("advertise", "/state", DRIVE)
+        await peer.do("matched", "/state")
+        schema = json.loads(next_on(client, f"{ROBOT}/_appliance/schema/rover_msgs/Drive").payload)
+        assert schema["properties"]["mode"] == {
+            "type": "string",
+            "maxLength": 16,
+            "default": "idle",
+        }
+
+        wrong = {"wheels": [{"side": 1}, {"side": 256}]}
+        client.publish(f"{ROBOT}/drive", json.dumps(wrong))
+        appliance.wait_for_log(r"wheels\[1\]\.side: 256 does not fit in uint8")
+        client.publish(f"{ROBOT}/drive", json.dumps(VALUE))
+        await until(lambda: peer.received, "the message on /drive")
+        topic, cdr = peer.received[0]
+        assert topic == "/drive"
+
+        await peer.do("publish", "/state", cdr)  # what ROS has received goes back
+        message = next_on(client, f"{ROBOT}/state")
+        assert json.loads(message.payload) == VALUE
+        properties = dict(message.properties.UserProperty)
+        assert properties["ros-type"] == DRIVE
+        assert properties["ros-type-hash"].startswith("RIHS01_")
+    finally:
+        await peer.stop()

@@ -1,0 +1,336 @@
+"""What is put on MQTT and taken from it: encodings, compression, fields, schemas, properties."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import cbor2
+import pytest
+
+from appliance.broker.message import Message
+from appliance.mqtt.codec import Property
+from appliance.ros import cbor
+from appliance.ros.careful import ConversionError
+
+pytest.importorskip("sensor_msgs.msg")
+import zstandard
+from test_bridge import STRING, TWIST, House, both, string, to_mqtt, to_ros
+
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import UnknownTypeError, import_message, load_description, select
+from appliance.ros.payloads import packer, unpacker
+from appliance.ros.schema import json_schema
+
+CONVERTERS = Converters(load_description)
+PICTURE, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
+ODOMETRY, JOINTS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
+ODOMETRY_PARTS = ("PoseWithCovariance", "Pose", "Point", "Quaternion", "TwistWithCovariance")
+JPEG = b"\xff\xd8\xff\xe0" + bytes(range(256))
+
+
+@pytest.fixture
+async def house():
+    house = House()
+    parts = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    parts += tuple(f"geometry_msgs/msg/{name}" for name in ODOMETRY_PARTS)
+    for name in (PICTURE, IMAGE, ODOMETRY, JOINTS, *parts):
+        house.node.types[name] = import_message(name)
+    yield house
+    await house.bridge.stop()
+
+
+def properties_of(message):
+    return dict(message.properties[Property.USER_PROPERTY])
+
+
+# CBOR
+
+
+def test_arrays_of_numbers_are_typed_arrays_and_bytes_are_bytes():
+    joints = CONVERTERS.get(JOINTS)
+    payload = joints.to_cbor(joints.from_json(b'{"name": ["a"], "position": [1.5, -2]}'))
+    value = cbor2.loads(payload)
+    assert value["name"] == ["a"]
+    assert value["position"] == cbor2.CBORTag(86, struct.pack("<2d", 1.5, -2))
+    picture = CONVERTERS.get(PICTURE)
+    assert cbor2.loads(picture.to_cbor(picture.from_binary(JPEG)))["data"] == JPEG
+
+
+@pytest.mark.parametrize(
+    ("tag", "code"),
+    [
+        *[(64, "4B"), (65, ">4H"), (69, "<4H"), (71, "<4Q"), (72, "4b"), (74, ">4i"), (75, ">4q")],
+        *[(77, "<4h"), (81, ">4f"), (82, ">4d"), (84, "<4e"), (85, "<4f"), (86, "<4d")],
+    ],
+)
+def test_typed_arrays_of_any_kind_are_taken(tag, code):
+    joints = CONVERTERS.get(JOINTS)
+    payload = cbor2.dumps({"position": cbor2.CBORTag(tag, struct.pack(code, 0, 1, 2, 100))})
+    assert joints.to_dict(joints.from_cbor(payload))["position"] == [0, 1, 2, 100]
+
+
+@pytest.mark.parametrize(
+    ("payload", "problem"),
+    [
+        (b"", "not CBOR"),
+        (b"\xa0\x00", "something follows the message at 1"),
+        (b"\xa1", "not CBOR"),
+        (b"\x9b" + b"\xff" * 8, "not CBOR"),
+        (b"\x5b\x7f" + b"\xff" * 7, "not CBOR"),
+        (b"\x81" * 5000 + b"\x00", "nesting"),
+        (b"\xa1\x01\x02", "map key"),
+        (b"\xd8\x1c\xa0", "tag 28"),  # a value to be referred to
+        (b"\xd9\x01\x00\xa0", "tag 25"),  # text to be referred to
+        (b"\xc2\x41\x01", "tag 2 "),
+        (b"\xd8\x63\x01", "tag 99"),
+        (cbor2.dumps({"position": cbor2.CBORTag(86, b"123")}), "ends within a number"),
+        (cbor2.dumps({"position": cbor2.CBORTag(86, [1])}), "not a byte string"),
+    ],
+)
+def test_what_is_no_cbor_of_a_message_is_refused(payload, problem):
+    with pytest.raises(ConversionError, match=problem):
+        CONVERTERS.get(JOINTS).from_cbor(payload)
+
+
+@pytest.mark.parametrize(
+    ("value", "path"),
+    [
+        ({"twist": {"twist": {"linear": {"x": "fast"}}}}, "twist.twist.linear.x"),
+        ({"header": {"stamp": {"sec": 2**31}}}, "header.stamp.sec"),
+        ({"header": {"stamp": {"nanosec": 1.5}}}, "header.stamp.nanosec"),
+        ({"header": {"frame": ""}}, "header.frame"),
+        ({"pose": {"covariance": [0.0] * 35}}, "pose.covariance"),
+        ({"pose": {"covariance": [0.0] * 35 + ["x"]}}, "pose.covariance[35]"),
+        ({"pose": {"covariance": cbor2.CBORTag(86, bytes(8 * 37))}}, "pose.covariance"),
+        ({"pose": {"covariance": bytes(36)}}, "pose.covariance"),
+        ({"child_frame_id": b"bytes"}, "child_frame_id"),
+        ({"child_frame_id": cbor2.undefined}, "child_frame_id"),
+        ([], ""),
+    ],
+)
+def test_what_cbor_gets_wrong_is_named_by_its_path(value, path):
+    with pytest.raises(ConversionError) as caught:
+        CONVERTERS.get(ODOMETRY).from_cbor(cbor2.dumps(value))
+    assert caught.value.path == path
+
+
+def test_cbor_decodes_no_more_than_it_is_given():
+    """Ten levels of references, each to ten of the level below, would be 10^10 items."""
+    level = cbor2.dumps([1] * 10)
+    for _ in range(9):
+        level = b"\xd8\x1c\x8a" + level + b"\xd8\x1d\x00" * 9
+    with pytest.raises(ConversionError):
+        cbor.loads(level)
+
+
+# fields
+
+
+@pytest.mark.parametrize("path", ["speed", "pose.pose.positions", "pose.covariance.x", "pose."])
+def test_a_field_that_there_is_not_is_refused_with_what_there_is(path):
+    with pytest.raises(UnknownTypeError, match="has no field"):
+        select(load_description(ODOMETRY), [path])
+
+
+async def test_some_fields_of_a_topic(house):
+    house.start(to_mqtt("/odom", fields=("pose.pose.position", "header.stamp")))
+    peer = house.node.add_publisher("/odom", ODOMETRY)
+    peer.publish(CONVERTERS.get(ODOMETRY).from_json(b'{"child_frame_id": "base"}'))
+    await house.settle()
+    (payload,) = house.client.payloads("r2d2/odom")
+    assert json.loads(payload) == {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}},
+        "pose": {"pose": {"position": {"x": 0, "y": 0, "z": 0}}},
+    }
+
+
+async def test_a_wrong_field_leaves_the_topic_unbridged_and_says_why(house):
+    house.start(to_mqtt("/odom", fields=("speed",)))
+    house.node.add_publisher("/odom", ODOMETRY)
+    await house.settle()
+    assert "no 'speed', there are header, child_frame_id" in house.status().last_error
+    assert house.routes() == []
+
+
+# pictures
+
+
+async def test_a_picture_goes_as_it_is_with_its_content_type(house):
+    house.start(both("/camera", type=PICTURE, encoding="binary", keep=2))
+    peer = house.node.add_publisher("/camera", PICTURE)
+    other = house.node.add_subscriber("/camera", PICTURE)
+    peer.publish(CONVERTERS.get(PICTURE).from_dict({"format": "jpeg", "data": JPEG}))
+    peer.publish(CONVERTERS.get(PICTURE).from_dict({"format": "??", "data": b"else"}))
+    await house.settle()
+    first, second = [m for m, _ in house.client.received if m.topic == "r2d2/camera"]
+    assert first.payload == JPEG
+    assert first.properties[Property.CONTENT_TYPE] == "image/jpeg"
+    assert second.properties[Property.CONTENT_TYPE] == "application/octet-stream"
+
+    other.received.clear()
+    house.client.send("r2d2/camera", JPEG)
+    (cdr,) = other.received
+    value = CONVERTERS.get(PICTURE).to_dict(cdr)
+    assert value["format"] == "jpeg"
+    assert CONVERTERS.get(PICTURE).to_binary(cdr) == JPEG
+
+
+async def test_a_raw_image_cannot_be_made_of_its_bytes(house):
+    house.start(to_ros("/image", type=IMAGE, encoding="binary"))
+    await house.settle()
+    assert "nothing would tell encoding, height" in house.status("to_ros").last_error
+
+
+# zstd
+
+
+async def test_compressed_both_ways(house):
+    house.start(both("/chatter", type=STRING, compression="zstd"))
+    peer = house.node.add_publisher("/chatter", STRING)
+    other = house.node.add_subscriber("/chatter", STRING)
+    peer.publish(string("a" * 1000))
+    await house.settle()
+    (message,) = [m for m, _ in house.client.received if m.topic == "r2d2/chatter"]
+    assert len(message.payload) < 100
+    assert json.loads(zstandard.decompress(message.payload)) == {"data": "a" * 1000}
+    assert properties_of(message)["content-encoding"] == "zstd"
+
+    other.received.clear()
+    house.client.send("r2d2/chatter", zstandard.compress(b'{"data": "small"}'))
+    house.client.send("r2d2/chatter", b'{"data": "plain"}')
+    assert other.received == [string("small"), string("plain")]
+
+
+@pytest.mark.parametrize("has_size", [True, False])
+def test_a_bomb_is_not_set_off(has_size):
+    bomb = zstandard.ZstdCompressor(write_content_size=has_size).compress(bytes(50_000_000))
+    assert len(bomb) < 5000
+    unpack = unpacker(CONVERTERS.get(STRING), "json", "zstd", 1_000_000)
+    with pytest.raises(ConversionError, match="1000000"):
+        unpack(bomb)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"\x28\xb5\x2f\xfd",
+        zstandard.compress(b'{"data": "x"}')[:-3],
+        zstandard.compress(b'{"data": "x"}') + b"more",
+        zstandard.compress(b"not json"),
+        b"\x28\xb5\x2f\xfd" + b"\xff" * 40,
+    ],
+)
+def test_what_is_no_zstd_is_refused(payload):
+    with pytest.raises(ConversionError):
+        unpacker(CONVERTERS.get(STRING), "json", "zstd", 1000)(payload)
+
+
+@pytest.mark.parametrize("encoding", ["json", "cbor", "text", "cdr"])
+def test_every_encoding_can_be_compressed(encoding):
+    converter = CONVERTERS.get(STRING)
+    pack = packer(converter, encoding, "zstd", [("ros-type", STRING)])
+    payload, properties = pack(string("x" * 100))
+    assert properties[Property.USER_PROPERTY] == [
+        ("ros-type", STRING),
+        ("content-encoding", "zstd"),
+    ]
+    assert unpacker(converter, encoding, "zstd", 1000)(payload) == string("x" * 100)
+
+
+# what MQTT 5 says about a payload
+
+
+@pytest.mark.parametrize(
+    ("payload", "properties", "problem"),
+    [
+        (b"{}", {Property.USER_PROPERTY: [("ros-type", TWIST)]}, f"says to be {TWIST}"),
+        (b"\xa0", {Property.CONTENT_TYPE: "application/cbor"}, "the route takes json"),
+    ],
+)
+async def test_what_says_to_be_something_else_does_not_reach_ros(
+    house, payload, properties, problem
+):
+    house.start(to_ros("/chatter", type=STRING))
+    peer = house.node.add_subscriber("/chatter", STRING)
+    house.broker.publish(
+        Message("r2d2/chatter", payload, properties=properties), house.client.session
+    )
+    assert peer.received == []
+    assert problem in house.status("to_ros").last_error
+
+
+# schemas
+
+
+def test_the_schema_of_every_field():
+    jsonschema = pytest.importorskip("jsonschema")
+    converter = CONVERTERS.get("test_msgs/msg/MultiNested")
+    schema = json_schema(converter.description)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validate = jsonschema.Draft202012Validator(schema).validate
+    validate(json.loads(converter.to_json(converter.from_json(b"{}"))))
+    validate({})
+    for wrong in ({"nope": 1}, {"array_of_arrays": []}, {"array_of_arrays": 1}):
+        with pytest.raises(jsonschema.ValidationError):
+            validate(wrong)
+
+
+@pytest.mark.parametrize(
+    ("type_name", "value"),
+    [
+        (ODOMETRY, {"header": {"stamp": "now"}}),
+        (ODOMETRY, {"header": {"stamp": {"sec": 2**31}}}),
+        (ODOMETRY, {"pose": {"covariance": [None] * 36}}),
+        (ODOMETRY, {"pose": {"covariance": [0] * 35}}),
+        (PICTURE, {"data": "AAAA"}),
+        (PICTURE, {"data": [0, 255]}),
+        (PICTURE, {"data": [256]}),
+        (STRING, {"data": 1}),
+        ("test_msgs/msg/BoundedPlainSequences", {"bool_values": [True] * 4}),
+        ("test_msgs/msg/BoundedPlainSequences", {"bool_values": [True] * 3}),
+    ],
+)
+def test_a_schema_agrees_with_what_is_taken(type_name, value):
+    jsonschema = pytest.importorskip("jsonschema")
+    converter = CONVERTERS.get(type_name)
+    is_valid = jsonschema.Draft202012Validator(json_schema(converter.description)).is_valid(value)
+    try:
+        converter.from_json(json.dumps(value).encode())
+    except ConversionError:
+        assert not is_valid
+    else:
+        assert is_valid
+
+
+async def test_schemas_of_what_is_bridged_are_retained(house):
+    house.start(to_ros("/chatter", type=STRING), to_ros("/cmd_vel", type=TWIST))
+    await house.settle()
+    retained = house.broker.retained
+    schema = retained.get("r2d2/_appliance/schema/geometry_msgs/Twist")
+    assert json.loads(schema.payload)["title"] == TWIST
+    assert schema.properties[Property.CONTENT_TYPE] == "application/schema+json"
+    assert retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
+    house.bridge.replace([to_ros("/cmd_vel", type=TWIST)])
+    house.node.spin()
+    await house.settle()
+    assert retained.get("r2d2/_appliance/schema/std_msgs/String") is None
+    assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
+
+
+# the budget
+
+
+async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now[0])
+    house.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
+    peer = house.node.add_publisher("/chatter", STRING)
+    text = string("x" * 991)  # a thousand bytes
+    for _ in range(500):  # five seconds of 100 Hz
+        peer.publish(text)
+        now[0] += 0.01
+    await house.settle()
+    # What was saved before the first, and what came in since; one may have been too large.
+    assert 59 <= len(house.client.payloads("r2d2/chatter")) <= 61
+    assert house.status().throttled == 500 - len(house.client.payloads("r2d2/chatter"))
