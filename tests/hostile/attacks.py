@@ -950,7 +950,7 @@ async def take_overs(fight: Fight) -> None:
 # --- what is refused, and logged
 
 
-@attack(r"client 'forbidden.*may not publish|may not publish.*forbidden")
+@attack(r"client 'forbidden.*may not publish|may not publish.*forbidden", at_least=2.0)
 async def refused_publishes(fight: Fight) -> None:
     """Messages that the rules refuse, thousands a second, to the same topic and to new ones."""
 
@@ -967,7 +967,7 @@ async def refused_publishes(fight: Fight) -> None:
     await fight.together(*(publish(number) for number in range(10)))
 
 
-@attack(r"client 'curious.*may not subscribe")
+@attack(r"client 'curious.*may not subscribe", at_least=2.0)
 async def refused_subscriptions(fight: Fight) -> None:
     """Filters that the rules refuse, thousands a second, and ones that are wrong."""
     wrong = [AREA + "/a#b", "$share//x", "$share/g", "a+/b"]
