@@ -305,7 +305,8 @@ class App:
             raise ControlError("there is no bridge (bridge.bus is none)")
         if self.bridge.problem is not None:
             raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
-        return [asdict(topic) for topic in self.bridge.topics()]
+        topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
+        return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
 
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""

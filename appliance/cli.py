@@ -178,7 +178,7 @@ def reload(config: ConfigOption = None) -> None:
 @app.command()
 def routes(
     config: ConfigOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a topic.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON an entry.")] = False,
 ) -> None:
     """Show what the running appliance carries between ROS and MQTT now."""
     settings = _load(config)
@@ -187,30 +187,37 @@ def routes(
     from appliance.control import ControlError, ask
 
     try:
-        topics = ask(settings.control, "routes")
+        bridged = ask(settings.control, "routes")
     except ControlError as error:
         raise CommandError(str(error)) from None
     if as_json:
-        typer.echo("".join(f"{json.dumps(topic)}\n" for topic in topics), nl=False)
+        typer.echo("".join(f"{json.dumps(entry)}\n" for entry in bridged), nl=False)
         return
-    if not topics:
+    if not bridged:
         typer.echo("nothing is bridged now")
         return
     rows = [("ROS", "", "MQTT", "TYPE", "AS", "HZ", "BYTES", "LOST", "ERRORS", "MS")]
-    for topic in sorted(topics, key=lambda topic: (topic["ros"], topic["direction"])):
-        latency = topic["latency_ms"]
+    arrows = {"to_mqtt": "→", "to_ros": "←"}
+    for entry in sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])):
+        way = entry["direction"]
+        figures = [""] * 5  # services, actions and parameters have none
+        if way in arrows:
+            latency = entry["latency_ms"]
+            figures = [
+                f"{entry['rate']:g}",
+                str(entry["size"]),
+                str(entry["dropped"]),
+                str(entry["errors"]),
+                f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
+            ]
         rows.append(
             (
-                topic["ros"],
-                "→" if topic["direction"] == "to_mqtt" else "←",
-                topic["mqtt"],
-                topic["type"],
-                topic["encoding"],
-                f"{topic['rate']:g}",
-                str(topic["size"]),
-                str(topic["dropped"]),
-                str(topic["errors"]),
-                f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
+                entry["ros"],
+                arrows.get(way, way),
+                entry["mqtt"],
+                entry["type"],
+                entry["encoding"],
+                *figures,
             )
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

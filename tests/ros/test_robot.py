@@ -266,8 +266,6 @@ def appliance(domain, robot, tmp_path_factory):
         tmp_path_factory.mktemp("appliance"),
         users={"mallory": "mallory's"},
         acl=ACL,
-        # Of two listeners on one address without a port, a reload could not tell which is which.
-        broker={"listeners": [{"bind": "127.0.0.2:0", "tls": True}, {"bind": "127.0.0.1:0"}]},
         bridge=BRIDGE,
     )
     appliance.start()
@@ -294,6 +292,30 @@ def client_of(appliance):
 
 
 # Services
+
+
+def test_the_command_shows_what_can_be_called(appliance):
+    done = subprocess.run(
+        [sys.executable, "-m", "appliance", "routes", "-c", str(appliance.config)],
+        capture_output=True,
+        text=True,
+        env=for_other_programs(),
+        check=True,
+    )
+    head, *lines = (line.split() for line in done.stdout.splitlines())
+    assert head[:4] == ["ROS", "MQTT", "TYPE", "AS"]
+    for line in (
+        ["/turtle/pen", "service", "r2d2/turtle/pen/_call", "std_srvs/srv/SetBool", "json"],
+        ["/turtle/walk", "action", "r2d2/turtle/walk", "test_msgs/action/Fibonacci", "json"],
+        [
+            "/turtle",
+            "parameters",
+            "r2d2/turtle/_param",
+            "rcl_interfaces/msg/ParameterValue",
+            "json",
+        ],
+    ):
+        assert line in lines
 
 
 @both
