@@ -163,19 +163,8 @@ class Commands(ToRos):
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
             return
-        convert, publisher = out
-        try:
-            cdr = self._limited(self._read(convert, message), origin)
-            if self.echo is not None:
-                self.echo.sent(cdr)
-            publisher.publish(cdr)
-        except ConversionError as error:
-            self.fail(f"cannot be converted: {error}")
-        except BusError as error:
-            self.fail(f"could not be published: {error}")
-        else:
-            self.counters.messages += 1
-            self.counters.bytes += len(message.payload)
+        cdr = self._publish(*out, message, origin)
+        if cdr is not None:
             self._commanded(cdr, origin)
 
     def _is_in_time(self, message: Message, retain: bool, origin: Session | None) -> bool:
@@ -207,7 +196,10 @@ class Commands(ToRos):
         self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
         return False
 
-    def _limited(self, cdr: bytes, origin: Session | None) -> bytes:
+    def _read(
+        self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
+    ) -> bytes:
+        cdr = super()._read(convert, message, origin)
         if self._limits is None:
             return cdr
         try:

@@ -510,10 +510,18 @@ class ToRos(Flow):
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
             return
-        convert, publisher = out
-        payload = message.payload
+        self._publish(*out, message, origin)
+
+    def _publish(
+        self,
+        convert: Callable[[bytes], bytes],
+        publisher: RosPublisher,
+        message: Message,
+        origin: Session | None,
+    ) -> bytes | None:
+        """Publish the message on ROS; its CDR, or None when that failed, which is told."""
         try:
-            cdr = self._read(convert, message)
+            cdr = self._read(convert, message, origin)
             if self.echo is not None:
                 self.echo.sent(cdr)
             publisher.publish(cdr)
@@ -523,9 +531,13 @@ class ToRos(Flow):
             self.fail(f"could not be published: {error}")
         else:
             self.counters.messages += 1
-            self.counters.bytes += len(payload)
+            self.counters.bytes += len(message.payload)
+            return cdr
+        return None
 
-    def _read(self, convert: Callable[[bytes], bytes], message: Message) -> bytes:
+    def _read(
+        self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
+    ) -> bytes:
         """The message's CDR. Raises ConversionError, also for what says to be something else."""
         properties = message.properties
         if properties is None:
