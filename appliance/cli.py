@@ -271,6 +271,7 @@ def bench(
     cell: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Only this cell; may be repeated.")
     ] = None,
+    bridge: Annotated[bool, typer.Option("--bridge", help="Only the cells of the bridge.")] = False,
     seconds: Annotated[float, typer.Option(help="How long each cell is measured.")] = 3.0,
     peer: Annotated[
         str | None, typer.Option(metavar="PATH", help="The mosquitto to compare with.")
@@ -279,7 +280,8 @@ def bench(
     """Measure this broker, and mosquitto beside it where it is installed."""
     from appliance import bench
 
-    raise typer.Exit(bench.main(cell or None, seconds, peer, as_json))
+    cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
+    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))
 
 
 # What is stored

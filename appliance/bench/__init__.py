@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 
+def bridge_cells() -> list[str]:
+    """The names of those among CELLS that measure the bridge."""
+    from appliance.bench.cells import CELLS, BridgeCell
+
+    return [cell.name for cell in CELLS if isinstance(cell, BridgeCell)]
+
+
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
     """Measure and print; returns the exit status, 0 when every cell ran.
 
