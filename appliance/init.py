@@ -27,7 +27,10 @@ bridge:
   topics: []
   # A route each, for example:
   #  - {{ros: /odom, to: mqtt, rate: 10}}
-  #  - {{ros: /cmd_vel, to: ros, type: geometry_msgs/msg/Twist}}
+  #  - ros: /cmd_vel
+  #    to: ros
+  #    type: geometry_msgs/msg/Twist
+  #    on_silence: {{after: 500 ms, publish: {{}}}}  # who falls silent is followed by a stop
 """
 
 DEMO_CONFIGURATION = """\
