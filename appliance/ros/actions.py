@@ -324,6 +324,8 @@ class Action:
         # The goal alone is checked first, so that an error names its fields as the client does.
         to_request(self._converters, f"{type_name}_Goal", call.payload)
         self._check_room(call.caller)
+        if self.route.cancel_on_disconnect and call.caller.link is None:
+            raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
         fields = orjson.loads(call.payload or b"{}")
         request = self._converters.get(request_type).from_dict(

@@ -200,6 +200,7 @@ class Bridge:
             if before.get(topic) != subscription:
                 self._broker.subscribe(session, subscription)
                 self._broker.send_retained(session, subscription, True)
+                session.take_turn()  # it has no others to leave a turn to
         for topic in before.keys() - wanted.keys():
             self._broker.unsubscribe(session, topic)
 

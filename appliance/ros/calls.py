@@ -34,6 +34,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.ros.backlog import Backlog
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ CLIENT_ID = "_calls"
 #: What can go wrong with a call; the message beside it has the particulars.
 ErrorCode: TypeAlias = Literal[
     "bad_request",  # the payload, or the message, is not what the call takes
+    "expired",  # it was sent long before it came
     "no_response_topic",  # there is no way to answer
     "not_authorized",  # the caller may not have the answer there, or not ask for that
     "too_many",  # the caller, or all together, have too many calls under way
@@ -161,6 +163,7 @@ class Switchboard:
         self, broker: Broker, loop: asyncio.AbstractEventLoop, limits: CallLimits | None = None
     ) -> None:
         self.limits = limits or CallLimits()
+        self._backlog = Backlog()
         self._broker = broker
         self._loop = loop
         self._session: Session | None = None
@@ -178,6 +181,7 @@ class Switchboard:
         self._session = self._broker.attach(
             CLIENT_ID, Ear(self, None), lambda origin: Ear(self, origin)
         )
+        self._broker.departures.append(self._backlog.departed)
         for topic_filter in self._identifiers:
             self._subscribe(topic_filter)
 
@@ -192,6 +196,7 @@ class Switchboard:
         await asyncio.sleep(0)  # the answers go out
         session, self._session = self._session, None
         if session is not None:
+            self._broker.departures.remove(self._backlog.departed)
             self._broker.detach(session)
 
     # Topics
@@ -279,7 +284,7 @@ class Switchboard:
             return
         call = Call(caller, message.payload, topic, reply)
         try:
-            self._admit(caller, message)
+            self._admit(offer, caller, message)
         except CallError as error:
             self._fail(offer, caller, reply, error)
             return
@@ -320,15 +325,22 @@ class Switchboard:
             route = self._broker.route(caller, encode_string(topic))
         except ProtocolError as error:
             raise CallError("bad_request", f"the Response Topic is not valid: {error}") from None
+        if topic in self._broker.guards:
+            # The answer would come some time later, and as the appliance's own message.
+            raise CallError("not_authorized", f"{quote(topic)} is for commands, not for answers")
         if not route.allowed:
             raise CallError(
                 "not_authorized",
                 f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
             )
 
-    def _admit(self, caller: Session, message: Message) -> None:
+    def _admit(self, offer: Offer, caller: Session, message: Message) -> None:
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
+        is_over = message.expires_at is not None and message.expires_at <= self._broker.now
+        if is_over or self._backlog.has(message, caller, offer.timeout, self._loop.time()):
+            # Nobody waits for its answer any more, and what it would do nobody expects now.
+            raise CallError("expired", "it was sent some time ago, before a connection was lost")
         limits = self.limits
         if self._under_way[caller] >= limits.client:
             raise CallError(

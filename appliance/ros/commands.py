@@ -19,6 +19,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Decision
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros.backlog import Backlog
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell, ToRos
 from appliance.ros.node import BusError, QosProfile, RosNode
@@ -91,8 +92,7 @@ class Commands(ToRos):
         self._is_driven = False
         self._last = b""
         self._has_stopped = False
-        #: Who has sent old commands, and until when its others are taken for such.
-        self._behind: tuple[Session | None, float] | None = None
+        self._backlog = Backlog()
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
         #: A retained message from before there was anybody on ROS to have it.
@@ -177,16 +177,10 @@ class Commands(ToRos):
         # Without a Message Expiry Interval nobody knows how old a retained message is. A will was
         # handed over when its client connected.
         is_will = origin is not None and origin.link is None
-        is_old = message.age > rules.oldest or (rules.oldest < math.inf and is_will)
-        if is_old and not is_will:
-            # What its client queued while it had no connection comes behind what it sends again,
-            # and looks like new.
-            self._behind = origin, self._around.loop.time() + rules.oldest
-        elif self._behind is not None:
-            late, until = self._behind
-            if self._around.loop.time() >= until:
-                self._behind = None
-            is_old |= origin is late and self._behind is not None
+        if is_will:
+            is_old = rules.oldest < math.inf
+        else:
+            is_old = self._backlog.has(message, origin, rules.oldest, self._around.loop.time())
         if is_old or (retain and rules.expire is not None and expires_at is None):
             return self._count_expired("it was sent some time before", origin)
         return True
@@ -256,6 +250,7 @@ class Commands(ToRos):
     # Silence
 
     def _departed(self, session: Session) -> None:
+        self._backlog.departed(session)
         if session is self._holder:
             self._release("has left")
         if session is self._source:
@@ -316,8 +311,11 @@ class Commands(ToRos):
     def _publish_stop(self, why: str) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""
         out, stop = self._out, self._stop
-        if out is None or stop is None:
+        if stop is None or (out is None and self._is_left):
             self._is_driven = False
+            return
+        if out is None:  # the publisher is being set up anew
+            self._stop_later()
             return
         cdr = stop.cdr()
         try:
@@ -327,15 +325,18 @@ class Commands(ToRos):
         except BusError as error:
             self.fail(f"that stops could not be published: {error}")
             if not self._is_left:
-                self._is_driven = self._must_stop = True
-                if self._timer is not None:
-                    self._timer.cancel()
-                self._timer = self._around.loop.call_later(RETRY, self._check)
+                self._stop_later()
             return
         self._is_driven = self._must_stop = False
         self._has_stopped = True
         self.counters.stops += 1
         self._mention("stopped", "%s: the stop message was published: %s", why)
+
+    def _stop_later(self) -> None:
+        self._is_driven = self._must_stop = True
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._around.loop.call_later(RETRY, self._check)
 
     # The log
 

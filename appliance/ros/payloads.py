@@ -110,17 +110,12 @@ def unpacker(
     `largest` bytes.
     """
 
-    def checked(payload: bytes) -> bytes:
-        # Nodes end over a message that cannot be read, and rclpy does not look: we do.
-        converter.to_dict(payload)
-        return payload
-
     unpack = {
         "json": converter.from_json,
         "cbor": converter.from_cbor,
         "text": converter.from_text,
         "binary": converter.from_binary,
-        "cdr": checked,
+        "cdr": converter.checked,
     }[encoding]
     if compression == "none":
         return unpack

@@ -209,7 +209,14 @@ class Ros2Node:
         executor = self._executor
         if executor is None:
             raise BusError("ROS is not ready")
-        executor.create_task(callback)
+
+        def run() -> None:
+            try:
+                callback()
+            except Exception:  # in EventsExecutor it would end the whole process
+                log.exception("a fault on the ROS thread")
+
+        executor.create_task(run)
 
     # The graph
 
@@ -389,9 +396,8 @@ class _Service:
     def _take(self, request: Any, header: Any) -> None:
         def respond(response: bytes | None) -> None:
             if response is not None and self._own is not None:
-                message = self._deserialize(response, self._response_class)
                 with _as_bus_error():
-                    self._send(message, header)
+                    self._send(self._deserialize(response, self._response_class), header)
 
         self._callback(self._serialize(request), respond)
 
@@ -413,7 +419,7 @@ def import_service(name: str) -> Any:
 
 def _errors() -> tuple[type[Exception], ...]:
     implementation = import_module("rclpy.impl.implementation_singleton").rclpy_implementation
-    return implementation.RCLError, implementation.InvalidHandle
+    return implementation.RCLError, implementation.RMWError, implementation.InvalidHandle
 
 
 @contextmanager

@@ -88,8 +88,7 @@ def to_request(
     try:
         converter = converters.get(type_name)
         if encoding == "cdr":
-            converter.to_dict(payload)  # nodes end over a message that cannot be read
-            return payload
+            return converter.checked(payload)
         return converter.from_json(payload or b"{}")
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None

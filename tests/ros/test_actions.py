@@ -101,6 +101,14 @@ async def test_a_goal_that_is_accepted_too_late_is_cancelled(house):
     assert house.counters().under_way == 0
 
 
+async def test_a_client_that_leaves_right_behind_its_goal(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    client.send(f"{GOAL}/1", {"order": 3})
+    client.leave()
+    await asyncio.sleep(0.02)
+    assert walks.results == {} and house.counters().errors["rejected"] == 1
+
+
 async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
     walks, client = await begin(house)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]

@@ -200,6 +200,20 @@ async def test_a_qos_2_command_is_as_old_as_its_publish(house):
     assert house.counters().expired == 2
 
 
+async def test_what_two_clients_had_queued_is_old_of_both(house):
+    house.start(CommandRules(expire=0.5))
+    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    for driver in (a, b):
+        driver.drive(qos=1, dup=True)
+    for driver in (a, b):
+        driver.drive()
+    assert house.robot.received == []
+    assert house.counters().expired == 4
+    a.cut()
+    Driver(house.broker, "a").drive()
+    assert house.robot.received == [twist(0.5)]
+
+
 async def test_a_will_is_as_old_as_its_connection(house):
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a", will=Will(TOPIC, GO))
@@ -463,6 +477,19 @@ async def test_a_stop_message_that_ros_does_not_take_is_tried_until_it_does(hous
     await asyncio.sleep(0.12)
     assert house.robot.received == [twist(0.5)]
     publisher.error = None
+    await until(lambda: house.robot.received[-1] == STOP)
+
+
+async def test_a_stop_message_that_is_due_while_its_publisher_is_set_up_anew(house):
+    bridge = house.start(CommandRules(on_silence=OnSilence(60)))
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    (commands,) = bridge._to_ros.values()
+    away, commands._out = commands._out, None
+    driver.cut()
+    await asyncio.sleep(0.06)
+    assert house.robot.received == [twist(0.5)]
+    commands._out = away
     await until(lambda: house.robot.received[-1] == STOP)
 
 

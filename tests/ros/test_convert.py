@@ -11,7 +11,13 @@ import struct
 import orjson
 import pytest
 
-from appliance.ros.convert import ConversionError, Converter, Converters, compile_converter
+from appliance.ros.convert import (
+    LARGEST_LENIENT,
+    ConversionError,
+    Converter,
+    Converters,
+    compile_converter,
+)
 from appliance.ros.definitions import (
     PRIMITIVES,
     TIME,
@@ -24,6 +30,7 @@ from appliance.ros.definitions import (
     WideString,
     describe,
     import_message,
+    load_description,
 )
 from appliance.ros.generate import generate
 
@@ -650,3 +657,28 @@ def test_a_field_that_ros_cannot_carry() -> None:
     Odd.__module__ = "demo_msgs.msg._odd"
     with pytest.raises(UnknownTypeError, match=r"demo_msgs/msg/Odd\.letter has the type wchar"):
         describe(Odd, import_message)
+
+
+# What is large, and what is handed on
+
+
+def test_cdr_is_handed_on_without_its_options():
+    converter = Converters(load_description).get("std_msgs/msg/Float64")
+    value = struct.pack("<d", 1.5)
+    assert converter.checked(b"\0\1\0\3" + value) == b"\0\1\0\0" + value
+    with pytest.raises(ConversionError):
+        converter.checked(b"\0\1\0\0" + value[:7])
+
+
+def test_a_large_payload_must_be_exact():
+    """What is left out costs so much time that there is a bound."""
+    converter = Converters(load_description).get("geometry_msgs/msg/PoseArray")
+    pose = converter.to_dict(converter.from_json(b'{"poses":[{}]}'))["poses"][0]
+    many = orjson.dumps({"header": {"frame_id": "a", "stamp": {}}, "poses": [{}] * 100})
+    assert len(converter.to_dict(converter.from_json(many))["poses"]) == 100
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    exact = orjson.dumps({"header": header, "poses": [pose] * 3100})
+    assert len(exact) > LARGEST_LENIENT
+    assert len(converter.to_dict(converter.from_json(exact))["poses"]) == 3100
+    with pytest.raises(ConversionError, match="has not exactly the fields of"):
+        converter.from_json(b'{"poses":[' + b"{}," * 100_000 + b"{}]}")

@@ -99,6 +99,29 @@ class Peer:
         await self._reader
 
 
+async def test_no_request_ends_the_thread():
+    node = ros2.Ros2Node()
+    told, failures = [], []
+
+    def look():
+        if told:
+            return
+        client = node.create_client("/parameters", "rcl_interfaces/srv/GetParameters")
+        try:
+            # More padding, says its fourth byte, than the message has at its end.
+            client.call(b"\0\1\0\3\0\0\0\0", told.append)
+        except BusError as error:
+            told.append(str(error))
+
+    node.start(look, failures.append)
+    await until(lambda: told or failures, "the call")
+    node.call_soon(lambda: 1 / 0)
+    node.call_soon(lambda: told.append("still there"))
+    await until(lambda: told[-1] == "still there" or failures, "what comes behind a fault")
+    assert failures == []
+    await asyncio.to_thread(node.stop)
+
+
 class House:
     """Broker, bridge and an MQTT client, as in test_bridge.py, on a real node."""
 

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("std_srvs.srv")
 from call_house import AllTypes, House, call_routes, service, until
 
+from appliance.broker.message import Late, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
@@ -241,10 +242,11 @@ async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(house):
     switch = Switch(house)
     house.rules.deny("mallory", "publish", "r2d2/cmd_vel")
     mallory = house.client("mallory", "r2d2/#")
-    victim = house.client("victim", "r2d2/cmd_vel", "$SYS/#")
-    for topic in ("r2d2/cmd_vel", "$SYS/broker/version"):
+    victim = house.client("victim", "r2d2/cmd_vel", "r2d2/arm", "$SYS/#")
+    house.broker.guards["r2d2/arm"] = []  # where commands are received that have rules
+    for topic in ("r2d2/cmd_vel", "$SYS/broker/version", "r2d2/arm"):
         mallory.send(CALL, {"data": True}, response_topic=topic)
-    await until(lambda: len(mallory.on("r2d2/switch/_reply/mallory")) == 2, "the refusals")
+    await until(lambda: len(mallory.on("r2d2/switch/_reply/mallory")) == 3, "the refusals")
     codes = {a["error"]["code"] for a in mallory.payloads("r2d2/switch/_reply/mallory")}
     assert codes == {"not_authorized"}
     assert switch.asked == [] and victim.received == []
@@ -287,6 +289,20 @@ async def test_a_retained_call_is_not_carried_out(house):
     await until(lambda: client.on("answers/alice"), "the error")
     assert client.payloads("answers/alice")[0]["error"]["code"] == "bad_request"
     assert switch.asked == []
+
+
+async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    client = house.client("alice")
+    again = Message(CALL, b"", 1, properties={Property.RESPONSE_TOPIC: "answers/alice"})
+    house.broker.publish(Late(again, 60.0), client.session)
+    client.send(CALL, {"data": True}, response_topic="answers/alice")
+    await until(lambda: len(client.on("answers/alice")) == 2, "the errors")
+    codes = [answer["error"]["code"] for answer in client.payloads("answers/alice")]
+    assert codes == ["expired", "expired"] and switch.asked == []
+    house.broker.publish(Late(again, 1.0), house.client("bob").session)  # within its time
+    await until(lambda: switch.asked, "another client's call")
 
 
 async def test_patterns_follow_the_bus(house):
