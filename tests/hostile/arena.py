@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -103,6 +104,8 @@ class Arena:
         appliance.config.write_text(yaml.safe_dump(self._settings))
         logged_before = len(appliance.log)
         self._audit.unlink(missing_ok=True)
+        # What one attack has left in the store is not the next one's.
+        shutil.rmtree(appliance.directory / "state", ignore_errors=True)
         problems: list[str] = []
         appliance.start()
         try:
