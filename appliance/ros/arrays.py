@@ -16,9 +16,7 @@ from typing import Any
 
 import pybase64
 
-from appliance.ros.definitions import PRIMITIVES, Primitive
-
-HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian, no options
+from appliance.ros.definitions import CDR, PRIMITIVES, Primitive
 
 # Fewer numbers than this have a Struct prepared, and are not worth numpy's detour.
 _FEW = 32
@@ -31,7 +29,7 @@ _NUMBERS_AND_NULL = frozenset({int, float, type(None)})
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """An array of numbers as it is in CDR, in little endian."""
+    """An array of numbers as it is on the wire, in little endian."""
 
     primitive: Primitive
     data: bytes
@@ -141,7 +139,7 @@ def _frombuffer() -> Callable[[bytes, str], Any] | None:
 def readers(with_numpy: bool) -> dict[str, Any]:
     """What decoders call. With numpy, long arrays come as numpy's, else as lists."""
     return {
-        "LITTLE_ENDIAN": HEADER[:2],
+        "LITTLE_ENDIAN": CDR.header[:2],
         "base64": pybase64.b64encode_as_string,
         "read_wide_string": _read_wide_string,
         **{f"read_{p.name}": _reader(p, with_numpy) for p in PRIMITIVES.values()},
@@ -184,7 +182,7 @@ def binary_readers() -> dict[str, Any]:
     """What decoders call that leave arrays of numbers as they are; those of bools are lists."""
     bools = PRIMITIVES["bool"]
     return {
-        "LITTLE_ENDIAN": HEADER[:2],
+        "LITTLE_ENDIAN": CDR.header[:2],
         "base64": _as_it_is,
         "read_wide_string": _read_wide_string,
         **{f"read_{p.name}": _binary_reader(p) for p in PRIMITIVES.values()},
@@ -195,7 +193,7 @@ def binary_readers() -> dict[str, Any]:
 
 # What encoders call.
 WRITERS: dict[str, Any] = {
-    "HEADER": HEADER,
+    "HEADER": CDR.header,
     "ZEROS": bytes(8),
     "BOOLS": _BOOLS,
     "INTEGERS": _INTEGERS,

@@ -25,7 +25,7 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
-from appliance.ros.definitions import UnknownTypeError, describe
+from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
 from appliance.ros.graph import CallRoutes, Calls
@@ -85,7 +85,7 @@ class Bridge:
         self._told: set[str] = set()
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
-        self._converters = Converters(lambda name: describe(node.load(name), node.load), node.now)
+        self._converters = Converters(node.describe, node.now)
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: asyncio.TimerHandle | None = None
         self._metered = 0
@@ -225,7 +225,7 @@ class Bridge:
         there = self._to_mqtt.get(key)
         back = self._found.get(key) or self._to_ros.get(key)
         if there is not None and back is not None and (back.echo is None or there.echo is None):
-            there.echo = back.echo = Echo()
+            there.echo = back.echo = Echo(self._node.wire)
 
     # The loop's thread
 

@@ -31,6 +31,7 @@ from appliance.ros.definitions import (
     String,
     TypeDescription,
     WideString,
+    Wire,
     least_size,
 )
 
@@ -52,18 +53,21 @@ class ConversionError(ValueError):
 
 
 def decode(description: TypeDescription, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
-    """The value of a serialized message: byte order, alignment and strings as in plain CDR.
+    """The value of a serialized message: byte order, alignment and strings as its wire has them.
 
     uint8[], byte[] and char[] come as base64, as in JSON; when `binary`, as bytes, and other
     arrays of numbers, but for bools, as `Numbers`. Bytes after the message are ignored,
     as every DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) comes with
     U+FFFD in it, as rclpy gives it. Raises ConversionError.
     """
-    if len(cdr) < 4:
-        raise ConversionError("", "truncated: not even CDR's header of four bytes")
-    if cdr[0] != 0 or cdr[1] > 1:
-        raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
-    return _Reader(cdr, "<" if cdr[1] else ">", binary).structure(description, "")
+    order = "<"
+    if description.wire.header:
+        if len(cdr) < 4:
+            raise ConversionError("", "truncated: not even CDR's header of four bytes")
+        if cdr[0] != 0 or cdr[1] > 1:
+            raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
+        order = "<" if cdr[1] else ">"
+    return _Reader(cdr, description.wire, order, binary).structure(description, "")
 
 
 def pick(value: Any, wanted: Selection) -> Any:
@@ -80,15 +84,16 @@ def pick(value: Any, wanted: Selection) -> Any:
 class _Reader:
     """A position in the bytes of one message."""
 
-    def __init__(self, cdr: bytes, order: str, binary: bool) -> None:
+    def __init__(self, cdr: bytes, wire: Wire, order: str, binary: bool) -> None:
         self._cdr = cdr
+        self._wire = wire
         self._order = order
         self._binary = binary
-        self._position = 4
+        self._position = len(wire.header)
 
     def structure(self, description: TypeDescription, path: str) -> dict[str, Any]:
         if not description.fields:
-            self._take(1, path)
+            self._take(len(self._wire.empty), path)
         return {
             field.name: self._value(field.type, _join(path, field.name))
             for field in description.fields
@@ -124,14 +129,13 @@ class _Reader:
     def _numbers(self, primitive: Primitive, count: int, path: str) -> tuple[Any, ...]:
         if not count:
             return ()  # nothing, and no padding either
-        # Alignment counts from the end of the header.
-        self._position += (4 - self._position) % primitive.size
+        self._align(primitive.size)
         chunk = self._take(count * primitive.size, path)
         return struct.unpack(f"{self._order}{count}{primitive.code}", chunk)
 
     def _count(self, size: int, path: str) -> int:
         """A count of items of at least `size` bytes, or of a string's bytes."""
-        self._position += -self._position % 4
+        self._align(4)
         (count,) = struct.unpack(f"{self._order}I", self._take(4, path))
         assert isinstance(count, int)
         left = len(self._cdr) - self._position
@@ -144,7 +148,7 @@ class _Reader:
     def _string(self, path: str) -> str:
         # The count includes the final NUL. Some senders leave both out of an empty string.
         chunk = self._take(self._count(1, path), path)
-        return chunk.removesuffix(b"\0").decode("utf-8", "replace")
+        return chunk.removesuffix(self._wire.terminator).decode("utf-8", "replace")
 
     def _wide_string(self, path: str) -> str:
         # As every rmw writes it: 16-bit units, each in four bytes, without a final NUL.
@@ -153,6 +157,11 @@ class _Reader:
         if any(unit > 0xFFFF for unit in units):
             raise ConversionError(path, "not UTF-16")
         return struct.pack(f"<{count}H", *units).decode("utf-16-le", "replace")
+
+    def _align(self, size: int) -> None:
+        # It counts from the end of the header.
+        past = self._position - len(self._wire.header)
+        self._position += -past % min(size, self._wire.alignment)
 
     def _take(self, size: int, path: str) -> bytes:
         chunk = self._cdr[self._position : self._position + size]
@@ -174,12 +183,13 @@ def accept(description: TypeDescription, value: object, now: Callable[[], int]) 
     What comes back has every field and nothing else: defaults filled in, null as NaN, bytes for
     uint8[], byte[] and char[]. `now` gives nanoseconds since the epoch. Raises ConversionError.
     """
-    return _Checker(now).structure(description, value, "")
+    return _Checker(now, description.wire).structure(description, value, "")
 
 
 class _Checker:
-    def __init__(self, now: Callable[[], int]) -> None:
+    def __init__(self, now: Callable[[], int], wire: Wire) -> None:
         self._now = now
+        self._wire = wire
 
     def structure(self, description: TypeDescription, value: object, path: str) -> dict[str, Any]:
         if value == "now" and description.name == TIME:
@@ -202,7 +212,7 @@ class _Checker:
         if isinstance(type_, Primitive):
             return _number(type_, value, path)
         if isinstance(type_, (String, WideString)):
-            return _text(type_, value, path)
+            return self._text(type_, value, path)
         if isinstance(type_, TypeDescription):
             return self.structure(type_, value, path)
         items = self._items(type_.item, value, path)
@@ -228,6 +238,22 @@ class _Checker:
         if isinstance(item, Primitive) and _all_fit(item, value):
             return list(value)
         return [self._value(item, x, f"{path}[{i}]") for i, x in enumerate(value)]
+
+    def _text(self, type_: String | WideString, value: object, path: str) -> str:
+        if not isinstance(value, str):
+            raise ConversionError(path, f"expected a string, got {_say(value)}")
+        wide = isinstance(type_, WideString)
+        try:
+            size = len(value.encode("utf-16-le")) // 2 if wide else len(value.encode())
+        except UnicodeEncodeError:
+            raise ConversionError(path, "the string has half a surrogate pair in it") from None
+        if type_.bound is not None and size > type_.bound:
+            unit = "units of UTF-16" if wide else "bytes of UTF-8"
+            raise ConversionError(path, f"{size} {unit}, at most {type_.bound} are allowed")
+        if not wide and self._wire.terminator and "\0" in value:
+            # What follows would be lost on the way: strings end at NUL in C, and in rclpy.
+            raise ConversionError(path, "a ROS string cannot hold the character U+0000")
+        return value
 
 
 def default(field: Field) -> Any:
@@ -283,23 +309,6 @@ def _number(primitive: Primitive, value: object, path: str) -> Any:
     except (OverflowError, struct.error):
         raise ConversionError(path, f"{_say(value)} does not fit in {primitive.name}") from None
     return number
-
-
-def _text(type_: String | WideString, value: object, path: str) -> str:
-    if not isinstance(value, str):
-        raise ConversionError(path, f"expected a string, got {_say(value)}")
-    wide = isinstance(type_, WideString)
-    try:
-        size = len(value.encode("utf-16-le")) // 2 if wide else len(value.encode())
-    except UnicodeEncodeError:
-        raise ConversionError(path, "the string has half a surrogate pair in it") from None
-    if type_.bound is not None and size > type_.bound:
-        unit = "units of UTF-16" if wide else "bytes of UTF-8"
-        raise ConversionError(path, f"{size} {unit}, at most {type_.bound} are allowed")
-    if not wide and "\0" in value:
-        # What follows would be lost on the way: strings end at NUL in C, and so in rclpy.
-        raise ConversionError(path, "a ROS string cannot hold the character U+0000")
-    return value
 
 
 def _base64(value: str, path: str) -> bytes:

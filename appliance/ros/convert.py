@@ -1,4 +1,6 @@
-"""ROS messages as MQTT payloads: JSON, CBOR, text, to and from ROS's own serialized bytes (CDR).
+"""ROS messages as MQTT payloads: JSON, CBOR, text, to and from ROS's own serialized bytes.
+
+They are called `cdr` here, whatever they are: in ROS 1 they are not CDR (definitions.Wire).
 
     converters = Converters(load_description)
     twist = converters.get("geometry_msgs/msg/Twist")
@@ -7,7 +9,7 @@
 
 No message object is made on the way: code generated once a type (generate.py) goes straight from
 one to the other, and the slow way (careful.py) takes over for what is not exactly as expected.
-The encoding `cdr` needs nothing from here.
+The encodings `cdr` and `ros1` need nothing from here.
 
 JSON, beyond what the word says:
 
@@ -132,11 +134,11 @@ class Converter:
         """The serialized message, as it is safe to hand on: nodes end over one that cannot be read,
         and rclpy does not look.
 
-        Its options become 0, which say how many bytes of padding are at its end: more than there
+        CDR's options become 0, which say how many bytes of padding are at its end: more than there
         are would end a node, too, and fewer are passed over.
         """
         self.to_dict(cdr)
-        return cdr[:2] + b"\0\0" + cdr[4:]
+        return cdr[:2] + b"\0\0" + cdr[4:] if self.description.wire.header else cdr
 
     def to_dict(self, cdr: bytes) -> dict[str, Any]:
         """What `to_json` writes, as Python values: lists, floats (NaN among them), base64."""

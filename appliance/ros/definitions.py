@@ -30,7 +30,7 @@ class UnknownTypeError(LookupError):
 
 @dataclass(frozen=True)
 class Primitive:
-    """A bool, number, byte or char: `code` is its `struct` code, `size` its bytes in CDR."""
+    """A bool, number, byte or char: `code` is its `struct` code, `size` its bytes."""
 
     name: str
     code: str
@@ -111,11 +111,36 @@ class Field:
 
 
 @dataclass(frozen=True)
+class Wire:
+    """How messages are serialized.
+
+    They begin with `header`. Numbers are aligned to their size, at most to `alignment` (MAXALIGN of
+    DDS-XTypes), counted from its end. `terminator` ends a string and is counted with it; `empty` is
+    all that there is of a structure without fields.
+    """
+
+    name: str
+    header: bytes
+    alignment: int
+    terminator: bytes
+    empty: bytes
+
+
+#: ROS 2's: plain CDR, little endian, no options.
+CDR = Wire("CDR", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
+
+#: ROS 1's: always little endian, and nothing but the values.
+PACKED = Wire("ROS 1", b"", 1, b"", b"")
+
+
+@dataclass(frozen=True)
 class TypeDescription:
-    """A message type: its full name (`geometry_msgs/msg/Twist`) and its fields in wire order."""
+    """A message type: its full name (`geometry_msgs/msg/Twist`), its fields in wire order, and how
+    it is serialized, as the types in it are."""
 
     name: str
     fields: tuple[Field, ...]
+    wire: Wire = CDR
 
 
 ItemType = Primitive | String | WideString | TypeDescription
@@ -153,7 +178,7 @@ def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
 
 
 def least_size(type_: FieldType) -> int:
-    """The fewest bytes that a value takes in CDR, padding not counted: at least 1.
+    """The fewest bytes that a serialized value takes, padding not counted: in CDR at least 1.
 
     A count in a hostile message is held against it before anything is allocated.
     """
@@ -162,8 +187,7 @@ def least_size(type_: FieldType) -> int:
     if isinstance(type_, Array):
         return type_.length * least_size(type_.item)
     if isinstance(type_, TypeDescription):
-        # An empty structure is one byte on the wire.
-        return sum(least_size(field.type) for field in type_.fields) or 1
+        return sum(least_size(field.type) for field in type_.fields) or len(type_.wire.empty)
     return 4
 
 

@@ -20,7 +20,7 @@ from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, encode_string
 from appliance.ros.convert import ConversionError, Converters
-from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.definitions import CDR, UnknownTypeError, Wire
 from appliance.ros.figures import Counters, Meter
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import (
@@ -34,6 +34,7 @@ from appliance.ros.node import (
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payloads import (
     CONTENT_TYPE,
+    RAW,
     Compression,
     Encoding,
     check,
@@ -148,14 +149,17 @@ class Echo:
     the echo, and the echo in its place as the other's message: on MQTT nobody can tell.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wire: Wire = CDR) -> None:
+        self._header = len(wire.header)
+        #: In CDR, up to three bytes may have been added at the end.
+        self._padding = 3 if wire.header else 0
         self._lock = threading.Lock()
         self._sent: deque[tuple[float, bytes]] = deque(maxlen=ECHO_SAMPLES)
 
     def sent(self, cdr: bytes) -> None:
         """The sample is about to be published. Without CDR's header, where DDS notes padding."""
         with self._lock:
-            self._sent.append((monotonic() + ECHO_TIME, cdr[4:]))
+            self._sent.append((monotonic() + ECHO_TIME, cdr[self._header :]))
 
     def is_own(self, cdr: bytes) -> bool:
         """Whether the sample received is one that was sent and has not come back yet."""
@@ -166,8 +170,8 @@ class Echo:
             while self._sent and self._sent[0][0] < now:
                 self._sent.popleft()
             for index, (_, body) in enumerate(self._sent):
-                # Padding, up to three bytes, may have been added at the end.
-                if 4 <= len(cdr) - len(body) < 8 and cdr.startswith(body, 4):
+                more = len(cdr) - len(body) - self._header
+                if 0 <= more <= self._padding and cdr.startswith(body, self._header):
                     del self._sent[index]
                     return True
         return False
@@ -370,7 +374,7 @@ class ToMqtt(Flow):
         self.close()
         settings = self.settings
         converter = None
-        if settings.encoding != "cdr":
+        if settings.encoding not in RAW:
             converter = self._converters.get(type_name, settings.fields)
             check(converter, settings.encoding, to_ros=False)
         about = [("ros-type", type_name)]

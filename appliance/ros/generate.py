@@ -1,10 +1,10 @@
-"""Python source for one message type: `decode` and `encode`, straight between CDR and values.
+"""Python source for one message type: `decode` and `encode`, straight between wire and values.
 
 What can be known beforehand is worked out here, once a type: neighbouring numbers are read and
 written by one precompiled `struct.Struct` (a *run*), nested messages are laid flat, and padding is
 part of the run. CDR aligns a number to its size, counted from the end of the four bytes of header.
 While the position modulo 8 is known, a run has one layout; after a string it has up to eight, and
-the position picks one of them.
+the position picks one of them. ROS 1 aligns nothing, so that there every run has one layout.
 
 Of a message of which only some fields are wanted, what is passed over is not read at all.
 
@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from appliance.ros.arrays import HEADER, WRITERS, binary_readers, readers
+from appliance.ros.arrays import WRITERS, binary_readers, readers
 from appliance.ros.definitions import (
     PRIMITIVES,
     Array,
@@ -32,6 +32,7 @@ from appliance.ros.definitions import (
     String,
     TypeDescription,
     WideString,
+    Wire,
 )
 
 # What generated code raises when a message is not exactly as expected.
@@ -72,7 +73,7 @@ class Binary(NamedTuple):
 
 def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> Binary:
     """Generates and compiles the reader of a type, or of some of its fields."""
-    decoder = _Decoder(wanted, "numbers_{}({})")
+    decoder = _Decoder(description.wire, wanted, "numbers_{}({})")
     source = decoder.function(description)
     namespace = {**decoder.constants, **binary_readers()}
     exec(compile(source, f"<binary reader of {description.name}>", "exec"), namespace)
@@ -81,7 +82,7 @@ def generate_binary(description: TypeDescription, wanted: Selection | None = Non
 
 def generate(description: TypeDescription, wanted: Selection | None = None) -> Generated:
     """Generates and compiles the converters of a type; those that decode, of some of its fields."""
-    decoder, encoder = _Decoder(wanted), _Encoder()
+    decoder, encoder = _Decoder(description.wire, wanted), _Encoder(description.wire)
     source = decoder.function(description) + "\n\n" + encoder.function(description)
     code = compile(source, f"<converters of {description.name}>", "exec")
     fast = {**decoder.constants, **readers(with_numpy=True)}
@@ -97,28 +98,38 @@ def generate(description: TypeDescription, wanted: Selection | None = None) -> G
 
 @dataclass(frozen=True)
 class Phase:
-    """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1)."""
+    """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1).
+
+    Nothing is aligned to more than `most`.
+    """
 
     modulus: int
     rest: int
+    most: int
 
     def align(self, size: int) -> Phase:
+        size = min(size, self.most)
         if size > self.modulus:
-            return Phase(size, 0)
+            return Phase(size, 0, self.most)
         return self.advance(-self.rest % size)
 
+    def is_aligned(self, size: int) -> bool:
+        size = min(size, self.most)
+        return self.modulus >= size and self.rest % size == 0
+
     def advance(self, count: int) -> Phase:
-        return Phase(self.modulus, (self.rest + count) % self.modulus)
+        return Phase(self.modulus, (self.rest + count) % self.modulus, self.most)
+
+    def lost(self, modulus: int = 1) -> Phase:
+        """What is known behind something unknown: it ends at a multiple of `modulus`."""
+        return Phase(modulus, 0, self.most)
 
     def join(self, other: Phase) -> Phase:
         """What is known when it may be this or the other."""
         modulus = min(self.modulus, other.modulus)
         while self.rest % modulus != other.rest % modulus:
             modulus //= 2
-        return Phase(modulus, self.rest % modulus)
-
-
-_ANYWHERE = Phase(1, 0)
+        return Phase(modulus, self.rest % modulus, self.most)
 
 
 def _after(type_: FieldType, phase: Phase) -> Phase:
@@ -126,13 +137,13 @@ def _after(type_: FieldType, phase: Phase) -> Phase:
     if isinstance(type_, Primitive):
         return phase.align(type_.size).advance(type_.size)
     if isinstance(type_, String):
-        return _ANYWHERE
+        return phase.lost()
     if isinstance(type_, WideString):
-        return Phase(4, 0)
+        return phase.lost(4)
     if isinstance(type_, TypeDescription):
         for field in type_.fields:
             phase = _after(field.type, phase)
-        return phase if type_.fields else phase.advance(1)
+        return phase if type_.fields else phase.advance(len(type_.wire.empty))
     if isinstance(type_, Sequence):
         phase = phase.align(4).advance(4)
         return phase.join(_after(type_.item, _loop_phase(type_.item, phase)))
@@ -176,16 +187,16 @@ def _is_run(type_: FieldType) -> bool:
     return isinstance(type_, Primitive) or _is_row(type_)
 
 
-def _run_size(type_: FieldType, rest: int) -> int:
+def _run_size(type_: FieldType, rest: int, most: int) -> int:
     """The bytes of a value that is part of a run, from a position that is `rest` modulo 8."""
     if isinstance(type_, TypeDescription):
-        size = 0 if type_.fields else 1
+        size = 0 if type_.fields else len(type_.wire.empty)
         for field in type_.fields:
-            size += _run_size(field.type, rest + size)
+            size += _run_size(field.type, rest + size, most)
         return size
     item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
     assert isinstance(item, Primitive)
-    return -rest % item.size + count * item.size
+    return -rest % min(item.size, most) + count * item.size
 
 
 # --- the two generators ---------------------------------------------------------------------
@@ -218,15 +229,16 @@ class _Generator:
     have yet to be added to `q`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wire: Wire) -> None:
         self.constants: dict[str, Any] = {}
+        self._wire = wire
         self._lines: list[str] = []
         self._indent = 1
         self._names = 0
         self._run: list[_Part] = []
-        self._phase = Phase(8, 0)
+        self._phase = Phase(8, 0, wire.alignment)
         self._variable = False
-        self._offset = len(HEADER)
+        self._offset = len(wire.header)
         self._terms: list[str] = []
 
     def _line(self, text: str) -> None:
@@ -267,11 +279,11 @@ class _Generator:
         for rest in range(self._phase.rest, 8, self._phase.modulus):
             position, codes = rest, "<"
             for part in self._run:
-                padding = -position % part.primitive.size
+                padding = -position % min(part.primitive.size, self._wire.alignment)
                 codes += "x" * padding + part.code
                 position += padding + part.size
             # The header makes an index four more than the position that is aligned.
-            layouts[(rest + len(HEADER)) % 8] = struct.Struct(codes)
+            layouts[(rest + len(self._wire.header)) % 8] = struct.Struct(codes)
         for part in self._run:
             self._phase = self._phase.align(part.primitive.size).advance(part.size)
         self._run = []
@@ -291,8 +303,10 @@ class _Generator:
         self._terms.append(f"SIZE_{name}[{phase}]")
         return name, f"[{phase}]"
 
-    def _is_aligned(self, size: int) -> bool:
-        return self._phase.modulus >= size and self._phase.rest % size == 0
+    def _fill(self, description: TypeDescription) -> None:
+        """What a structure without fields is."""
+        if not description.fields and self._wire.empty:
+            self._run.append(_Part(_PADDING, 1, ""))
 
     def _stride(self, item: FieldType) -> int | None:
         """The bytes from one item to the next, if all of them have the same layout, with the
@@ -300,7 +314,8 @@ class _Generator:
         phase = _loop_phase(item, self._phase)
         if not _is_run(item) or _after(item, phase) != phase:
             return None
-        sizes = {_run_size(item, rest) for rest in range(phase.rest, 8, phase.modulus)}
+        most = self._wire.alignment
+        sizes = {_run_size(item, rest, most) for rest in range(phase.rest, 8, phase.modulus)}
         return sizes.pop() if len(sizes) == 1 else None
 
 
@@ -310,13 +325,14 @@ class _Decoder(_Generator):
     `row` is what becomes of the name of a type and the names of numbers that are a row.
     """
 
-    def __init__(self, wanted: Selection | None = None, row: str = "[{1}]") -> None:
-        super().__init__()
+    def __init__(self, wire: Wire, wanted: Selection | None, row: str = "[{1}]") -> None:
+        super().__init__(wire)
         self._wanted = wanted
         self._row = row
 
     def function(self, description: TypeDescription) -> str:
-        self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
+        if self._wire.header:
+            self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
         value = self._value(description, "message")
         self._flush()
         self._line(f"return {value}")
@@ -326,8 +342,7 @@ class _Decoder(_Generator):
         """Lines that pass a value without reading it."""
         item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
         if isinstance(type_, TypeDescription):
-            if not type_.fields:
-                self._run.append(_Part(_PADDING, 1, ""))
+            self._fill(type_)
             for field in type_.fields:
                 self._pass(field.type)
         elif isinstance(item, Primitive) and count * item.size <= _LONGEST_ROW:
@@ -339,7 +354,7 @@ class _Decoder(_Generator):
             size = self._number(_COUNT, "size")
             self._flush()
             self._terms.append(size if isinstance(type_, String) else f"{size} * 4")
-            self._phase = _ANYWHERE if isinstance(type_, String) else Phase(4, 0)
+            self._phase = self._phase.lost(1 if isinstance(type_, String) else 4)
         elif isinstance(type_, Sequence) and isinstance(type_.item, Primitive):
             size = self._number(_COUNT, "size")
             self._flush()
@@ -371,8 +386,7 @@ class _Decoder(_Generator):
         return self._sequence(type_, hint)
 
     def _structure(self, description: TypeDescription) -> str:
-        if not description.fields:
-            self._run.append(_Part(_PADDING, 1, ""))
+        self._fill(description)
         wanted = self._wanted
         values = []
         for field in description.fields:
@@ -395,7 +409,7 @@ class _Decoder(_Generator):
         names = [part.text for part in self._run if part.text]
         target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
         first_size = self._run[0].primitive.size
-        if first_size > self._phase.modulus:
+        if min(first_size, self._wire.alignment) > self._phase.modulus:
             # Cheaper than as many layouts, and what follows has often but one.
             self._align(first_size, "1")
         position = self._position()
@@ -407,13 +421,17 @@ class _Decoder(_Generator):
         self._flush()
         self._settle()
         name, end = self._name(hint), self._name("end")
-        self._line(f"{end} = q + {size} - 1")
-        # Behind the message this is an IndexError. A string without even its NUL passes: the byte
-        # looked at is then the last of its size, which is 0.
-        self._line(f"if b[{end}]: raise ValueError")
+        if self._wire.terminator:
+            self._line(f"{end} = q + {size} - 1")
+            # Behind the message this is an IndexError. A string without even its NUL passes: the
+            # byte looked at is then the last of its size, which is 0.
+            self._line(f"if b[{end}]: raise ValueError")
+        else:
+            self._line(f"{end} = q + {size}")
+            self._line(f"if {end} > len(b): raise IndexError")
         self._line(f"{name} = b[q:{end}].decode()")
         self._terms.append(size)
-        self._phase = _ANYWHERE
+        self._phase = self._phase.lost()
         return name
 
     def _wide_string(self, hint: str) -> str:
@@ -422,7 +440,7 @@ class _Decoder(_Generator):
         name = self._name(hint)
         self._line(f"{name} = read_wide_string(b, {self._position()}, {count})")
         self._terms.append(f"{count} * 4")
-        self._phase = Phase(4, 0)
+        self._phase = self._phase.lost(4)
         return name
 
     def _array(self, array: Array, hint: str) -> str:
@@ -456,7 +474,7 @@ class _Decoder(_Generator):
 
     def _align(self, size: int, count: str) -> None:
         """Passes the padding before items, of which there may be none."""
-        if not self._is_aligned(size):
+        if not self._phase.is_aligned(size):
             self._settle()
             self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) & {size - 1}")
             self._phase = self._phase.align(size)
@@ -497,13 +515,14 @@ class _Decoder(_Generator):
 
 
 class _Encoder(_Generator):
-    """Writes `encode(message)`: the message in CDR, little endian."""
+    """Writes `encode(message)`: the message, in little endian."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(wire)
         # The header is the beginning of the first run.
-        self._run = [_Part(PRIMITIVES["uint8"], len(HEADER), "HEADER")]
-        self._phase = Phase(8, 8 - len(HEADER))
+        if wire.header:
+            self._run = [_Part(PRIMITIVES["uint8"], len(wire.header), "HEADER")]
+        self._phase = self._phase.advance(-len(wire.header))
         self._offset = 0
         self._pieces: list[str] = []  # expressions for bytes
         self._spilled = False
@@ -538,7 +557,7 @@ class _Encoder(_Generator):
             name = self._assign(hint, f"write_wide_string({source})")
             self._bound(f"len({name}) // 4", type_.bound)
             self._run.append(_Part(_COUNT, 1, f"len({name}) // 4"))
-            self._bytes(name, Phase(4, 0))
+            self._bytes(name, self._phase.lost(4))
         elif isinstance(type_, Array):
             self._array(type_, source, hint)
         else:
@@ -588,7 +607,7 @@ class _Encoder(_Generator):
         fields = description.fields
         if not fields:
             self._line(f"if {name} != {{}}: raise TypeError")
-            self._run.append(_Part(_PADDING, 1, ""))
+            self._fill(description)
             return
         # As many as there are, and each of them found below: none unknown, none missing.
         self._line(f"if len({name}) != {len(fields)}: raise KeyError")
@@ -597,11 +616,14 @@ class _Encoder(_Generator):
 
     def _string(self, string: String, source: str, hint: str) -> None:
         name = self._assign(hint, f"{source}.encode()")
-        self._line(f"if 0 in {name}: raise ValueError")
+        if self._wire.terminator:
+            self._line(f"if 0 in {name}: raise ValueError")
         self._bound(f"len({name})", string.bound)
-        self._run.append(_Part(_COUNT, 1, f"len({name}) + 1"))
-        self._bytes(name, _ANYWHERE)
-        self._run.append(_Part(_PADDING, 1, ""))  # its NUL
+        size = f"len({name}) + 1" if self._wire.terminator else f"len({name})"
+        self._run.append(_Part(_COUNT, 1, size))
+        self._bytes(name, self._phase.lost())
+        if self._wire.terminator:
+            self._run.append(_Part(_PADDING, 1, ""))
 
     def _array(self, array: Array, source: str, hint: str) -> None:
         item, length = array.item, array.length
@@ -653,7 +675,7 @@ class _Encoder(_Generator):
 
     def _align(self, size: int, items: str) -> None:
         """Writes the padding before items, of which there may be none."""
-        if not self._is_aligned(size):
+        if not self._phase.is_aligned(size):
             self._settle()
             padding = self._assign("padding", f"ZEROS[:(4 - q) & {size - 1}] if {items} else b''")
             self._bytes(padding, self._phase.align(size))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
-from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.definitions import CDR, TypeDescription, UnknownTypeError, Wire, describe
 
 
 class BusError(Exception):
@@ -111,15 +111,35 @@ class RosService(Protocol):
         """End it. On the ROS thread."""
 
 
+class ParameterServer(Protocol):
+    """The parameters of a whole bus. Its methods are for the ROS thread; all raise BusError."""
+
+    def names(self) -> list[str]:
+        """The full names of all parameters."""
+
+    def get(self, names: Sequence[str]) -> dict[str, Any]:
+        """The values of those that are there, as JSON knows values."""
+
+    def set(self, name: str, value: Any) -> None:
+        """Set one, which need not be there yet."""
+
+
 class RosNode(Protocol):
     """A node on the robot's bus, with a thread of its own: the ROS thread.
 
     `start`, `stop`, `call_soon` and `RosPublisher.publish` may be called from any thread, all else
-    only from inside the callbacks, which are called on the ROS thread.
+    only from inside the callbacks, which are called on the ROS thread. Only those of a subscription
+    may be called on another, one at a time.
+
+    What is called CDR here is what `wire` says: the bus's own serialized bytes.
     """
 
     #: The node's full name, such as `/appliance`.
     name: str
+    #: How messages are serialized on the bus.
+    wire: Wire
+    #: Where parameters are; None when every node keeps its own, and has services for them.
+    parameter_server: ParameterServer | None
 
     def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
         """Join the bus in the background and return at once.
@@ -157,8 +177,11 @@ class RosNode(Protocol):
     def subscribers(self, topic: str) -> list[Endpoint]:
         """The subscriptions of other nodes."""
 
-    def load(self, type_name: str) -> type[Any]:
-        """The message class of `std_msgs/msg/String`. Raises UnknownTypeError."""
+    def describe(self, type_name: str) -> TypeDescription:
+        """What `std_msgs/msg/String` is made of; may be asked from any thread.
+
+        Raises UnknownTypeError, and BusError when that is still to be found out.
+        """
 
     def subscribe_raw(
         self,
@@ -310,6 +333,9 @@ class FakeNode:
     on a real bus. `types` are the types that can be loaded; None: any, as an empty class.
     """
 
+    wire = CDR
+    parameter_server: ParameterServer | None = None
+
     def __init__(self, name: str = "/appliance", types: Mapping[str, type[Any]] | None = None):
         self.name = name
         self.types = types
@@ -451,7 +477,11 @@ class FakeNode:
     def subscribers(self, topic: str) -> list[Endpoint]:
         return [peer.endpoint for peer in self.remote_subscribers if peer.topic == topic]
 
+    def describe(self, type_name: str) -> TypeDescription:
+        return describe(self.load(type_name), self.load)
+
     def load(self, type_name: str) -> type[Any]:
+        """The class of a type. Raises UnknownTypeError."""
         if self.types is None:
             return type(type_name.rpartition("/")[2], (), {})
         if type_name not in self.types:

@@ -12,7 +12,7 @@ from appliance.ros.careful import ConversionError
 from appliance.ros.convert import NO_BINARY, Converter, image_format
 from appliance.ros.definitions import UnknownTypeError
 
-Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "binary"]
+Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
 Compression: TypeAlias = Literal["none", "zstd"]
 
 CONTENT_TYPE = {
@@ -20,8 +20,12 @@ CONTENT_TYPE = {
     "cbor": "application/cbor",
     "text": "text/plain",
     "cdr": "application/cdr",
+    "ros1": "application/x-ros1",
     "binary": "application/octet-stream",
 }
+
+#: ROS's own serialized bytes, of ROS 2 and of ROS 1.
+RAW = frozenset({"cdr", "ros1"})
 
 #: What a user property is called that names the compression, MQTT having no property for it.
 CONTENT_ENCODING = "content-encoding"
@@ -59,7 +63,8 @@ def packer(
 ) -> Callable[[bytes], tuple[bytes, Properties]]:
     """The function that makes payload and properties of a serialized message.
 
-    `about` are user properties. `converter` may be None for `cdr`. It raises ConversionError.
+    `about` are user properties. `converter` may be None for those of RAW. It raises
+    ConversionError.
     """
     if compression != "none":
         about = [*about, (CONTENT_ENCODING, compression)]
@@ -116,6 +121,7 @@ def unpacker(
         "text": converter.from_text,
         "binary": converter.from_binary,
         "cdr": converter.checked,
+        "ros1": converter.checked,
     }[encoding]
     if compression == "none":
         return unpack

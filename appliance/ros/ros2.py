@@ -15,11 +15,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from appliance.ros.definitions import UnknownTypeError, import_message
+from appliance.ros.definitions import (
+    CDR,
+    TypeDescription,
+    UnknownTypeError,
+    import_message,
+    load_description,
+)
 from appliance.ros.node import (
     BusError,
     Durability,
     Endpoint,
+    ParameterServer,
     QosProfile,
     Reliability,
     Respond,
@@ -91,6 +98,9 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
 
 class Ros2Node:
     """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
+
+    wire = CDR
+    parameter_server: ParameterServer | None = None
 
     def __init__(
         self,
@@ -254,8 +264,8 @@ class Ros2Node:
         endpoints = [_endpoint(info) for info in found]
         return [endpoint for endpoint in endpoints if endpoint.node != self.name]
 
-    def load(self, type_name: str) -> type[Any]:
-        return import_message(type_name)
+    def describe(self, type_name: str) -> TypeDescription:
+        return load_description(type_name)
 
     # Subscriptions and publishers
 

@@ -28,7 +28,6 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.calls import (
-    JSON,
     REPORT_INTERVAL,
     Answer,
     Call,
@@ -41,6 +40,7 @@ from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.payloads import CONTENT_TYPE, RAW
 from appliance.ros.requests import Key, Requests
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class ServiceSettings:
     to: Literal["ros", "mqtt"] = "ros"
     type: str | None = None
     timeout: float = 5.0
-    encoding: Literal["json", "cdr"] = "json"
+    encoding: Literal["json", "cdr", "ros1"] = "json"
     on_error: str | None = None
 
     @property
@@ -87,7 +87,7 @@ def to_request(
     """
     try:
         converter = converters.get(type_name)
-        if encoding == "cdr":
+        if encoding in RAW:
             return converter.checked(payload)
         return converter.from_json(payload or b"{}")
     except ConversionError as error:
@@ -210,8 +210,8 @@ class ServiceRoutes:
         request = to_request(self._converters, f"{type_name}_Request", call.payload, route.encoding)
         response = await self._requests.ask(name, type_name, request)
         response_type = f"{type_name}_Response"
-        if route.encoding == "cdr":
-            return Answer(response, response_type, "application/cdr")
+        if route.encoding in RAW:
+            return Answer(response, response_type, CONTENT_TYPE[route.encoding])
         return Answer(self._converters.get(response_type).to_json(response), response_type)
 
     def keys(self) -> Iterable[Key]:
@@ -358,13 +358,12 @@ class Provided:
             self._fail(respond, f"too_many: {len(self._asked)} requests are under way")
             return
         token = secrets.token_hex(8)
-        is_json = route.encoding == "json"
         message = Message(
             f"{self._base}/_request/{token}",
             payload,
             1,
             properties={
-                Property.CONTENT_TYPE: JSON if is_json else "application/cdr",
+                Property.CONTENT_TYPE: CONTENT_TYPE[route.encoding],
                 Property.RESPONSE_TOPIC: f"{self._base}/_response/{token}",
                 Property.CORRELATION_DATA: token.encode(),
                 Property.USER_PROPERTY: [("ros-type", self._request_type)],
