@@ -38,6 +38,8 @@ from appliance.control import Control, ControlError
 from appliance.listeners import Listeners
 from appliance.reload import Parts, Reload, ReloadError
 from appliance.ros.bridge import Bridge
+from appliance.ros.node import RosNode
+from appliance.ros.ros1 import Ros1Node
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
 from appliance.store import MemoryStore, SqliteStore
 from appliance.watch import watch
@@ -220,15 +222,17 @@ class App:
         if settings.bridge.bus == "none":
             return
         bridge = settings.bridge
-        use_fastdds_profile(os.environ)
+        arguments = (*bridge.ros_arguments, *self._ros_arguments)
+        node: RosNode
+        if bridge.bus == "ros1":
+            node = Ros1Node(bridge.node, bridge.namespace, arguments)
+        else:
+            use_fastdds_profile(os.environ)
+            node = Ros2Node(
+                bridge.node, bridge.namespace, bridge.domain_id, arguments, bridge.use_sim_time
+            )
         self.bridge = Bridge(
-            Ros2Node(
-                bridge.node,
-                bridge.namespace,
-                bridge.domain_id,
-                (*bridge.ros_arguments, *self._ros_arguments),
-                bridge.use_sim_time,
-            ),
+            node,
             self.broker,
             wiring.routes(settings),
             loop,

@@ -408,12 +408,6 @@ def _check_plugins(value: object) -> object:
     return {name: {} if settings is None else settings for name, settings in value.items()}
 
 
-def _check_bus(value: object) -> object:
-    if value == "ros1":
-        raise ValueError("ros1 is not in this version; use ros2 or none")
-    return value
-
-
 def _unquoted_off(value: object) -> object:
     return "off" if value is False else value  # off is a boolean in YAML 1.1
 
@@ -455,7 +449,7 @@ RosNames = Annotated[
     PlainSerializer(lambda names: names if isinstance(names, str) else list(names)),
 ]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
-Encoding = Literal["json", "cbor", "text", "cdr", "binary"]
+Encoding = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
 Level = Literal["debug", "info", "warning", "error"]
@@ -696,7 +690,7 @@ class ServiceRoute(_CalledRoute):
 
     to: Literal["ros", "mqtt"] = "ros"
     type: Annotated[str, AfterValidator(_check_service_type)] | None = None
-    encoding: Literal["json", "cdr"] = "json"
+    encoding: Literal["json", "cdr", "ros1"] = "json"
     on_error: Annotated[dict[str, Any], BeforeValidator(_check_response)] | None = None
 
 
@@ -740,7 +734,7 @@ class BridgeLimits(_Section):
 class Bridge(_Section):
     """The way between the robot's bus and the broker; `diagnostics` in seconds, 0 for none."""
 
-    bus: Annotated[Literal["ros2", "none"], BeforeValidator(_check_bus)] = "ros2"
+    bus: Literal["ros2", "ros1", "none"] = "ros2"
     node: Annotated[str, AfterValidator(_check_node)] = "appliance"
     namespace: Annotated[str, AfterValidator(_check_namespace)] = "/"
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None

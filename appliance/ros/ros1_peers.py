@@ -9,11 +9,12 @@ four bytes.
 
 from __future__ import annotations
 
+import base64
 import socket
 import struct
 import threading
 import xmlrpc.client
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from http.client import HTTPException
@@ -64,9 +65,7 @@ class Master:
 
     def call_each(self, method: str, calls: Iterable[tuple[Any, ...]]) -> list[Any]:
         """The values of many answers at once, None for what failed. Raises BusError."""
-        many = [
-            {"methodName": method, "params": (self._caller, *arguments)} for arguments in calls
-        ]
+        many = [{"methodName": method, "params": (self._caller, *arguments)} for arguments in calls]
         try:
             answers: Any = self._proxy.system.multicall(many) if many else []
             return [
@@ -82,6 +81,41 @@ def _value(answer: Any) -> Any:
     if code != 1:
         raise ValueError(text)
     return value
+
+
+class MasterParameters:
+    """The Master's parameters; a ParameterServer."""
+
+    def __init__(self, master: Master) -> None:
+        self._master = master
+
+    def names(self) -> list[str]:
+        return [str(name) for name in self._master.call("getParamNames")]
+
+    def get(self, names: Sequence[str]) -> dict[str, Any]:
+        values = self._master.call_each("getParam", [(name,) for name in names])
+        return {
+            name: _plain(value)
+            for name, value in zip(names, values, strict=True)
+            if value is not None  # it has gone meanwhile
+        }
+
+    def set(self, name: str, value: Any) -> None:
+        try:
+            self._master.call("setParam", name, value)
+        except OverflowError:
+            raise BusError("ROS 1 keeps integers of 32 bits only") from None
+
+
+def _plain(value: Any) -> Any:
+    """A value of XML-RPC as JSON knows it: bytes in base64, dates as their text."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, xmlrpc.client.Binary):
+        return base64.b64encode(value.data).decode()
+    return str(value) if isinstance(value, xmlrpc.client.DateTime) else value
 
 
 class Answers(Generic[_Answer]):

@@ -1,0 +1,634 @@
+"""The node on ROS 1: the only file that imports rospy, and that only when the node starts.
+
+rospy gives and takes messages as their bytes, through classes that have a type's name and MD5 sum
+and nothing else. It does not come back by itself when the Master was away or came anew: the state
+of the graph, which is asked for anyway, says when our registrations are missing from it, and they
+are made again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from importlib.util import find_spec
+from time import monotonic
+from typing import Any
+
+from appliance.ros.definitions import PACKED, TypeDescription, UnknownTypeError
+from appliance.ros.node import (
+    BusError,
+    Durability,
+    Endpoint,
+    ParameterServer,
+    QosProfile,
+    Respond,
+)
+from appliance.ros.ros1_peers import (
+    Answers,
+    Master,
+    MasterParameters,
+    ServiceCall,
+    ask_publisher,
+    ask_service,
+)
+from appliance.ros.ros1_types import (
+    Definition,
+    ServiceDefinition,
+    describe,
+    full_name,
+    installed,
+    installed_service,
+)
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at the graph, of which the Master does not tell changes.
+POLL_INTERVAL = 0.2
+
+#: Seconds between two attempts to find a Master at the start.
+KNOCK_INTERVAL = 0.5
+
+#: Seconds that rospy may take to leave the bus.
+LEAVE_TIME = 5.0
+
+DEFAULT_MASTER = "http://localhost:11311"
+
+#: Messages of a publisher that are held until it is seen to be latched.
+HELD = 10
+
+#: Names of topics or services, and the nodes that have them.
+_Graph = dict[str, list[str]]
+
+
+def available() -> tuple[bool, str]:
+    """Whether a node can be started here, and if not, one line that says why and what to do."""
+    if find_spec("rospy") is None:
+        return False, (
+            "there is no ROS 1 here: rospy cannot be imported. Source a ROS 1 setup file first, or "
+            "apt install python3-rospy, and install the appliance for the system's Python: "
+            "/usr/bin/python3 -m venv --system-site-packages"
+        )
+    return True, ""
+
+
+class Ros1Node:
+    """A RosNode on ROS 1. There can be one in the life of a process: rospy starts only once.
+
+    Messages come on threads of rospy's, one at a time for each subscription.
+    """
+
+    wire = PACKED
+
+    def __init__(
+        self, name: str = "appliance", namespace: str = "/", arguments: Sequence[str] = ()
+    ) -> None:
+        """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
+        self.name = f"{namespace.rstrip('/')}/{name}"
+        self.parameter_server: ParameterServer | None = None
+        self._base_name = name
+        self._namespace = namespace
+        self._arguments = [argument for argument in arguments if ":=" in argument]
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._is_running = False
+        self._rospy: Any = None
+        self._uri = ""
+        self._master: Master
+        self._is_away = False
+        # The graph, as of the last look.
+        self._publishers: _Graph = {}
+        self._subscribers: _Graph = {}
+        self._servers: _Graph = {}
+        self._types: dict[str, str] = {}
+        #: Topic and node of the publishers that have said to be latched.
+        self._latched: set[tuple[str, str]] = set()
+        #: Definitions of types that are not installed, and the types of services.
+        self._definitions: Answers[Definition] = Answers()
+        self._service_types: Answers[str] = Answers()
+        self._told: dict[str, Definition] = {}
+        #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
+        self._holding: dict[_Subscription, None] = {}
+        self._complained: set[str] = set()
+
+    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        is_available, reason = available()
+        if not is_available:
+            failed(reason)
+            return
+        self._thread = threading.Thread(
+            target=self._run, args=(poll, failed), name="ros", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._work.put(lambda: None)
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        thread.join(LEAVE_TIME)
+        if thread.is_alive():
+            # It waits for a Master that does not answer, with a socket that has no time limit.
+            log.warning("ROS is left without a word: the Master does not answer")
+
+    def _run(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        reason = ""
+        try:
+            if self._join():
+                self._is_running = True
+                self._spin(poll)
+        except Exception as error:
+            # The thread's end, whatever ended it: it must be told, and the bus be left in order.
+            log.debug("the ROS thread ended", exc_info=True)
+            reason = (
+                str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
+            )
+        finally:
+            self._is_running = False
+            self._leave()
+        if reason:
+            failed(reason)
+
+    def _join(self) -> bool:
+        """Wait for the Master and become a node; False when the stop came first."""
+        os.environ.setdefault("ROS_MASTER_URI", DEFAULT_MASTER)
+        if self._namespace != "/":
+            os.environ["ROS_NAMESPACE"] = self._namespace
+        import rospy
+
+        if rospy.core.is_shutdown():
+            raise BusError("rospy starts once in a process: restart the appliance")
+        self._master = Master(os.environ["ROS_MASTER_URI"], self.name)
+        if not self._await_master():
+            return False
+        # rospy would take over the logging of the whole process.
+        rospy.core.configure_logging = lambda *_, **__: None
+        rospy.init_node(
+            self._base_name,
+            argv=["appliance", *self._arguments],
+            # What this node logs would be a message on a topic that may itself be bridged.
+            disable_rosout=True,
+            disable_signals=True,
+        )
+        self._rospy = rospy
+        self.name = rospy.get_name()
+        self._uri = rospy.core.get_node_uri()
+        self._master = Master(os.environ["ROS_MASTER_URI"], self.name)
+        self.parameter_server = MasterParameters(self._master)
+        return True
+
+    def _await_master(self) -> bool:
+        while not self._stopping.is_set():
+            try:
+                self._master.call("getPid")
+            except BusError as error:
+                if not self._is_away:
+                    self._is_away = True
+                    log.warning("waiting for the ROS Master: %s", error)
+                self._stopping.wait(KNOCK_INTERVAL)
+            else:
+                self._is_away = False
+                return True
+        return False
+
+    def _spin(self, poll: Callable[[], None]) -> None:
+        while not self._stopping.is_set():
+            if self._rospy.is_shutdown():
+                raise BusError(
+                    f"{self.name} was shut down from outside: by `rosnode kill`, or by another "
+                    "node of the same name. Restart the appliance; bridge.node names its node"
+                )
+            if self._see():
+                holding = list(self._holding)
+                poll()
+                for subscription in holding:
+                    subscription.release()
+            self._do_work(monotonic() + POLL_INTERVAL)
+
+    def _do_work(self, until: float) -> None:
+        while not self._stopping.is_set():
+            try:
+                callback = self._work.get(timeout=max(0.0, until - monotonic()))
+            except queue.Empty:
+                return
+            try:
+                callback()
+            except Exception:  # it must not end the thread
+                log.exception("a fault on the ROS thread")
+
+    def _leave(self) -> None:
+        self._definitions.close()
+        self._service_types.close()
+        if self._rospy is not None:
+            self._rospy.signal_shutdown("the appliance stops")
+
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        if not self._is_running:
+            raise BusError("ROS is not ready")
+        self._work.put(callback)
+
+    # The graph
+
+    def _see(self) -> bool:
+        """Look at the graph; False when there is none to be seen."""
+        try:
+            state = [dict(found) for found in self._master.call("getSystemState")]
+            if state != [self._publishers, self._subscribers, self._servers]:
+                types = dict(self._master.call("getTopicTypes"))
+                self._types = {
+                    topic: full_name(name) for topic, name in types.items() if name != "*"
+                }
+                self._publishers, self._subscribers, self._servers = state
+                there = {(topic, node) for topic in state[0] for node in state[0][topic]}
+                self._latched = self._latched & there
+                self._definitions.keep(there)
+            self._register_missing()
+        except BusError as error:
+            if not self._is_away:
+                self._is_away = True
+                log.warning("the ROS Master does not answer; what is connected stays so: %s", error)
+            return False
+        if self._is_away:
+            self._is_away = False
+            log.info("the ROS Master is back at %s", self._master.uri)
+        return True
+
+    def _register_missing(self) -> None:
+        """Tell the Master what we have that it does not know of: it has come anew."""
+        from rospy.impl.registration import get_service_manager, get_topic_manager
+
+        topics = get_topic_manager()
+        master, count = self._master, 0
+        for topic, type_name in topics.get_publications():
+            if self.name not in self._publishers.get(topic, ()):
+                master.call("registerPublisher", topic, type_name, self._uri)
+                count += 1
+        for topic, type_name in topics.get_subscriptions():
+            if self.name not in self._subscribers.get(topic, ()):
+                uris = master.call("registerSubscriber", topic, type_name, self._uri)
+                # As the Master tells it later, of others that come.
+                Master(self._uri, self.name).call("publisherUpdate", topic, uris)
+                count += 1
+        for service, uri in get_service_manager().get_services():
+            if service not in self._servers:
+                master.call("registerService", service, uri, self._uri)
+                count += 1
+        if count:
+            log.info("registered with the ROS Master anew: %d topics and services", count)
+
+    def now(self) -> int:
+        rospy = self._rospy
+        if rospy is None or rospy.rostime.is_wallclock():
+            return time.time_ns()
+        return int(rospy.rostime.get_rostime().to_nsec()) or time.time_ns()
+
+    def topics(self) -> dict[str, list[str]]:
+        return {
+            topic: [self._types[topic]]
+            for topic in self._publishers | self._subscribers
+            if topic in self._types
+        }
+
+    def services(self) -> dict[str, list[str]]:
+        found = {}
+        for service, nodes in self._servers.items():
+            key = service, *nodes
+            ask = partial(ask_service, self._master.uri, self.name, service)
+            try:
+                name = self._service_types.get(key, ask)
+            except BusError as error:  # its node has ended without a word, most often
+                log.debug("%s is left out: %s", service, error)
+                continue
+            if name is not None:
+                found[service] = [full_name(name, "srv")]
+        self._service_types.keep({(service, *nodes) for service, nodes in self._servers.items()})
+        return found
+
+    def count(self, topic: str) -> tuple[int, int]:
+        topic = self._resolve(topic)
+        # One that has said to be latched counts twice, so that it is seen to be another now.
+        latched = sum(1 for name, _ in self._latched if name == topic)
+        publishers = len(self._publishers.get(topic, ())) + latched
+        return publishers, len(self._subscribers.get(topic, ()))
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        topic = self._resolve(topic)
+        return [
+            Endpoint(
+                node,
+                type_name,
+                QosProfile(
+                    durability=Durability.TRANSIENT_LOCAL
+                    if (topic, node) in self._latched
+                    else Durability.VOLATILE,
+                    depth=1,
+                ),
+            )
+            for node, type_name in self._others(self._publishers, topic)
+            if self._is_known(type_name, node, topic)
+        ]
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        topic = self._resolve(topic)
+        return [
+            Endpoint(node, type_name, QosProfile(depth=0))
+            for node, type_name in self._others(self._subscribers, topic)
+        ]
+
+    def _others(self, graph: _Graph, topic: str) -> list[tuple[str, str]]:
+        type_name = self._types.get(topic)
+        if type_name is None:
+            return []
+        return [(node, type_name) for node in graph.get(topic, ()) if node != self.name]
+
+    def _is_known(self, type_name: str, node: str, topic: str) -> bool:
+        """Whether it is known what the type is made of, or that it cannot be: one that is not
+        installed here is asked for."""
+        with suppress(UnknownTypeError):
+            self._definition(type_name)
+            return True
+        ask = partial(ask_publisher, self._master.uri, self.name, node, topic)
+        try:
+            told = self._definitions.get((topic, node), ask)
+        except BusError as error:
+            self._complain(f"{type_name} is not installed here, and not told: {error}")
+            return True
+        if told is not None:
+            self._told[type_name] = told
+        return told is not None
+
+    def _complain(self, text: str) -> None:
+        if text not in self._complained:
+            self._complained.add(text)
+            log.warning("%s", text)
+
+    def _definition(self, type_name: str) -> Definition:
+        told = self._told.get(type_name)
+        return told if told is not None else _installed(type_name)
+
+    def describe(self, type_name: str) -> TypeDescription:
+        return describe(type_name, self._definition(type_name).text)
+
+    def _resolve(self, name: str) -> str:
+        return str(self._rospy.resolve_name(name)) if self._arguments else name
+
+    # Subscriptions and publishers
+
+    def subscribe_raw(
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        *,
+        timed: bool = False,
+    ) -> _Subscription:
+        is_latched = qos.durability is Durability.TRANSIENT_LOCAL
+        message_class = _message_class(self._definition(type_name))
+        return _Subscription(self, self._resolve(topic), message_class, is_latched, callback)
+
+    def hear(self, topic: str, node: str, is_latched: bool) -> bool:
+        """What a publisher says of itself; whether that is news."""
+        key = topic, node
+        if is_latched == (key in self._latched):
+            return False
+        # Replaced, because the ROS thread goes through it.
+        self._latched = self._latched | {key} if is_latched else self._latched - {key}
+        return True
+
+    def hold(self, subscription: _Subscription) -> None:
+        """Have it release what it holds after the next look."""
+        self._holding[subscription] = None
+
+    def let_go(self, subscription: _Subscription) -> None:
+        """It holds nothing any more."""
+        self._holding.pop(subscription, None)
+
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
+        message_class = _message_class(self._definition(type_name))
+        return _Publisher(self._rospy, topic, message_class, qos)
+
+    # Services
+
+    def create_client(self, service: str, type_name: str) -> _Client:
+        return _Client(self, self._resolve(service), installed_service(type_name))
+
+    @property
+    def master_uri(self) -> str:
+        """Where the Master is."""
+        return self._master.uri
+
+    def is_served(self, service: str) -> bool:
+        """Whether a service is on the graph."""
+        return service in self._servers
+
+    def create_service(
+        self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
+    ) -> _Service:
+        definition = installed_service(type_name)
+        return _Service(self._rospy, service, definition, callback, self.call_soon)
+
+
+@cache
+def _installed(type_name: str) -> Definition:
+    return installed(type_name)
+
+
+@cache
+def _message_class(definition: Definition) -> Any:
+    """What rospy takes for the class of a type, and has its bytes only."""
+    from rospy import AnyMsg
+
+    attributes = {
+        "__slots__": [],
+        "_type": definition.name,
+        "_md5sum": definition.md5sum,
+        "_full_text": definition.text,
+    }
+    return type("Raw", (AnyMsg,), attributes)
+
+
+@cache
+def _service_class(definition: ServiceDefinition) -> Any:
+    attributes = {
+        "_type": definition.name,
+        "_md5sum": definition.md5sum,
+        "_request_class": _message_class(definition.request),
+        "_response_class": _message_class(definition.response),
+    }
+    return type("RawService", (), attributes)
+
+
+def _of(message_class: Any, data: bytes) -> Any:
+    message = message_class()
+    message._buff = data
+    return message
+
+
+class _Subscription:
+    """What latched publishers send is retained on MQTT, and only with a message it is told that one
+    is latched. The first of them is held until the graph was looked at again: most often the
+    subscription is then made anew, and the message comes once more."""
+
+    def __init__(
+        self,
+        node: Ros1Node,
+        topic: str,
+        message_class: Any,
+        is_latched: bool,
+        callback: Callable[..., None],
+    ) -> None:
+        import rospy
+
+        self._node = node
+        self._topic = topic
+        self._class = message_class
+        self._is_latched = is_latched
+        self._callback = callback
+        self._lock = threading.Lock()
+        self._is_over = False
+        self._held: deque[bytes] = deque(maxlen=HELD)
+        self._own = rospy.Subscriber(topic, message_class, self._on_message, tcp_nodelay=True)
+        if self._own.impl.data_class is not message_class:
+            self.destroy()
+            raise BusError(f"another route receives {topic} as {self._own.impl.type}")
+
+    def _on_message(self, message: Any) -> None:
+        header: Mapping[str, str] = message._connection_header
+        is_latched = header.get("latching") == "1"
+        with self._lock:
+            if self._is_over:
+                return
+            is_news = self._node.hear(self._topic, header.get("callerid", ""), is_latched)
+            if is_latched and not self._is_latched and (is_news or self._held):
+                self._held.append(message._buff)
+                self._node.hold(self)
+            else:
+                self._callback(message._buff)
+
+    def release(self) -> None:
+        """Hand on what was held: not all publishers are latched, so that this one stays."""
+        self._node.let_go(self)
+        with self._lock:
+            while self._held and not self._is_over:
+                self._callback(self._held.popleft())
+
+    def destroy(self) -> None:
+        with self._lock:
+            self._is_over = True
+        self._node.let_go(self)
+        self._own.unregister()
+
+
+class _Publisher:
+    def __init__(self, rospy: Any, topic: str, message_class: Any, qos: QosProfile) -> None:
+        self._class = message_class
+        self._refusals = (rospy.ROSException, rospy.ROSSerializationException, OSError)
+        self._own = rospy.Publisher(
+            topic,
+            message_class,
+            latch=qos.durability is Durability.TRANSIENT_LOCAL,
+            tcp_nodelay=True,
+            # A subscriber that does not read loses the oldest, and stops nobody.
+            queue_size=qos.depth,
+        )
+        if self._own.impl.data_class is not message_class:
+            other = self._own.impl.type
+            self._own.unregister()
+            raise BusError(f"another route publishes {topic} as {other}")
+
+    def publish(self, cdr: bytes) -> None:
+        try:
+            self._own.publish(_of(self._class, cdr))
+        except self._refusals as error:
+            raise BusError(str(error)) from error
+
+    def destroy(self) -> None:
+        self._own.unregister()
+
+
+class _Client:
+    def __init__(self, node: Ros1Node, service: str, definition: ServiceDefinition) -> None:
+        self._node = node
+        self._service = service
+        self._definition = definition
+        self._calls: set[ServiceCall] = set()
+
+    def is_ready(self) -> bool:
+        return self._node.is_served(self._service)
+
+    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
+        node = self._node
+
+        def finish(result: bytes | BusError) -> None:
+            if call in self._calls:
+                self._calls.discard(call)
+                done(result)
+
+        def tell(result: bytes | BusError) -> None:
+            with suppress(BusError):
+                node.call_soon(partial(finish, result))
+
+        def give_up() -> None:
+            self._calls.discard(call)
+            call.give_up()
+
+        call = ServiceCall(
+            node.master_uri, node.name, self._service, self._definition, request, tell
+        )
+        self._calls.add(call)
+        return give_up
+
+    def destroy(self) -> None:
+        for call in self._calls:
+            call.give_up()
+        self._calls.clear()
+
+
+class _Service:
+    """rospy waits for each answer on a thread of its own."""
+
+    def __init__(
+        self,
+        rospy: Any,
+        name: str,
+        definition: ServiceDefinition,
+        callback: Callable[[bytes, Respond], None],
+        call_soon: Callable[[Callable[[], None]], None],
+    ) -> None:
+        self._error = rospy.ServiceException
+        self._response_class = _message_class(definition.response)
+        self._callback = callback
+        self._call_soon = call_soon
+        self._waiting: set[queue.SimpleQueue[bytes | None]] = set()
+        try:
+            self._own = rospy.Service(name, _service_class(definition), self._take)
+        except rospy.ServiceException as error:
+            raise BusError(str(error)) from error
+
+    def _take(self, request: Any) -> Any:
+        answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._waiting.add(answer)
+        try:
+            self._call_soon(partial(self._callback, request._buff, answer.put))
+            response = answer.get()
+        except BusError as error:
+            raise self._error(str(error)) from error
+        finally:
+            self._waiting.discard(answer)
+        if response is None:
+            raise self._error("nobody on MQTT answered")
+        return _of(self._response_class, response)
+
+    def destroy(self) -> None:
+        self._own.shutdown("its route has ended")
+        for answer in list(self._waiting):
+            answer.put(None)
