@@ -196,9 +196,14 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
     bridge = settings.bridge
     if bridge.bus == "none":
         yield Finding("ok", "bridge", "off: a broker alone")
-    elif importlib.util.find_spec("rclpy") is None:
+    elif importlib.util.find_spec("rospy" if bridge.bus == "ros1" else "rclpy") is None:
         text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
+        if bridge.bus == "ros1":
+            text = (
+                "no ROS 1 here: source one, or apt install python3-rospy; the broker runs without"
+            )
         yield Finding("warning", "bridge", text)
     else:
         called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
-        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics) + called}")
+        found = f"ROS {bridge.bus[-1]} found; routes: {len(bridge.topics) + called}"
+        yield Finding("ok", "bridge", found)

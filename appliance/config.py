@@ -314,15 +314,20 @@ def _check_called(value: str) -> str:
     return _excluded(value) + _check_ros_pattern(value.removeprefix("!"))
 
 
+#: How a parameter is named.
+OF_NODE = (
+    "must be a node's full name, '/', and a parameter's: /arm/speed, /arm/* for all of /arm, /**/* "
+    "for all of every node"
+)
+
+
 def _check_parameters(value: str) -> str:
     """The full name of a node, `/`, and the name of a parameter; all may be patterns."""
     node, _, name = value.removeprefix("!").rpartition("/")
-    if not node or not re.fullmatch(r"[\w.*-]+", name):
-        raise ValueError(
-            "must be a node's full name, '/', and a parameter's: /arm/speed, /arm/* for all of "
-            "/arm, /**/* for all of every node"
-        )
-    return f"{_excluded(value)}{_check_ros_pattern(node)}/{name}"
+    # Of ROS 1, /speed is a parameter that is no node's.
+    if not re.fullmatch(r"[\w.*-]+", name) or not value.removeprefix("!").startswith("/"):
+        raise ValueError(OF_NODE)
+    return f"{_excluded(value)}{_check_ros_pattern(node) if node else ''}/{name}"
 
 
 def _excluded(value: str) -> str:
@@ -866,6 +871,30 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)
+    yield from _cross_check_bus(settings.bridge)
+
+
+def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    """What ROS 1 and ROS 2 do not have in common."""
+    is_ros1 = bridge.bus == "ros1"
+    foreign, own = ("cdr", "ros1") if is_ros1 else ("ros1", "cdr")
+    sections: tuple[tuple[str, Sequence[TopicRoute | ServiceRoute]], ...] = (
+        ("topics", bridge.topics),
+        ("services", bridge.services),
+    )
+    for section, routes in sections:
+        for number, route in enumerate(routes):
+            if route.encoding == foreign:
+                text = f"must be {own}: that is what ROS's own bytes are with bus: {bridge.bus}"
+                yield ("bridge", section, number, "encoding"), text
+    for number, parameter in enumerate(bridge.parameters):
+        if not is_ros1 and not parameter.node.removeprefix("!"):
+            yield ("bridge", "parameters", number, "ros"), OF_NODE
+    ros2_only = {"domain_id": bridge.domain_id is not None, "use_sim_time": bridge.use_sim_time}
+    for key, is_set in ros2_only.items():
+        if is_ros1 and is_set:
+            instead = "ROS_MASTER_URI" if key == "domain_id" else "the parameter /use_sim_time"
+            yield ("bridge", key), f"is for ROS 2 only; in ROS 1 it is {instead}"
 
 
 def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:

@@ -117,7 +117,7 @@ broker:
   users: 3
   users: users.passwd
 bridge:
-  bus: ros1
+  bus: ros3
   topics:
     - {ros: odom, to: mqt}
     - {to: mqtt, type: std_msgs/String, mqtt: "{foo}/x"}
@@ -140,7 +140,7 @@ log: {level: warn}
         "11: broker.limits.inflight: must be at least 1",
         "12: broker.users: must be a path",
         "13: broker.users: is given twice; the first is on line 12",
-        "15: bridge.bus: ros1 is not in this version",
+        "15: bridge.bus: must be ros2, ros1 or none; did you mean 'ros2'?",
         "17: bridge.topics[0].ros: must be a full ROS name",
         "17: bridge.topics[0].to: must be mqtt, ros or both; did you mean 'mqtt'?",
         "18: bridge.topics[1].ros: is needed",

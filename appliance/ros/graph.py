@@ -17,6 +17,7 @@ from appliance.ros.calls import CallCounters, CallLimits, Switchboard
 from appliance.ros.convert import Converters
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.parameter_server import ServerParameters
 from appliance.ros.parameters import ParameterRoutes, ParameterSettings
 from appliance.ros.requests import Requests
 from appliance.ros.services import ServiceRoutes, ServiceSettings
@@ -77,7 +78,13 @@ class Calls:
         self._actions = ActionRoutes(
             self.board, self._requests, converters, node, loop, post, mailbox
         )
-        self._parameters = ParameterRoutes(self.board, self._requests, converters, node, loop, post)
+        self._parameters: ParameterRoutes | ServerParameters
+        if node.parameter_server is not None:
+            self._parameters = ServerParameters(self.board, node, loop, post, announce)
+        else:
+            self._parameters = ParameterRoutes(
+                self.board, self._requests, converters, node, loop, post
+            )
 
     def replace(self, routes: CallRoutes) -> None:
         """Have these routes from now on; one that was there before does not notice."""

@@ -168,10 +168,10 @@ class ParameterRoutes:
 
         async def set_one(call: Call) -> Answer:
             parameter = call.topic.split("/")[-2]
-            return await self._set(node, {parameter: _json(call.payload)}, at_once=False)
+            return await self._set(node, {parameter: from_json(call.payload)}, at_once=False)
 
         async def set_all(call: Call) -> Answer:
-            values = _json(call.payload)
+            values = from_json(call.payload)
             if not isinstance(values, dict) or not values:
                 raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
             return await self._set(node, values, at_once=True)
@@ -378,7 +378,7 @@ class ParameterRoutes:
         self._subscription = None
 
 
-def _json(payload: bytes) -> Any:
+def from_json(payload: bytes) -> Any:
     try:
         return orjson.loads(payload)
     except orjson.JSONDecodeError as error:
@@ -444,13 +444,13 @@ def _type_of(name: str, value: Any) -> int:
             return kind
         if isinstance(value, list) and value and all(_is(kind, item) for item in value):
             return kind + 5
-    raise CallError("bad_request", f"{name}: no parameter can have the value {_short(value)}")
+    raise CallError("bad_request", f"{name}: no parameter can have the value {shorten(value)}")
 
 
 def _unlike(name: str, expected: str, value: Any) -> CallError:
-    return CallError("bad_request", f"{name}: expected {expected}, got {_short(value)}")
+    return CallError("bad_request", f"{name}: expected {expected}, got {shorten(value)}")
 
 
-def _short(value: Any) -> str:
+def shorten(value: Any) -> str:
     text = orjson.dumps(value).decode()
     return text if len(text) <= 60 else f"{text[:60]}…"

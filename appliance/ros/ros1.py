@@ -91,7 +91,8 @@ class Ros1Node:
     ) -> None:
         """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
         self.name = f"{namespace.rstrip('/')}/{name}"
-        self.parameter_server: ParameterServer | None = None
+        self._master = Master(os.environ.get("ROS_MASTER_URI", DEFAULT_MASTER), self.name)
+        self.parameter_server: ParameterServer | None = MasterParameters(self._master)
         self._base_name = name
         self._namespace = namespace
         self._arguments = [argument for argument in arguments if ":=" in argument]
@@ -101,7 +102,6 @@ class Ros1Node:
         self._is_running = False
         self._rospy: Any = None
         self._uri = ""
-        self._master: Master
         self._is_away = False
         # The graph, as of the last look.
         self._publishers: _Graph = {}
@@ -159,14 +159,13 @@ class Ros1Node:
 
     def _join(self) -> bool:
         """Wait for the Master and become a node; False when the stop came first."""
-        os.environ.setdefault("ROS_MASTER_URI", DEFAULT_MASTER)
+        os.environ["ROS_MASTER_URI"] = self._master.uri
         if self._namespace != "/":
             os.environ["ROS_NAMESPACE"] = self._namespace
         import rospy
 
         if rospy.core.is_shutdown():
             raise BusError("rospy starts once in a process: restart the appliance")
-        self._master = Master(os.environ["ROS_MASTER_URI"], self.name)
         if not self._await_master():
             return False
         # rospy would take over the logging of the whole process.
@@ -181,8 +180,7 @@ class Ros1Node:
         self._rospy = rospy
         self.name = rospy.get_name()
         self._uri = rospy.core.get_node_uri()
-        self._master = Master(os.environ["ROS_MASTER_URI"], self.name)
-        self.parameter_server = MasterParameters(self._master)
+        self._master.caller = self.name
         return True
 
     def _await_master(self) -> bool:

@@ -53,19 +53,19 @@ class Master:
 
     def __init__(self, uri: str, caller: str) -> None:
         self.uri = uri
-        self._caller = caller
+        self.caller = caller
         self._proxy = xmlrpc.client.ServerProxy(uri, _Transport())
 
     def call(self, method: str, *arguments: Any) -> Any:
         """The value of an answer. Raises BusError, also when it says that it failed."""
         try:
-            return _value(getattr(self._proxy, method)(self._caller, *arguments))
+            return _value(getattr(self._proxy, method)(self.caller, *arguments))
         except (OSError, HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
             raise BusError(f"{self.uri}: {error}") from error
 
     def call_each(self, method: str, calls: Iterable[tuple[Any, ...]]) -> list[Any]:
         """The values of many answers at once, None for what failed. Raises BusError."""
-        many = [{"methodName": method, "params": (self._caller, *arguments)} for arguments in calls]
+        many = [{"methodName": method, "params": (self.caller, *arguments)} for arguments in calls]
         try:
             answers: Any = self._proxy.system.multicall(many) if many else []
             return [

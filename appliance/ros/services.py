@@ -46,7 +46,9 @@ from appliance.ros.requests import Key, Requests
 log = logging.getLogger(__name__)
 
 #: What every node offers; they are called only where a route names them.
-_OF_EVERY_NODE = re.compile(r"(rcl_interfaces|type_description_interfaces)/srv/.*")
+_OF_EVERY_NODE = re.compile(
+    r"(rcl_interfaces|type_description_interfaces)/srv/.*|roscpp/srv/(GetLoggers|SetLoggerLevel)"
+)
 
 Post = Callable[..., None]
 
