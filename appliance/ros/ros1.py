@@ -14,7 +14,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from importlib.util import find_spec
@@ -29,6 +29,15 @@ from appliance.ros.node import (
     ParameterServer,
     QosProfile,
     Respond,
+    RosClient,
+    RosSubscription,
+)
+from appliance.ros.ros1_actions import (
+    HIDDEN,
+    Actions,
+    describe_action,
+    find_actions,
+    services_of,
 )
 from appliance.ros.ros1_peers import (
     Answers,
@@ -108,6 +117,9 @@ class Ros1Node:
         self._subscribers: _Graph = {}
         self._servers: _Graph = {}
         self._types: dict[str, str] = {}
+        #: The types of the actions that have a server.
+        self._actions: dict[str, str] = {}
+        self._action_clients = Actions(self)
         #: Topic and node of the publishers that have said to be latched.
         self._latched: set[tuple[str, str]] = set()
         #: Definitions of types that are not installed, and the types of services.
@@ -245,6 +257,7 @@ class Ros1Node:
                     topic: full_name(name) for topic, name in types.items() if name != "*"
                 }
                 self._publishers, self._subscribers, self._servers = state
+                self._actions = find_actions(self._types, self._publishers)
                 there = {(topic, node) for topic in state[0] for node in state[0][topic]}
                 self._latched = self._latched & there
                 self._definitions.keep(there)
@@ -296,7 +309,7 @@ class Ros1Node:
         }
 
     def services(self) -> dict[str, list[str]]:
-        found = {}
+        found = services_of(self._actions)
         for service, nodes in self._servers.items():
             key = service, *nodes
             ask = partial(ask_service, self._master.uri, self.name, service)
@@ -311,7 +324,7 @@ class Ros1Node:
         return found
 
     def count(self, topic: str) -> tuple[int, int]:
-        topic = self._resolve(topic)
+        topic = self._resolve(topic.replace(HIDDEN, "/"))
         # One that has said to be latched counts twice, so that it is seen to be another now.
         latched = sum(1 for name, _ in self._latched if name == topic)
         publishers = len(self._publishers.get(topic, ())) + latched
@@ -373,6 +386,9 @@ class Ros1Node:
         return told if told is not None else _installed(type_name)
 
     def describe(self, type_name: str) -> TypeDescription:
+        action = describe_action(type_name, self.describe)
+        if action is not None:
+            return action
         return describe(type_name, self._definition(type_name).text)
 
     def _resolve(self, name: str) -> str:
@@ -388,7 +404,9 @@ class Ros1Node:
         callback: Callable[..., None],
         *,
         timed: bool = False,
-    ) -> _Subscription:
+    ) -> RosSubscription:
+        if HIDDEN in topic:
+            return self._action_clients.subscribe(topic, type_name, callback)
         is_latched = qos.durability is Durability.TRANSIENT_LOCAL
         message_class = _message_class(self._definition(type_name))
         return _Subscription(self, self._resolve(topic), message_class, is_latched, callback)
@@ -416,7 +434,17 @@ class Ros1Node:
 
     # Services
 
-    def create_client(self, service: str, type_name: str) -> _Client:
+    def action_type(self, action: str) -> str | None:
+        """The type `pkg/action/Name` of an action, None when it has no server."""
+        return self._actions.get(action)
+
+    def action_servers(self, action: str) -> list[str]:
+        """The nodes that serve an action."""
+        return self._publishers.get(f"{action}/result", [])
+
+    def create_client(self, service: str, type_name: str) -> RosClient:
+        if HIDDEN in service:
+            return self._action_clients.create_client(service, type_name)
         return _Client(self, self._resolve(service), installed_service(type_name))
 
     @property
@@ -548,6 +576,10 @@ class _Publisher:
             self._own.publish(_of(self._class, cdr))
         except self._refusals as error:
             raise BusError(str(error)) from error
+
+    def reaches(self, nodes: Iterable[str]) -> bool:
+        """Whether one of these nodes is connected."""
+        return any(map(self._own.impl.has_connection, nodes))
 
     def destroy(self) -> None:
         self._own.unregister()

@@ -41,7 +41,7 @@ _FIELD = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,9})\])?\s+([A-Za-z]\w*)\s*(=?)"
 _SEPARATOR = re.compile(r"^={80}$", re.MULTILINE)
 
 # Both are two numbers of four bytes, which ROS 2 calls differently.
-_TIMES: dict[str, ItemType] = {
+_TIMES: dict[str, TypeDescription] = {
     name: TypeDescription(
         full_name,
         (Field("sec", PRIMITIVES[number]), Field("nanosec", PRIMITIVES[number])),
@@ -52,6 +52,9 @@ _TIMES: dict[str, ItemType] = {
         ("duration", "builtin_interfaces/msg/Duration", "int32"),
     )
 }
+
+#: What a time is.
+STAMP = _TIMES["time"]
 
 #: byte is an old name of int8, and char of uint8.
 _BUILT_IN: dict[str, ItemType] = {
