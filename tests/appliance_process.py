@@ -55,6 +55,8 @@ class BrokerProcess:
     """
 
     name: str
+    #: What its environment has beside that of the tests.
+    environment: Mapping[str, str] = {}
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -73,7 +75,8 @@ class BrokerProcess:
 
     def _run(self, arguments: list[str | Path]) -> None:
         self._ended = False
-        environment = os.environ | {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        more = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        environment = {**os.environ, **more, **self.environment}
         self._process = subprocess.Popen(
             arguments,
             stdin=subprocess.DEVNULL,
@@ -161,6 +164,7 @@ class ApplianceProcess(BrokerProcess):
     """
 
     name = "appliance"
+    python = sys.executable
 
     def __init__(
         self,
@@ -194,7 +198,7 @@ class ApplianceProcess(BrokerProcess):
         """Start it; the ports are those that the system gave it."""
         listening = r"listening on \S+:(\d+)$"
         before = len(re.findall(listening, self.log, re.MULTILINE))
-        self._run([sys.executable, "-m", "appliance", "run", "-c", self.config])
+        self._run([self.python, "-m", "appliance", "run", "-c", self.config])
         try:
             self.wait_for_log(listening, before + 2)
         except AssertionError:

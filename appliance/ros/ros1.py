@@ -251,9 +251,12 @@ class Ros1Node:
         """Look at the graph; False when there is none to be seen."""
         try:
             state = [dict(found) for found in self._master.call("getSystemState")]
+            self._register_missing(*state)
+            connected = self._add_connected(*state[:2])
             if state != [self._publishers, self._subscribers, self._servers]:
                 types = dict(self._master.call("getTopicTypes"))
-                self._types = {
+                before = {topic: self._types[topic] for topic in connected if topic in self._types}
+                self._types = before | {
                     topic: full_name(name) for topic, name in types.items() if name != "*"
                 }
                 self._publishers, self._subscribers, self._servers = state
@@ -261,7 +264,6 @@ class Ros1Node:
                 there = {(topic, node) for topic in state[0] for node in state[0][topic]}
                 self._latched = self._latched & there
                 self._definitions.keep(there)
-            self._register_missing()
         except BusError as error:
             if not self._is_away:
                 self._is_away = True
@@ -272,28 +274,46 @@ class Ros1Node:
             log.info("the ROS Master is back at %s", self._master.uri)
         return True
 
-    def _register_missing(self) -> None:
+    def _register_missing(self, publishers: _Graph, subscribers: _Graph, servers: _Graph) -> None:
         """Tell the Master what we have that it does not know of: it has come anew."""
         from rospy.impl.registration import get_service_manager, get_topic_manager
 
         topics = get_topic_manager()
         master, count = self._master, 0
         for topic, type_name in topics.get_publications():
-            if self.name not in self._publishers.get(topic, ()):
+            if self.name not in publishers.get(topic, ()):
                 master.call("registerPublisher", topic, type_name, self._uri)
                 count += 1
         for topic, type_name in topics.get_subscriptions():
-            if self.name not in self._subscribers.get(topic, ()):
+            if self.name not in subscribers.get(topic, ()):
                 uris = master.call("registerSubscriber", topic, type_name, self._uri)
                 # As the Master tells it later, of others that come.
                 Master(self._uri, self.name).call("publisherUpdate", topic, uris)
                 count += 1
         for service, uri in get_service_manager().get_services():
-            if service not in self._servers:
+            if service not in servers:
                 master.call("registerService", service, uri, self._uri)
                 count += 1
         if count:
             log.info("registered with the ROS Master anew: %d topics and services", count)
+
+    def _add_connected(self, publishers: _Graph, subscribers: _Graph) -> set[str]:
+        """Add who is connected to us: a Master that has come anew does not know of nodes that do
+        not register again, and these go on. Returns the topics that they have with us."""
+        from rospy.impl.registration import get_topic_manager
+
+        topics = get_topic_manager()
+        found = set()
+        for graph, own, attribute in (
+            (publishers, topics.subs, "callerid_pub"),
+            (subscribers, topics.pubs, "endpoint_id"),
+        ):
+            for topic, impl in list(own.items()):
+                nodes = {getattr(peer, attribute) for peer in impl.connections}
+                if more := nodes.difference(graph.get(topic, ()), {"unknown", ""}):
+                    graph[topic] = [*graph.get(topic, ()), *sorted(more)]
+                    found.add(topic)
+        return found
 
     def now(self) -> int:
         rospy = self._rospy

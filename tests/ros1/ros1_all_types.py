@@ -1,4 +1,4 @@
-"""Every message type that ROS 1 has here, against genpy: `python all_types.py [SEED]`.
+"""Every message type that ROS 1 has here, against genpy: `python ros1_all_types.py [SEED]`.
 
 It runs where rospy is, and prints how many types and messages agreed; what did not is an
 AssertionError. genpy makes the bytes from its own message objects, and `plain` walks these slowly
@@ -32,12 +32,22 @@ from appliance.ros.ros1_types import describe, full_name, installed
 from appliance.ros.schema import json_schema
 
 VARIANTS = ("default", "smallest", "largest", "random 1", "random 2", "random 3", "random 4")
-MUTATIONS = 30
+MUTATIONS = 12
 
 CODES = {
-    **{"bool": "?", "byte": "b", "int8": "b", "uint8": "B", "char": "B"},
-    **{"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"},
-    **{"float32": "f", "float64": "d"},
+    "bool": "?",
+    "byte": "b",
+    "int8": "b",
+    "uint8": "B",
+    "char": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
 }
 
 
@@ -178,7 +188,9 @@ def mutate(data, rng):
         elif kind == 1:
             data[place] ^= 1 << rng.randrange(8)
         elif kind == 2:
-            data[place : place + 4] = rng.choice([b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f"])
+            data[place : place + 4] = rng.choice(
+                [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f"]
+            )
         else:
             data[place:place] = rng.randbytes(rng.randint(1, 9))
     return bytes(data)

@@ -1,0 +1,468 @@
+"""ROS 1 as the bus: a real Master, nodes of other processes, ROS's commands and mosquitto's."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import paho.mqtt.client as paho
+import pytest
+from appliance_process import PATIENCE, eventually
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from ros1_world import HERE, Node, Python, Ros1Appliance, World, end, is_installed
+
+from appliance.environment import for_other_programs
+
+pytestmark = pytest.mark.skipif(
+    not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
+)
+
+BRIDGE = {
+    "topics": [
+        {"ros": ["/chatter", "/robot/*", "/many"], "to": "mqtt", "keep": 10000},
+        {"ros": "/hear", "to": "ros", "type": "std_msgs/msg/String"},
+        {"ros": "/both", "to": "both", "encoding": "ros1", "type": "std_msgs/msg/String"},
+        {"ros": "/raw/*", "to": "mqtt", "encoding": "ros1"},
+        {"ros": "/stamped", "to": "ros", "type": "geometry_msgs/msg/PointStamped"},
+        {
+            "ros": "/cmd_vel",
+            "to": "ros",
+            "type": "geometry_msgs/msg/Twist",
+            "clamp": {"linear.x": [-0.5, 0.5]},
+            "exclusive": True,
+            "on_silence": {"after": "300 ms", "publish": {}},
+        },
+    ],
+    "services": [
+        "/robot/*",
+        {"ros": "/robot/sleep", "timeout": "300 ms"},
+        {
+            "ros": "/ask_human",
+            "to": "mqtt",
+            "type": "std_srvs/srv/SetBool",
+            "timeout": "500 ms",
+            "on_error": {"success": False, "message": "nobody"},
+        },
+        {"ros": "/ask_nobody", "to": "mqtt", "type": "std_srvs/srv/SetBool", "timeout": "300 ms"},
+    ],
+    "actions": ["/robot/*"],
+    "parameters": ["/arm/*", "!/arm/secret", "/speed"],
+}
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Python:
+    return Python(tmp_path_factory.mktemp("python"))
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    world = World(tmp_path_factory.mktemp("ros1"))
+    yield world
+    world.kill()
+
+
+@pytest.fixture(scope="module")
+def appliance(
+    python: Python, world: World, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Ros1Appliance]:
+    """It is there before the Master is."""
+    process = Ros1Appliance(tmp_path_factory.mktemp("appliance"), python, world, BRIDGE)
+    process.start()
+    try:
+        process.wait_for_log("waiting for the ROS Master: .*refused")
+        world.start()
+        process.wait_for_log("on ROS as /appliance", timeout=2 * PATIENCE)
+        yield process
+    finally:
+        process.stop()
+        print(process.log)
+
+
+@pytest.fixture(scope="module")
+def robot(world: World, appliance: Ros1Appliance) -> Iterator[Node]:
+    node = Node(world)
+    try:
+        assert node.hear() == ["ok", "ready"]
+        yield node
+    finally:
+        node.stop()
+
+
+class Mqtt:
+    """An MQTT 5 client, and what it has received."""
+
+    def __init__(self, appliance: Ros1Appliance, *topics: str) -> None:
+        self.name = f"test-{uuid.uuid4().hex[:6]}"
+        self.received: list[paho.MQTTMessage] = []
+        self._changed = threading.Condition()
+        self.paho = paho.Client(paho.CallbackAPIVersion.VERSION2, self.name, protocol=paho.MQTTv5)
+        self.paho.username_pw_set("alice", appliance.passwords["alice"])
+        self.paho.on_message = self._on_message
+        ready = threading.Event()
+        self.paho.on_connect = lambda *_: self.paho.subscribe(
+            [(topic, 1) for topic in (*topics, f"r2d2/+/+/_reply/{self.name}/#")]
+        )
+        self.paho.on_subscribe = lambda *_: ready.set()
+        self.paho.connect("127.0.0.1", appliance.plain_port)
+        self.paho.loop_start()
+        assert ready.wait(PATIENCE)
+
+    def __enter__(self) -> Mqtt:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.paho.disconnect()
+        self.paho.loop_stop()
+
+    def _on_message(self, client: object, userdata: object, message: paho.MQTTMessage) -> None:
+        with self._changed:
+            self.received.append(message)
+            self._changed.notify_all()
+
+    def until(self, condition: Callable[[paho.MQTTMessage], object]) -> paho.MQTTMessage:
+        """The first message that this holds for."""
+        found: list[paho.MQTTMessage] = []
+
+        def is_there() -> bool:
+            found[:] = [message for message in self.received if condition(message)]
+            return bool(found)
+
+        with self._changed:
+            self._changed.wait_for(is_there, PATIENCE)
+        assert found, [(m.topic, m.payload) for m in self.received]
+        return found[0]
+
+    def next(self, topic: str, payload: object = ...) -> paho.MQTTMessage:
+        """The first message on a topic, or with a payload, which is taken away."""
+
+        def fits(message: paho.MQTTMessage) -> bool:
+            return message.topic == topic and (
+                payload is ... or (json.loads(message.payload or "null") == payload)
+            )
+
+        message = self.until(fits)
+        self.received.remove(message)
+        return message
+
+    def call(self, topic: str, value: object, kind: str = "_call") -> object:
+        """The answer to a call."""
+        properties = Properties(PacketTypes.PUBLISH)
+        token = uuid.uuid4().hex[:6].encode()
+        base = topic if topic.count("/") > 1 else f"{topic}/x"
+        properties.ResponseTopic = f"{base}/_reply/{self.name}/answer"
+        properties.CorrelationData = token
+        self.paho.subscribe(properties.ResponseTopic, 1)
+        self.paho.publish(f"{topic}/{kind}", json.dumps(value), 1, properties=properties)
+        answer = self.until(
+            lambda m: m.topic == properties.ResponseTopic and m.properties.CorrelationData == token
+        )
+        return json.loads(answer.payload)
+
+
+def mosquitto(appliance: Ros1Appliance, command: str, *arguments: str) -> list[str]:
+    login = ["-h", "127.0.0.1", "-p", str(appliance.plain_port), "-u", "alice"]
+    return [command, *login, "-P", appliance.passwords["alice"], *arguments]
+
+
+def output(process: subprocess.Popen[str], again: Callable[[], object]) -> str:
+    """What it writes until it ends, while something is done again: it does not tell when it has
+    subscribed."""
+    deadline = time.monotonic() + 2 * PATIENCE
+    while process.poll() is None:
+        assert time.monotonic() < deadline, f"{process.args} does not end"
+        again()
+        time.sleep(0.1)
+    return process.communicate()[0]
+
+
+def test_strings_between_rostopic_and_mosquitto(world: World, appliance: Ros1Appliance) -> None:
+    listener = subprocess.Popen(
+        mosquitto(appliance, "mosquitto_sub", "-t", "r2d2/chatter", "-C", "2", "-W", "15"),
+        stdout=subprocess.PIPE,
+        text=True,
+        env=for_other_programs(),
+    )
+    talker = world.begin("rostopic", "pub", "-r", "10", "/chatter", "std_msgs/String", "data: hi")
+    echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
+    try:
+        assert listener.communicate(timeout=2 * PATIENCE)[0].split("\n")[:2] == [
+            '{"data":"hi"}',
+            '{"data":"hi"}',
+        ]
+        hello = mosquitto(
+            appliance, "mosquitto_pub", "-t", "r2d2/hear", "-m", '{"data": "hello, ros"}'
+        )
+        greet = partial(subprocess.run, hello, check=True, env=for_other_programs())
+        assert output(echo, greet) == 'data: "hello, ros"\n---\n'
+    finally:
+        for process in (listener, talker, echo):
+            if process.poll() is None:
+                end(process)
+
+
+def test_many_messages_come_in_order_and_none_is_lost(
+    robot: Node, appliance: Ros1Appliance
+) -> None:
+    with Mqtt(appliance, "r2d2/many") as client:
+        robot.do("publish", "/many", "std_msgs/String", "first")
+        client.next("r2d2/many", {"data": "first"})
+        robot.do("burst", "/many", 500)
+        client.next("r2d2/many", {"data": "499"})
+        found = [json.loads(message.payload)["data"] for message in client.received]
+        assert found == [str(number) for number in range(499)]
+
+
+def test_what_is_latched_is_retained(robot: Node, appliance: Ros1Appliance) -> None:
+    def is_retained() -> bool:
+        with Mqtt(appliance, "r2d2/robot/map") as client:
+            message = client.next("r2d2/robot/map")
+            assert json.loads(message.payload) == {"data": "a map"}
+            return bool(message.retain)
+
+    eventually(is_retained, "the map is retained")
+
+
+def test_a_type_that_is_installed_nowhere(robot: Node, appliance: Ros1Appliance) -> None:
+    schema = "r2d2/_appliance/schema/own_msgs/Own"
+    with Mqtt(appliance, "r2d2/robot/own", schema) as client:
+        message = client.next("r2d2/robot/own")
+        assert json.loads(message.payload) == {
+            "name": "mine",
+            "data": "AQI=",
+            "parts": [{"at": {"sec": 1, "nanosec": 2}, "pair": [0.5, 1.5]}],
+        }
+        assert ("ros-type", "own_msgs/msg/Own") in message.properties.UserProperty
+        assert json.loads(client.next(schema).payload)["title"] == "own_msgs/msg/Own"
+
+
+def test_ros_bytes_as_they_are_and_no_echo(robot: Node, appliance: Ros1Appliance) -> None:
+    data = bytes.fromhex(str(robot.do("bytes", "/raw/text", "std_msgs/String", "a\0b é")))
+    assert data == b"\x06\0\0\0a\0b \xc3\xa9"
+    with Mqtt(appliance, "r2d2/raw/text", "r2d2/both") as client:
+        robot.do("publish", "/raw/text", "std_msgs/String", "a\0b é")
+        message = client.next("r2d2/raw/text")
+        assert (message.payload, message.properties.ContentType) == (data, "application/x-ros1")
+        robot.do("hear", "/both", "std_msgs/String")
+
+        def came() -> object:
+            client.paho.publish("r2d2/both", data, 1)
+            return robot.do("heard", "/both")
+
+        eventually(came, "bytes reach ROS")
+        assert set(robot.do("heard", "/both")) == {'data: "a\\0b \\xE9"'}  # type: ignore[call-overload]
+        robot.do("publish", "/both", "std_msgs/String", "from ROS")
+        client.until(lambda m: m.payload == b"\x08\0\0\0from ROS")
+        heard = len(robot.do("heard", "/both"))  # type: ignore[arg-type]
+        for cut in (data[:-1], data[:3], b"", b"\xff\xff\xff\xff" + data):
+            client.paho.publish("r2d2/both", cut, 1)
+        client.paho.publish("r2d2/both", b"\x04\0\0\0last", 1)
+        eventually(lambda: "last" in str(robot.do("heard", "/both")), "the last one comes")
+        assert len(robot.do("heard", "/both")) == heard + 1  # type: ignore[arg-type]
+        # What went to ROS came to us by MQTT alone: the appliance's own samples do not come back.
+        own = [m for m in client.received if m.payload == b"\x04\0\0\0last"]
+        assert len(own) == 1
+    appliance.wait_for_log("r2d2/both → /both: a message cannot be converted: data: truncated")
+
+
+def test_commands_are_held_to_their_rules(robot: Node, appliance: Ros1Appliance) -> None:
+    robot.do("hear", "/cmd_vel", "geometry_msgs/Twist")
+    with Mqtt(appliance) as driver, Mqtt(appliance) as other:
+
+        def drives() -> object:
+            driver.paho.publish("r2d2/cmd_vel", '{"linear": {"x": 9}}', 1).wait_for_publish(5)
+            other.paho.publish("r2d2/cmd_vel", '{"linear": {"x": -0.25}}', 1)
+            return robot.do("heard", "/cmd_vel")
+
+        eventually(drives, "commands reach ROS")
+        eventually(
+            lambda: "x: 0.0\n  y: 0.0" in str(robot.do("heard", "/cmd_vel")[-1]),  # type: ignore[index]
+            "the stop message comes",
+        )
+        heard = str(robot.do("heard", "/cmd_vel"))
+        assert "x: 0.5" in heard and "x: 9" not in heard and "-0.25" not in heard
+
+
+def test_a_header_and_now(robot: Node, appliance: Ros1Appliance) -> None:
+    robot.do("hear", "/stamped", "geometry_msgs/PointStamped")
+    with Mqtt(appliance) as client:
+
+        def comes() -> object:
+            header = {"stamp": "now", "frame_id": "map", "seq": 7}
+            client.paho.publish("r2d2/stamped", json.dumps({"header": header, "point": {"x": 1}}))
+            return robot.do("heard", "/stamped")
+
+        eventually(comes, "a point reaches ROS")
+        text = robot.do("heard", "/stamped")[0]  # type: ignore[index]
+        seconds = re.search(r"secs: (\d+)", text)
+        assert seconds and abs(int(seconds[1]) - time.time()) < 60
+        assert "seq: 7" in text and 'frame_id: "map"' in text and "x: 1.0" in text
+
+
+def test_services_both_ways(world: World, robot: Node, appliance: Ros1Appliance) -> None:
+    appliance.wait_for_log("/robot/switch can be called at")
+    with Mqtt(appliance, "r2d2/ask_human/_request/+") as client:
+        call = client.call
+        assert call("r2d2/robot/switch", {"data": True}) == {"success": False, "message": "so"}
+        assert call("r2d2/robot/switch", {}) == {"success": True, "message": "so"}
+        error = call("r2d2/robot/switch", {"data": 1})["error"]  # type: ignore[index]
+        assert error == {
+            "code": "bad_request",
+            "message": "data: expected true or false, got 1",
+        }
+        assert call("r2d2/robot/sleep", {})["error"]["code"] == "timeout"  # type: ignore[index]
+        said = world.run("rosservice", "call", "/ask_nobody", "true", check=False)
+        assert "nobody on MQTT answered" in said
+        assert robot.do("ask", "/ask_human", True) == [False, "nobody"]
+        client.next(client.received[-1].topic)
+
+        def answer() -> None:
+            request = client.until(lambda m: m.topic.startswith("r2d2/ask_human/_request/"))
+            assert json.loads(request.payload) == {"data": False}
+            reply = '{"success": true, "message": "a human"}'
+            client.paho.publish(request.properties.ResponseTopic, reply, 1)
+
+        human = threading.Thread(target=answer)
+        human.start()
+        said = world.run("rosservice", "call", "/ask_human", "false")
+        human.join(PATIENCE)
+        assert said == 'success: True\nmessage: "a human"\n'
+
+
+def test_an_action(robot: Node, appliance: Ros1Appliance) -> None:
+    appliance.wait_for_log("/robot/work can be called at")
+    with Mqtt(appliance, "r2d2/robot/work/#") as client:
+        accepted = client.call("r2d2/robot/work", {"goal": 3}, "_goal")
+        goal = accepted["goal_id"]  # type: ignore[index]
+        result = client.next(f"r2d2/robot/work/_result/{goal}")
+        assert json.loads(result.payload) == {"status": "succeeded", "result": {"result": 3}}
+        steps = [m for m in client.received if m.topic == f"r2d2/robot/work/_feedback/{goal}"]
+        assert json.loads(steps[-1].payload) == {"feedback": 2}
+
+        accepted = client.call("r2d2/robot/work", {"goal": -1}, "_goal")
+        goal = accepted["goal_id"]  # type: ignore[index]
+        result = client.next(f"r2d2/robot/work/_result/{goal}")
+        assert json.loads(result.payload)["status"] == "aborted"
+
+        accepted = client.call("r2d2/robot/work", {"goal": 400}, "_goal")
+        goal = accepted["goal_id"]  # type: ignore[index]
+        client.until(lambda m: m.topic == f"r2d2/robot/work/_feedback/{goal}")
+        cancelled = client.call("r2d2/robot/work", {"goal_id": goal}, "_cancel")
+        assert cancelled == {"goals_canceling": [goal]}
+        result = client.next(f"r2d2/robot/work/_result/{goal}")
+        assert json.loads(result.payload)["status"] == "canceled"
+        again = client.call("r2d2/robot/work", {"goal_id": goal}, "_cancel")
+        assert again["error"]["code"] == "unknown_goal"  # type: ignore[index]
+        wrong = client.call("r2d2/robot/work", {"gaol": 1}, "_goal")
+        assert "did you mean 'goal'?" in wrong["error"]["message"]  # type: ignore[index]
+
+
+def test_parameters(world: World, appliance: Ros1Appliance) -> None:
+    world.run("rosparam", "set", "/arm/gain", "0.5")
+    world.run("rosparam", "set", "/arm/secret", "1")
+    world.run("rosparam", "set", "/arm/pid/p", "1")
+    world.run("rosparam", "set", "/speed", "[1, two, 3.5]")
+    with Mqtt(appliance, "r2d2/arm/_param/#", "r2d2/_param/#") as client:
+        client.next("r2d2/arm/_param/gain", 0.5)
+        client.next("r2d2/_param/speed", [1, "two", 3.5])
+
+        def set_to(name: str, value: object) -> object:
+            return client.call(f"r2d2/arm/_param/{name}", value, "set")
+
+        assert set_to("gain", 2) == {"successful": True, "reason": ""}
+        client.next("r2d2/arm/_param/gain", 2.0)
+        assert world.run("rosparam", "get", "/arm/gain") == "2.0\n"
+        assert set_to("new", [True, "x"]) == {"successful": True, "reason": ""}
+        assert world.run("rosparam", "get", "/arm/new") == "- true\n- x\n\n"
+        for name, value, code in (
+            ("secret", 2, "not_authorized"),
+            ("gain", None, "bad_request"),
+            ("gain", {"a": 1}, "bad_request"),
+            ("pid", 1, "rejected"),
+            ("gain", 2**40, "ros_error"),
+        ):
+            assert set_to(name, value)["error"]["code"] == code, name  # type: ignore[index]
+        world.run("rosparam", "delete", "/arm/gain")
+        client.until(lambda m: m.topic == "r2d2/arm/_param/gain" and not m.payload)
+        assert not [m for m in client.received if "secret" in m.topic and m.payload]
+
+
+def test_the_commands_show_what_is_bridged(robot: Node, appliance: Ros1Appliance) -> None:
+    out = subprocess.run(
+        [appliance.python, "-m", "appliance", "routes", "-c", appliance.config],
+        env={**os.environ, **appliance.environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert "own_msgs/msg/Own" in out and "actionlib/action/Test" in out, out
+
+
+def test_every_type_of_debians_packages(python: Python, world: World) -> None:
+    environment = world.for_ros | {"PYTHONPATH": python.path}
+    done = subprocess.run(
+        [python.executable, str(HERE / "ros1_all_types.py")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    packages, types = map(int, re.findall(r"(\d+) (?:packages|types)", done.stdout))
+    assert packages >= 18 and types >= 217, done.stdout
+
+
+def test_a_master_that_is_killed_and_comes_back(
+    world: World, robot: Node, appliance: Ros1Appliance
+) -> None:
+    with Mqtt(appliance, "r2d2/many", "r2d2/chatter", "r2d2/_appliance/state") as client:
+        robot.do("publish", "/many", "std_msgs/String", "before")
+        client.next("r2d2/many", {"data": "before"})
+        world.kill()
+        appliance.wait_for_log("the ROS Master does not answer")
+        # Nodes that know each other need no Master.
+        robot.do("publish", "/many", "std_msgs/String", "meanwhile")
+        client.next("r2d2/many", {"data": "meanwhile"})
+        assert client.call("r2d2/robot/switch", {"data": True})["error"]  # type: ignore[index]
+        world.start()
+        appliance.wait_for_log("the ROS Master is back")
+        appliance.wait_for_log("registered with the ROS Master anew")
+        assert "/appliance" in world.run("rostopic", "info", "/hear")
+        assert "/appliance" in world.run("rosservice", "node", "/ask_human")
+        # A node that comes only now: both ways, a service, and the old robot's still.
+        talker = world.begin(
+            "rostopic", "pub", "-r", "10", "/chatter", "std_msgs/String", "data: again"
+        )
+        echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
+        try:
+            client.next("r2d2/chatter", {"data": "again"})
+            greet = partial(client.paho.publish, "r2d2/hear", '{"data": "hello again"}')
+            assert "hello again" in output(echo, greet)
+        finally:
+            for process in (talker, echo):
+                if process.poll() is None:
+                    end(process)
+        said = world.run("rosservice", "call", "/ask_human", "true")
+        assert "nobody" in said
+        robot.do("publish", "/many", "std_msgs/String", "after")
+        client.next("r2d2/many", {"data": "after"})
+        state = client.next("r2d2/_appliance/state", ...)
+        assert state.payload == b"online"
+
+
+def test_a_node_that_takes_the_name_ends_the_bridge_and_not_the_broker(
+    world: World, appliance: Ros1Appliance
+) -> None:
+    world.shut_down("/appliance")
+    appliance.wait_for_log("there is no bridge to ROS: /appliance was shut down from outside")
+    with Mqtt(appliance, "r2d2/x") as client:
+        client.paho.publish("r2d2/x", "1", 1)
+        client.next("r2d2/x", 1)
