@@ -23,6 +23,9 @@ _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv|action)/)?([A-Za-z]\w*)\Z", 
 
 TIME = "builtin_interfaces/msg/Time"
 
+#: Arrays of a fixed length up to this are read with a name for each of their numbers.
+LONGEST_ROW = 64
+
 
 class UnknownTypeError(LookupError):
     """No such message type is installed here, or it has a field that ROS itself cannot carry."""

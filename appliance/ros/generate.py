@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 from appliance.ros.arrays import WRITERS, binary_readers, readers
 from appliance.ros.definitions import (
+    LONGEST_ROW,
     PRIMITIVES,
     Array,
     FieldType,
@@ -45,9 +46,6 @@ MISFIT = (
     OverflowError,
     struct.error,
 )
-
-# Longer arrays are not worth a name for each of their items.
-_LONGEST_ROW = 64
 
 _COUNT = PRIMITIVES["uint32"]
 _PADDING = Primitive("padding", "x", 1)
@@ -176,7 +174,7 @@ def _is_row(type_: FieldType) -> bool:
     return (
         isinstance(type_, Array)
         and isinstance(type_.item, Primitive)
-        and (type_.item.is_octet or (type_.length <= _LONGEST_ROW and type_.item.code != "f"))
+        and (type_.item.is_octet or (type_.length <= LONGEST_ROW and type_.item.code != "f"))
     )
 
 
@@ -345,7 +343,7 @@ class _Decoder(_Generator):
             self._fill(type_)
             for field in type_.fields:
                 self._pass(field.type)
-        elif isinstance(item, Primitive) and count * item.size <= _LONGEST_ROW:
+        elif isinstance(item, Primitive) and count * item.size <= LONGEST_ROW:
             self._run.append(_Part(Primitive("passed", "x" * item.size, item.size), count, ""))
         elif isinstance(item, Primitive):
             self._flush()

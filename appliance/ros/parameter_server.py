@@ -239,9 +239,10 @@ class ServerParameters:
         for full_name in server.names():
             space, _, name = full_name.rpartition("/")
             names.setdefault(space, []).append(name)
-            while space and space not in names:  # a namespace of namespaces
-                names[space] = []
+        for space in list(names):
+            while space:
                 space = space.rpartition("/")[0]
+                names.setdefault(space, [])
         spaces = {space: self._find(space) for space in names}
         wanted = [
             f"{space}/{name}"

@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import Any
 
 from appliance.ros.definitions import (
+    LONGEST_ROW,
     PACKED,
     PRIMITIVES,
     TIME,
@@ -30,14 +31,15 @@ from appliance.ros.definitions import (
     least_size,
 )
 
-#: Bytes of a definition, fields that it comes to with all that is in it, and bytes of the smallest
-#: message: a stranger's definition is no reason to run out of memory.
+#: Bytes of a definition, fields that it comes to with all that is in it, types in types, and bytes
+#: of the smallest message: a stranger's definition is no reason to run out of memory.
 LARGEST_DEFINITION = 1 << 20
 MOST_FIELDS = 20_000
+DEEPEST = 16  # Python takes no more than 20 loops in loops
 LARGEST_MESSAGE = 64 << 20
 
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv)/)?([A-Za-z]\w*)\Z", re.ASCII)
-_FIELD = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,9})\])?\s+([A-Za-z]\w*)\s*(=?)", re.ASCII)
+_FIELD = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,9})\])?\s+([A-Za-z]\w*)\s*(=.*|#.*)?\Z", re.ASCII)
 _SEPARATOR = re.compile(r"^={80}$", re.MULTILINE)
 
 # Both are two numbers of four bytes, which ROS 2 calls differently.
@@ -167,6 +169,8 @@ class _Parser:
     def describe(self, name: str, ros1: str, text: str, above: tuple[str, ...]) -> TypeDescription:
         if ros1 in above:
             raise self._wrong(f"{ros1} contains itself")
+        if len(above) > DEEPEST:
+            raise self._wrong(f"it is too deep: more than {DEEPEST} types in types")
         fields: list[Field] = []
         count = 1
         for line in text.split("\n"):
@@ -176,8 +180,8 @@ class _Parser:
             match = _FIELD.match(line)
             if match is None:
                 raise self._wrong(f"{ros1} has the line {line[:60]!r}")
-            type_name, length, field_name, is_constant = match.groups()
-            if is_constant:
+            type_name, length, field_name, rest = match.groups()
+            if rest and rest.startswith("="):  # a constant
                 continue
             item = self._item(type_name, ros1, (*above, ros1))
             type_: FieldType = item
@@ -187,7 +191,11 @@ class _Parser:
                     raise self._wrong(f"{ros1}.{field_name} is an array of nothing")
                 type_ = Array(item, int(length)) if length else Sequence(item)
             fields.append(Field(field_name, type_))
-            count += self._known[item.name][1] if isinstance(item, TypeDescription) else 1
+            if isinstance(item, TypeDescription):
+                count += self._known[item.name][1]
+            else:
+                # Short arrays are read number by number.
+                count += min(int(length), LONGEST_ROW) if length else 1
             if count > MOST_FIELDS:
                 raise self._wrong(f"it has more than {MOST_FIELDS} fields")
         description = TypeDescription(name, tuple(fields), PACKED)

@@ -259,8 +259,12 @@ def test_ros_bytes_as_they_are_and_no_echo(robot: Node, appliance: Ros1Appliance
 
         eventually(came, "bytes reach ROS")
         assert set(robot.do("heard", "/both")) == {'data: "a\\0b \\xE9"'}  # type: ignore[call-overload]
-        robot.do("publish", "/both", "std_msgs/String", "from ROS")
-        client.until(lambda m: m.payload == b"\x08\0\0\0from ROS")
+
+        def comes() -> bool:  # the robot hears itself, so that it is not told when we do
+            robot.do("publish", "/both", "std_msgs/String", "from ROS")
+            return any(m.payload == b"\x08\0\0\0from ROS" for m in client.received)
+
+        eventually(comes, "what ROS says reaches MQTT")
         heard = len(robot.do("heard", "/both"))  # type: ignore[arg-type]
         for cut in (data[:-1], data[:3], b"", b"\xff\xff\xff\xff" + data):
             client.paho.publish("r2d2/both", cut, 1)
@@ -387,12 +391,12 @@ def test_parameters(world: World, appliance: Ros1Appliance) -> None:
             ("gain", None, "bad_request"),
             ("gain", {"a": 1}, "bad_request"),
             ("pid", 1, "rejected"),
-            ("gain", 2**40, "ros_error"),
+            ("other", 2**40, "ros_error"),
         ):
             assert set_to(name, value)["error"]["code"] == code, name  # type: ignore[index]
         world.run("rosparam", "delete", "/arm/gain")
         client.until(lambda m: m.topic == "r2d2/arm/_param/gain" and not m.payload)
-        assert not [m for m in client.received if "secret" in m.topic and m.payload]
+        assert not [m for m in client.received if m.topic.endswith("secret")]
 
 
 def test_the_commands_show_what_is_bridged(robot: Node, appliance: Ros1Appliance) -> None:
