@@ -90,7 +90,7 @@ def _check_free(bind: Bind) -> None:
 
 
 async def _start_robot(settings: Settings) -> Process | None:
-    if settings.bridge.bus == "none":
+    if settings.bridge.bus != "ros2":
         return None
     if importlib.util.find_spec("rclpy") is None:
         _say(

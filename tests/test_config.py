@@ -468,6 +468,36 @@ def test_mistakes_in_what_is_called(section: str, route: str, problem: str) -> N
     assert found.startswith(f"3: bridge.{section}[0].{problem}"), found
 
 
+def test_ros1_and_ros2_have_words_of_their_own() -> None:
+    bridge = """\
+bridge:
+  bus: {bus}
+  domain_id: 3
+  use_sim_time: true
+  topics:
+  - {{ros: /a, to: mqtt, encoding: cdr}}
+  - {{ros: /b, to: mqtt, encoding: ros1}}
+  services: [{{ros: /c, encoding: cdr}}, {{ros: /d, encoding: ros1}}]
+  parameters: [/e, "!/f", /g/h]
+"""
+    text = "must be {}: that is what ROS's own bytes are with bus: {}"
+    assert problems(bridge.format(bus="ros1")) == [
+        "3: bridge.domain_id: is for ROS 2 only; in ROS 1 it is ROS_MASTER_URI",
+        "4: bridge.use_sim_time: is for ROS 2 only; in ROS 1 it is the parameter /use_sim_time",
+        f"6: bridge.topics[0].encoding: {text.format('ros1', 'ros1')}",
+        f"8: bridge.services[0].encoding: {text.format('ros1', 'ros1')}",
+    ]
+    found = problems(bridge.format(bus="ros2"))
+    assert found[:2] == [
+        f"7: bridge.topics[1].encoding: {text.format('cdr', 'ros2')}",
+        f"8: bridge.services[1].encoding: {text.format('cdr', 'ros2')}",
+    ]
+    assert [line.partition(" must be")[0] for line in found[2:]] == [
+        "9: bridge.parameters[0].ros:",
+        "9: bridge.parameters[1].ros:",
+    ]
+
+
 def test_what_is_called_twice_is_told() -> None:
     assert problems("bridge: {actions: [/a, {ros: /a, timeout: 1 s}]}") == [
         "1: bridge.actions[1].ros: is the same as bridge.actions[0]"

@@ -14,9 +14,10 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
+from importlib import import_module
 from importlib.util import find_spec
 from time import monotonic
 from typing import Any
@@ -65,7 +66,7 @@ POLL_INTERVAL = 0.2
 KNOCK_INTERVAL = 0.5
 
 #: Seconds that rospy may take to leave the bus.
-LEAVE_TIME = 5.0
+LEAVE_TIME = 3.0
 
 DEFAULT_MASTER = "http://localhost:11311"
 
@@ -87,6 +88,15 @@ def available() -> tuple[bool, str]:
     return True, ""
 
 
+def remappings(arguments: Iterable[str]) -> Iterator[str]:
+    """The remappings among ROS arguments, with or without ROS 2's `-r` before them."""
+    before = ""
+    for argument in arguments:
+        if ":=" in argument and before not in ("-p", "--param"):
+            yield argument
+        before = argument
+
+
 class Ros1Node:
     """A RosNode on ROS 1. There can be one in the life of a process: rospy starts only once.
 
@@ -104,7 +114,7 @@ class Ros1Node:
         self.parameter_server: ParameterServer | None = MasterParameters(self._master)
         self._base_name = name
         self._namespace = namespace
-        self._arguments = [argument for argument in arguments if ":=" in argument]
+        self._arguments = list(remappings(arguments))
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -174,6 +184,11 @@ class Ros1Node:
         os.environ["ROS_MASTER_URI"] = self._master.uri
         if self._namespace != "/":
             os.environ["ROS_NAMESPACE"] = self._namespace
+        if not hasattr(import_module("std_msgs.msg").String, "_md5sum"):
+            raise BusError(
+                "ROS 2's packages come before those of ROS 1 here, and have the same names: make "
+                "an environment without the extra `ros`, and source no ROS 2"
+            )
         import rospy
 
         if rospy.core.is_shutdown():

@@ -34,7 +34,7 @@ from appliance.ros.definitions import (
 #: Bytes of a definition, fields that it comes to with all that is in it, types in types, and bytes
 #: of the smallest message: a stranger's definition is no reason to run out of memory.
 LARGEST_DEFINITION = 1 << 20
-MOST_FIELDS = 20_000
+MOST_FIELDS = 5_000
 DEEPEST = 16  # Python takes no more than 20 loops in loops
 LARGEST_MESSAGE = 64 << 20
 
