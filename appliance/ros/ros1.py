@@ -130,8 +130,8 @@ class Ros1Node:
         #: The types of the actions that have a server.
         self._actions: dict[str, str] = {}
         self._action_clients = Actions(self)
-        #: Topic and node of the publishers that have said to be latched.
-        self._latched: set[tuple[str, str]] = set()
+        #: By topic and node, whether a publisher has said to be latched: it does in its messages.
+        self._heard: dict[tuple[str, str], bool] = {}
         #: Definitions of types that are not installed, and the types of services.
         self._definitions: Answers[Definition] = Answers()
         self._service_types: Answers[str] = Answers()
@@ -277,9 +277,10 @@ class Ros1Node:
                 self._publishers, self._subscribers, self._servers = state
                 self._actions = find_actions(self._types, self._publishers)
                 there = {(topic, node) for topic in state[0] for node in state[0][topic]}
-                self._latched = self._latched & there
+                for key in self._heard.keys() - there:
+                    self._heard.pop(key, None)
                 self._definitions.keep(there)
-        except BusError as error:
+        except (BusError, TypeError, ValueError) as error:
             if not self._is_away:
                 self._is_away = True
                 log.warning("the ROS Master does not answer; what is connected stays so: %s", error)
@@ -361,26 +362,25 @@ class Ros1Node:
     def count(self, topic: str) -> tuple[int, int]:
         topic = self._resolve(topic.replace(HIDDEN, "/"))
         # One that has said to be latched counts twice, so that it is seen to be another now.
-        latched = sum(1 for name, _ in self._latched if name == topic)
-        publishers = len(self._publishers.get(topic, ())) + latched
+        publishers = len(self._publishers.get(topic, ())) + len(self._latched(topic))
         return publishers, len(self._subscribers.get(topic, ()))
 
     def publishers(self, topic: str) -> list[Endpoint]:
         topic = self._resolve(topic)
-        return [
-            Endpoint(
-                node,
-                type_name,
-                QosProfile(
-                    durability=Durability.TRANSIENT_LOCAL
-                    if (topic, node) in self._latched
-                    else Durability.VOLATILE,
-                    depth=1,
-                ),
-            )
-            for node, type_name in self._others(self._publishers, topic)
-            if self._is_known(type_name, node, topic)
-        ]
+        has_latched = bool(self._latched(topic))
+        found = []
+        for node, type_name in self._others(self._publishers, topic):
+            if self._is_known(type_name, node, topic):
+                # One that has said nothing yet is taken for what the others are.
+                is_latched = self._heard.get((topic, node), has_latched)
+                durability = Durability.TRANSIENT_LOCAL if is_latched else Durability.VOLATILE
+                found.append(Endpoint(node, type_name, QosProfile(durability=durability, depth=1)))
+        return found
+
+    def _latched(self, topic: str) -> list[str]:
+        """The publishers that have said to be latched."""
+        heard = list(self._heard.items())  # other threads add to it
+        return [node for (name, node), is_latched in heard if is_latched and name == topic]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         topic = self._resolve(topic)
@@ -405,16 +405,18 @@ class Ros1Node:
         try:
             told = self._definitions.get((topic, node), ask)
         except BusError as error:
-            self._complain(f"{type_name} is not installed here, and not told: {error}")
+            self._complain(type_name, f"is not installed here, and is not told: {error}")
             return True
-        if told is not None:
-            self._told[type_name] = told
+        if told is not None and self._told.setdefault(type_name, told) != told:
+            self._complain(
+                type_name, f"is another for {node} than it was: restart the appliance to receive it"
+            )
         return told is not None
 
-    def _complain(self, text: str) -> None:
-        if text not in self._complained:
-            self._complained.add(text)
-            log.warning("%s", text)
+    def _complain(self, type_name: str, problem: str) -> None:
+        if type_name not in self._complained:
+            self._complained.add(type_name)
+            log.warning("%s %s", type_name, problem)
 
     def _definition(self, type_name: str) -> Definition:
         told = self._told.get(type_name)
@@ -449,11 +451,11 @@ class Ros1Node:
     def hear(self, topic: str, node: str, is_latched: bool) -> bool:
         """What a publisher says of itself; whether that is news."""
         key = topic, node
-        if is_latched == (key in self._latched):
+        before = self._heard.get(key)
+        if before is is_latched:
             return False
-        # Replaced, because the ROS thread goes through it.
-        self._latched = self._latched | {key} if is_latched else self._latched - {key}
-        return True
+        self._heard[key] = is_latched
+        return is_latched or before is not None
 
     def hold(self, subscription: _Subscription) -> None:
         """Have it release what it holds after the next look."""

@@ -139,6 +139,14 @@ class World:
         assert not check or done.returncode == 0, done.stdout
         return done.stdout
 
+    def graph(self) -> list[dict[str, list[str]]]:
+        """Publishers, subscribers and servers, as the Master knows them."""
+        master = ServerProxy(self.environment["ROS_MASTER_URI"])
+        _, _, state = cast(
+            "list[list[list[tuple[str, list[str]]]]]", master.getSystemState("/test")
+        )
+        return [dict(part) for part in state]
+
     def shut_down(self, node: str) -> None:
         """What `rosnode kill` does, and the Master when another node takes the name."""
         master = ServerProxy(self.environment["ROS_MASTER_URI"])
