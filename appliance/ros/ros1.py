@@ -493,6 +493,10 @@ class Ros1Node:
         """Whether a service is on the graph."""
         return service in self._servers
 
+    def doubt(self, service: str) -> None:
+        """Ask a service anew for its type: a call of it has failed."""
+        self._service_types.forget((service, *self._servers.get(service, ())))
+
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
     ) -> _Service:
@@ -638,6 +642,8 @@ class _Client:
         def finish(result: bytes | BusError) -> None:
             if call in self._calls:
                 self._calls.discard(call)
+                if isinstance(result, BusError):
+                    node.doubt(self._service)
                 done(result)
 
         def tell(result: bytes | BusError) -> None:

@@ -17,7 +17,7 @@ import pytest
 from appliance_process import PATIENCE, eventually
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
-from ros1_world import HERE, Node, Python, Ros1Appliance, World, end, is_installed
+from ros1_world import HERE, SYSTEM_PYTHON, Node, Python, Ros1Appliance, World, end, is_installed
 
 from appliance.environment import for_other_programs
 
@@ -339,6 +339,34 @@ def test_services_both_ways(world: World, robot: Node, appliance: Ros1Appliance)
         said = world.run("rosservice", "call", "/ask_human", "false")
         human.join(PATIENCE)
         assert said == 'success: True\nmessage: "a human"\n'
+
+
+SHORT_LIVED = """
+import rospy
+from std_srvs.srv import SetBool, SetBoolResponse
+rospy.init_node("short_lived")
+rospy.Service("/robot/mayfly", SetBool, lambda asked: SetBoolResponse(True, "still here"))
+rospy.spin()
+"""
+
+
+def test_a_server_that_was_killed_is_missed(world: World, appliance: Ros1Appliance) -> None:
+    server = world.begin(SYSTEM_PYTHON, "-c", SHORT_LIVED)
+    try:
+        appliance.wait_for_log("/robot/mayfly can be called at")
+        with Mqtt(appliance) as client:
+            answer = client.call("r2d2/robot/mayfly", {})
+            assert answer == {"success": True, "message": "still here"}
+            server.kill()
+            # The Master does not notice, and goes on telling of it.
+            assert "error" in client.call("r2d2/robot/mayfly", {})  # type: ignore[operator]
+            assert "/robot/mayfly" in world.graph()[2]
+
+            routes = "r2d2/_appliance/routes"
+            with Mqtt(appliance, routes) as viewer:
+                viewer.until(lambda m: m.topic == routes and b"mayfly" not in m.payload)
+    finally:
+        end(server)
 
 
 def test_an_action(robot: Node, appliance: Ros1Appliance) -> None:
