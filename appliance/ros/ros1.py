@@ -13,8 +13,7 @@ import os
 import queue
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from importlib import import_module
@@ -40,17 +39,16 @@ from appliance.ros.ros1_actions import (
     find_actions,
     services_of,
 )
+from appliance.ros.ros1_ends import Client, Publisher, Service, Subscription
 from appliance.ros.ros1_peers import (
     Answers,
     Master,
     MasterParameters,
-    ServiceCall,
     ask_publisher,
     ask_service,
 )
 from appliance.ros.ros1_types import (
     Definition,
-    ServiceDefinition,
     describe,
     full_name,
     installed,
@@ -69,9 +67,6 @@ KNOCK_INTERVAL = 0.5
 LEAVE_TIME = 3.0
 
 DEFAULT_MASTER = "http://localhost:11311"
-
-#: Messages of a publisher that are held until it is seen to be latched.
-HELD = 10
 
 #: Names of topics or services, and the nodes that have them.
 _Graph = dict[str, list[str]]
@@ -137,7 +132,7 @@ class Ros1Node:
         self._service_types: Answers[str] = Answers()
         self._told: dict[str, Definition] = {}
         #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
-        self._holding: dict[_Subscription, None] = {}
+        self._holding: dict[Subscription, None] = {}
         self._complained: set[str] = set()
 
     def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
@@ -445,8 +440,9 @@ class Ros1Node:
         if HIDDEN in topic:
             return self._action_clients.subscribe(topic, type_name, callback)
         is_latched = qos.durability is Durability.TRANSIENT_LOCAL
-        message_class = _message_class(self._definition(type_name))
-        return _Subscription(self, self._resolve(topic), message_class, is_latched, callback)
+        definition = self._definition(type_name)
+        topic = self._resolve(topic)
+        return Subscription(self._rospy, self, topic, definition, is_latched, callback)
 
     def hear(self, topic: str, node: str, is_latched: bool) -> bool:
         """What a publisher says of itself; whether that is news."""
@@ -457,17 +453,16 @@ class Ros1Node:
         self._heard[key] = is_latched
         return is_latched or before is not None
 
-    def hold(self, subscription: _Subscription) -> None:
+    def hold(self, subscription: Subscription) -> None:
         """Have it release what it holds after the next look."""
         self._holding[subscription] = None
 
-    def let_go(self, subscription: _Subscription) -> None:
+    def let_go(self, subscription: Subscription) -> None:
         """It holds nothing any more."""
         self._holding.pop(subscription, None)
 
-    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
-        message_class = _message_class(self._definition(type_name))
-        return _Publisher(self._rospy, topic, message_class, qos)
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Publisher:
+        return Publisher(self._rospy, topic, self._definition(type_name), qos)
 
     # Services
 
@@ -482,7 +477,7 @@ class Ros1Node:
     def create_client(self, service: str, type_name: str) -> RosClient:
         if HIDDEN in service:
             return self._action_clients.create_client(service, type_name)
-        return _Client(self, self._resolve(service), installed_service(type_name))
+        return Client(self, self._resolve(service), installed_service(type_name))
 
     @property
     def master_uri(self) -> str:
@@ -499,209 +494,11 @@ class Ros1Node:
 
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
-    ) -> _Service:
+    ) -> Service:
         definition = installed_service(type_name)
-        return _Service(self._rospy, service, definition, callback, self.call_soon)
+        return Service(self._rospy, service, definition, callback, self.call_soon)
 
 
 @cache
 def _installed(type_name: str) -> Definition:
     return installed(type_name)
-
-
-@cache
-def _message_class(definition: Definition) -> Any:
-    """What rospy takes for the class of a type, and has its bytes only."""
-    from rospy import AnyMsg
-
-    attributes = {
-        "__slots__": [],
-        "_type": definition.name,
-        "_md5sum": definition.md5sum,
-        "_full_text": definition.text,
-    }
-    return type("Raw", (AnyMsg,), attributes)
-
-
-@cache
-def _service_class(definition: ServiceDefinition) -> Any:
-    attributes = {
-        "_type": definition.name,
-        "_md5sum": definition.md5sum,
-        "_request_class": _message_class(definition.request),
-        "_response_class": _message_class(definition.response),
-    }
-    return type("RawService", (), attributes)
-
-
-def _of(message_class: Any, data: bytes) -> Any:
-    message = message_class()
-    message._buff = data
-    return message
-
-
-class _Subscription:
-    """What latched publishers send is retained on MQTT, and only with a message it is told that one
-    is latched. The first of them is held until the graph was looked at again: most often the
-    subscription is then made anew, and the message comes once more."""
-
-    def __init__(
-        self,
-        node: Ros1Node,
-        topic: str,
-        message_class: Any,
-        is_latched: bool,
-        callback: Callable[..., None],
-    ) -> None:
-        import rospy
-
-        self._node = node
-        self._topic = topic
-        self._class = message_class
-        self._is_latched = is_latched
-        self._callback = callback
-        self._lock = threading.Lock()
-        self._is_over = False
-        self._held: deque[bytes] = deque(maxlen=HELD)
-        self._own = rospy.Subscriber(topic, message_class, self._on_message, tcp_nodelay=True)
-        if self._own.impl.data_class is not message_class:
-            self.destroy()
-            raise BusError(f"another route receives {topic} as {self._own.impl.type}")
-
-    def _on_message(self, message: Any) -> None:
-        header: Mapping[str, str] = message._connection_header
-        is_latched = header.get("latching") == "1"
-        with self._lock:
-            if self._is_over:
-                return
-            is_news = self._node.hear(self._topic, header.get("callerid", ""), is_latched)
-            if is_latched and not self._is_latched and (is_news or self._held):
-                self._held.append(message._buff)
-                self._node.hold(self)
-            else:
-                self._callback(message._buff)
-
-    def release(self) -> None:
-        """Hand on what was held: not all publishers are latched, so that this one stays."""
-        self._node.let_go(self)
-        with self._lock:
-            while self._held and not self._is_over:
-                self._callback(self._held.popleft())
-
-    def destroy(self) -> None:
-        with self._lock:
-            self._is_over = True
-        self._node.let_go(self)
-        self._own.unregister()
-
-
-class _Publisher:
-    def __init__(self, rospy: Any, topic: str, message_class: Any, qos: QosProfile) -> None:
-        self._class = message_class
-        self._refusals = (rospy.ROSException, rospy.ROSSerializationException, OSError)
-        self._own = rospy.Publisher(
-            topic,
-            message_class,
-            latch=qos.durability is Durability.TRANSIENT_LOCAL,
-            tcp_nodelay=True,
-            # A subscriber that does not read loses the oldest, and stops nobody.
-            queue_size=qos.depth,
-        )
-        if self._own.impl.data_class is not message_class:
-            other = self._own.impl.type
-            self._own.unregister()
-            raise BusError(f"another route publishes {topic} as {other}")
-
-    def publish(self, cdr: bytes) -> None:
-        try:
-            self._own.publish(_of(self._class, cdr))
-        except self._refusals as error:
-            raise BusError(str(error)) from error
-
-    def reaches(self, nodes: Iterable[str]) -> bool:
-        """Whether one of these nodes is connected."""
-        return any(map(self._own.impl.has_connection, nodes))
-
-    def destroy(self) -> None:
-        self._own.unregister()
-
-
-class _Client:
-    def __init__(self, node: Ros1Node, service: str, definition: ServiceDefinition) -> None:
-        self._node = node
-        self._service = service
-        self._definition = definition
-        self._calls: set[ServiceCall] = set()
-
-    def is_ready(self) -> bool:
-        return self._node.is_served(self._service)
-
-    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
-        node = self._node
-
-        def finish(result: bytes | BusError) -> None:
-            if call in self._calls:
-                self._calls.discard(call)
-                if isinstance(result, BusError):
-                    node.doubt(self._service)
-                done(result)
-
-        def tell(result: bytes | BusError) -> None:
-            with suppress(BusError):
-                node.call_soon(partial(finish, result))
-
-        def give_up() -> None:
-            self._calls.discard(call)
-            call.give_up()
-
-        call = ServiceCall(
-            node.master_uri, node.name, self._service, self._definition, request, tell
-        )
-        self._calls.add(call)
-        return give_up
-
-    def destroy(self) -> None:
-        for call in self._calls:
-            call.give_up()
-        self._calls.clear()
-
-
-class _Service:
-    """rospy waits for each answer on a thread of its own."""
-
-    def __init__(
-        self,
-        rospy: Any,
-        name: str,
-        definition: ServiceDefinition,
-        callback: Callable[[bytes, Respond], None],
-        call_soon: Callable[[Callable[[], None]], None],
-    ) -> None:
-        self._error = rospy.ServiceException
-        self._response_class = _message_class(definition.response)
-        self._callback = callback
-        self._call_soon = call_soon
-        self._waiting: set[queue.SimpleQueue[bytes | None]] = set()
-        try:
-            self._own = rospy.Service(name, _service_class(definition), self._take)
-        except rospy.ServiceException as error:
-            raise BusError(str(error)) from error
-
-    def _take(self, request: Any) -> Any:
-        answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._waiting.add(answer)
-        try:
-            self._call_soon(partial(self._callback, request._buff, answer.put))
-            response = answer.get()
-        except BusError as error:
-            raise self._error(str(error)) from error
-        finally:
-            self._waiting.discard(answer)
-        if response is None:
-            raise self._error("nobody on MQTT answered")
-        return _of(self._response_class, response)
-
-    def destroy(self) -> None:
-        self._own.shutdown("its route has ended")
-        for answer in list(self._waiting):
-            answer.put(None)
