@@ -26,6 +26,11 @@ import psutil
 from appliance_process import ACL, PATIENCE, ApplianceProcess, eventually
 from packaging.requirements import Requirement
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 import appliance
 from appliance.environment import for_other_programs
 
@@ -60,23 +65,34 @@ class Python:
 
 def link_packages(folder: Path) -> None:
     """Link all that the appliance needs, without the ROS 2 that is beside it."""
-    todo, done = ["ros-mqtt-appliance"], set()
+    own = distribution("ros-mqtt-appliance")
+    for file in own.files or ():
+        if file.parts[0].endswith(".dist-info"):  # it tells its version
+            link(own, file.parts[0], folder)
+    # What was installed may be older than what is here.
+    todo = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    done = set()
     while todo:
-        name = re.sub(r"[-_.]+", "-", todo.pop()).lower()
-        if name in done:
+        requirement = Requirement(todo.pop())
+        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
+        if name in done or not is_wanted(requirement):
             continue
         done.add(name)
-        found: Distribution = distribution(name)
+        found = distribution(name)
         for top in {file.parts[0] for file in found.files or ()}:
-            if top.endswith((".pth", "__pycache__")) or top in ("..", "/"):
-                continue
-            target = Path(str(found.locate_file(top)))
-            if (name != "ros-mqtt-appliance" or top.endswith(".dist-info")) and target.exists():
-                (folder / top).symlink_to(target)
-        for line in found.requires or ():
-            requirement = Requirement(line)
-            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-                todo.append(requirement.name)
+            if not top.endswith((".pth", "__pycache__")) and top not in ("..", "/"):
+                link(found, top, folder)
+        todo += found.requires or ()
+
+
+def is_wanted(requirement: Requirement) -> bool:
+    return requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+
+
+def link(found: Distribution, top: str, folder: Path) -> None:
+    target, place = Path(str(found.locate_file(top))), folder / top
+    if target.exists() and not place.exists():
+        place.symlink_to(target)
 
 
 class World:
