@@ -16,6 +16,7 @@ from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
 from appliance.broker.kept import Kept, Owed
+from appliance.broker.ledger import Ledger
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
     Access,
@@ -34,7 +35,6 @@ from appliance.broker.session import (
     LEVEL_SIZE,
     Delivery,
     Held,
-    Ledger,
     PendingWill,
     Session,
     subscription_size,

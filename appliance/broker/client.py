@@ -20,6 +20,7 @@ from appliance.broker.handshake import (
     maximum_packet_size,
     pending_will,
 )
+from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
@@ -72,10 +73,6 @@ MAXIMUM_LEVELS = 20_000
 
 #: The effort of a subscription, in and out; its levels come on top.
 SUBSCRIBE_EFFORT = 10
-
-#: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
-EFFORT_A_TURN = 1000
-
 
 #: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
 HOST_BURST = 100

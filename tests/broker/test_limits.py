@@ -7,8 +7,8 @@ import logging
 import pytest
 
 from appliance.broker.broker import ENDINGS_A_TURN, Broker
-from appliance.broker.client import EFFORT_A_TURN
 from appliance.broker.complaints import BURST, INTERVAL
+from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.session import REPLAYED_A_TURN, subscription_size

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from appliance.broker.broker import Broker
+from appliance.broker.ledger import Ledger
 from appliance.broker.message import OVERHEAD, Message, Watched
 from appliance.broker.ports import Identity, Limits
-from appliance.broker.session import Held, Ledger, Session
+from appliance.broker.session import Held, Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, Will
 from appliance.mqtt.topics import matches
