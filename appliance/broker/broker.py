@@ -841,7 +841,12 @@ class Broker:
         return None
 
     def send_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
-        """Let `Session.pump` send the retained messages that a subscription asks for."""
+        """Send the retained messages that a subscription asks for."""
+        self.replay_retained(session, subscription, is_new)
+        session.pump()
+
+    def replay_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
+        """Let the next `Session.pump` send the retained messages that a subscription asks for."""
         if parse_shared(subscription.filter) is not None:
             return  # the group's members have not asked for them (5.0 section 4.8.2)
         handling = subscription.retain_handling

@@ -9,7 +9,7 @@ import logging
 import math
 import uuid
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Protocol, cast
 
 from appliance.broker.broker import Broker, Route
@@ -24,6 +24,7 @@ from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
+from appliance.broker.subscribing import subscribe, unsubscribe
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.connection import (
     PUBACK,
@@ -47,12 +48,9 @@ from appliance.mqtt.packets import (
     Pubrel,
     Suback,
     Subscribe,
-    Subscription,
-    Unsuback,
     Unsubscribe,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
 
@@ -67,12 +65,6 @@ _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
 #: The effort of a packet that is not of the data path.
 PACKET_EFFORT = 5
-
-#: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE: some ten milliseconds of work.
-MAXIMUM_LEVELS = 20_000
-
-#: The effort of a subscription, in and out; its levels come on top.
-SUBSCRIBE_EFFORT = 10
 
 #: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
 HOST_BURST = 100
@@ -139,6 +131,8 @@ class Client:
         self._waiting: deque[tuple[int, list[bytes]]] = deque()
         #: PUBRELs that wait until the store can keep what they release.
         self._postponed: dict[int, None] = {}
+        #: A packet that is worked on in several turns.
+        self._work: Iterator[Packet | None] | None = None
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
         self._out: list[bytes] = []
@@ -403,12 +397,13 @@ class Client:
             self._on_acknowledgement(packet.TYPE << 16, packet.packet_id, packet.reason_code)
             return
         self._counters.control_received += 1
+        session = self.session
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
-        elif isinstance(packet, Subscribe):
-            self._on_subscribe(packet)
-        elif isinstance(packet, Unsubscribe):
-            self._on_unsubscribe(packet)
+        elif isinstance(packet, Subscribe) and session is not None:
+            self._begin(subscribe(self.broker, session, packet))
+        elif isinstance(packet, Unsubscribe) and session is not None:
+            self._begin(unsubscribe(self.broker, session, packet))
         elif isinstance(packet, Disconnect):
             self._on_disconnect(packet)
         elif isinstance(packet, Connect):
@@ -416,59 +411,28 @@ class Client:
         elif isinstance(packet, Auth):
             self._on_auth(packet)
 
-    def _on_subscribe(self, packet: Subscribe) -> None:
-        session = self.session
-        assert session is not None
-        identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
-        identifier = identifiers[0] if isinstance(identifiers, list) else 0
-        self._check_filters([subscription.filter for subscription in packet.subscriptions])
-        codes: list[int] = []
-        granted: list[tuple[Subscription, bool]] = []
-        for subscription in packet.subscriptions:
-            if isinstance(identifier, int):
-                subscription.identifier = identifier
-            is_new = subscription.filter not in session.subscriptions
-            code = self.broker.subscribe(session, subscription)
-            codes.append(code)
-            if code <= ReasonCode.GRANTED_QOS_2:
-                granted.append((subscription, is_new))
-        self._send(Suback(packet.packet_id, codes))  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
-        if self._closed:
-            return
-        for subscription, is_new in granted:
-            self.broker.send_retained(session, subscription, is_new)
+    def _begin(self, work: Iterator[Packet | None]) -> None:
+        """Do what a packet asks for that may be much; None is for the turn of the others."""
+        for answer in work:
+            if answer is None:
+                # What comes behind the packet waits for its end.
+                self._work = work
+                self.connection.pause()
+                self.later()
+                return
+            self._send(answer)
+            if self._closed:
+                return
+        self._work = None
 
-    def _check_filters(self, filters: Sequence[str]) -> None:
-        """Raises a ProtocolError when one is no topic filter, or all are too much for one turn."""
-        levels = sum(name.count("/") + 1 for name in filters)
-        self._counters.effort += SUBSCRIBE_EFFORT * len(filters) + levels
-        if levels > MAXIMUM_LEVELS:
-            raise ProtocolError(
-                ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_LEVELS} levels in one packet"
-            )
-        for name in filters:
-            self._check_filter(name)
-
-    def _check_filter(self, topic_filter: str) -> None:
-        """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+    def _go_on(self, work: Iterator[Packet | None]) -> None:
+        """Go on with what the last turn was too short for."""
         try:
-            check_filter(topic_filter)
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        try:
-            shared = parse_shared(topic_filter)
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
-        excess = self.broker.excess(shared[1] if shared else topic_filter)
-        if excess:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic filter with {excess}")
-
-    def _on_unsubscribe(self, packet: Unsubscribe) -> None:
-        session = self.session
-        assert session is not None
-        self._check_filters(packet.filters)
-        codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
-        self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
+            self._begin(work)
+        except ProtocolError as error:
+            self.fail(error)
+        if self._store.fresh:
+            self._depend()
 
     def _on_disconnect(self, packet: Disconnect) -> None:
         expiry = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
@@ -901,7 +865,9 @@ class Client:
         self._later = False
         if self.session is not None and self.session.link is self:
             self.session.take_turn()
-            if self.connection.paused:
+            if self._work is not None:
+                self._go_on(self._work)
+            if self._work is None and self.connection.paused:
                 self.connection.resume()
                 self.receive(b"")
 
@@ -968,6 +934,7 @@ class Client:
         # The last bytes are written, and the connection closed, by the flush: like all bytes they
         # wait for what they acknowledge to be kept.
         self._closed = True
+        self._work = None
         self.connection.close()
         self._ledger.queued_bytes -= self._held
         self._ledger.input_bytes -= self._held

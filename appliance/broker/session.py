@@ -295,13 +295,12 @@ class Session:
         return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
-        """Send retained messages, behind those before them; asked for again, they begin anew.
+        """Let `pump` send retained messages, behind others; asked for again, they begin anew.
 
         None among the deliveries is a message that is not for this session.
         """
         self.replays.pop(topic_filter, None)
         self.replays[topic_filter] = deliveries
-        self.pump()
 
     def take_turn(self) -> None:
         """Send what waits; the others have had their turn since the last time."""
