@@ -86,6 +86,7 @@ class TlsTransport:
         self._tcp: asyncio.Transport
         self._connected = False  # the protocol has heard of the connection
         self._open = False  # connected, and not closing
+        self._reading = True
         self._writable = True
         self._ended = False  # nothing more is to be read
         self._cut = True  # OpenSSL may have the beginning of a record
@@ -158,12 +159,14 @@ class TlsTransport:
             # Whoever makes OpenSSL answer again and again must read the answers.
             self.abort()
             return
-        if self._ended and self._error is None:
-            self._protocol.eof_received()
-        if self._ended:
-            self.close()
-        else:
+        if not self._ended:
             self._flush()
+            return
+        if self._error is None:
+            if not self._reading:  # what was said before it is still worked on
+                return
+            self._protocol.eof_received()
+        self.close()
 
     def _handshake_received(self, data: bytes) -> None:
         for start in range(0, len(data), PIECE):
@@ -270,11 +273,15 @@ class TlsTransport:
 
     def pause_reading(self) -> None:
         """Hand on nothing more."""
+        self._reading = False
         self._tcp.pause_reading()
 
     def resume_reading(self) -> None:
-        """Hand on what arrives."""
+        """Hand on what arrives, be it the end."""
+        self._reading = True
         self._tcp.resume_reading()
+        if self._ended:
+            self._loop.call_soon(self._react)
 
     def is_reading(self) -> bool:
         """Whether what arrives is handed on."""

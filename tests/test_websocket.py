@@ -578,6 +578,37 @@ async def test_what_was_said_before_the_close_frame_is_done(house: House):
     assert not house.broker.sessions
 
 
+@pytest.mark.parametrize("ends", [True, False], ids=["with DISCONNECT", "with its will"])
+async def test_what_was_said_before_the_login_and_the_close_frame_is_done(house: House, ends):
+    """As over TCP: that it is gone already keeps a client neither out nor from being heard."""
+    house.gate.clear()
+    await house.start()
+    watcher = await shake_hands(house)
+    caller = await shake_hands(house)
+    data = Connect("brief", will=Will("w", b"gone")).encode(5)
+    data += Publish("a", b"kept", retain=True).encode(5) * 3
+    data += Disconnect().encode(5) if ends else b""
+    await caller.say(frame(data) + frame(b"", Opcode.CLOSE))
+    await until(lambda: house.network.tasks)
+    assert len(house.network.open) == 2 and not house.broker.sessions
+    house.gate.set()
+    await until(lambda: len(house.network.open) == 1)
+    assert house.broker.counters.publish_received == 3
+    assert house.broker.counters.connects == 1 and not house.broker.sessions
+    await watcher.say(frame(Connect("watcher").encode(5)))
+    assert (await hear_frame(watcher))[0] == BINARY
+
+
+async def test_who_closes_before_the_login_is_not_waited_for_longer_than_others(house: House):
+    house.gate.clear()
+    await house.start(connect_timeout=0.3)
+    caller = await shake_hands(house)
+    await caller.say(frame(Connect("brief").encode(5)) + frame(b"", Opcode.CLOSE))
+    await until(lambda: not house.network.open)
+    house.gate.set()
+    assert house.broker.counters.connects == 0
+
+
 async def test_stop_with_open_clients(house: House):
     await house.start()
     talkers = [await join(house, f"c{n}", tls=n == 1) for n in range(2)]
