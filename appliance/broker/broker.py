@@ -31,8 +31,8 @@ from appliance.broker.ports import (
     Observer,
     Store,
 )
+from appliance.broker.retained import Retained
 from appliance.broker.session import (
-    LEVEL_SIZE,
     Delivery,
     Held,
     PendingWill,
@@ -45,7 +45,6 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import (
     SubscriptionTree,
-    TopicTree,
     check_filter,
     check_topic,
     parse_shared,
@@ -68,9 +67,6 @@ LATE = 0.1
 
 #: The effort to find a route, see `Counters.effort`; each match comes on top.
 ROUTE_EFFORT = 20
-
-#: Retained messages that one tick lets expire.
-EXPIRED_A_TURN = 1024
 
 #: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
@@ -119,11 +115,6 @@ class Route:
 Receiver: TypeAlias = "Session | Share"
 
 
-def retained_size(message: Message) -> int:
-    """Bytes that are counted for a retained message: it, and its topic's levels in the tree."""
-    return message.size + LEVEL_SIZE * message.topic.count("/")
-
-
 class Broker:
     """All sessions, subscriptions and retained messages, and the rules that join them."""
 
@@ -143,8 +134,7 @@ class Broker:
         #: What the broker counts.
         self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
-        self.retained: TopicTree[Message] = TopicTree()
-        self.retained_bytes = 0
+        self.retained = Retained(self.ledger, self.complaints, self._retained_changed)
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
@@ -168,8 +158,6 @@ class Broker:
         self._shares: dict[str, Share] = {}
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
-        #: When retained messages expire, soonest first.
-        self._expiring: list[tuple[float, int, Message]] = []
         #: Entries and targets that went into the sessions' caches since these were last cleared.
         self._cached = 0
 
@@ -406,11 +394,7 @@ class Broker:
                 self._join(session, subscription)
         for entry in kept:  # what is owed names sessions and groups, all of which are there now
             self._restore_owed(entry)
-        for message in retained:
-            self.retained.set(message.topic, message)
-            self.retained_bytes += retained_size(message)
-            if message.expires_at is not None:
-                self._schedule_expiry(message)
+        self.retained.restore(retained)
         self.epoch += 1
 
     def _restore_owed(self, entry: Kept) -> None:
@@ -593,7 +577,9 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
-        kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
+        kept = not retain or self.retained.keep(
+            message
+        )  # no room to keep it: who is there still gets it
         published_qos = message.qos
         self.counters.effort += 1 + len(targets)
         taken = full = False
@@ -727,60 +713,10 @@ class Broker:
             session.bytes,
         )
 
-    def _retain(self, message: Message) -> bool:
-        if self.ledger.refusing and message.qos:
-            return False
-        old = self.retained.get(message.topic)
-        if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
-            if old is None:
-                return True
-            self.retained_bytes -= retained_size(old)
-            self.retained.delete(message.topic)
-        else:
-            message.settle()
-            grown = self.retained_bytes + retained_size(message)
-            grown -= retained_size(old) if old is not None else 0
-            limits = self.limits
-            if grown > limits.retained_bytes or (
-                old is None and len(self.retained) >= limits.retained_messages
-            ):
-                self.counters.publish_dropped += 1
-                self.complaints.tell(
-                    self.now,
-                    "retained",
-                    "no room to retain %s: %d messages and %d bytes are retained "
-                    "(broker.limits.retained_messages, broker.limits.retained_bytes)",
-                    quote(message.topic),
-                    len(self.retained),
-                    self.retained_bytes,
-                )
-                return False
-            self.retained_bytes = grown
-            self.retained.set(message.topic, message)
-            if message.expires_at is not None:
-                self._schedule_expiry(message)
+    def _retained_changed(self, message: Message) -> None:
         self.store.retained(message)
         if self.observer is not None:
             self.observer.retained(message)
-        return True
-
-    def _schedule_expiry(self, message: Message) -> None:
-        assert message.expires_at is not None
-        heapq.heappush(self._expiring, (message.expires_at, next(self._order), message))
-        # Those that were replaced are not kept until their time comes.
-        if len(self._expiring) > 2 * len(self.retained) + 64:
-            self._expiring = [
-                entry for entry in self._expiring if self.retained.get(entry[2].topic) is entry[2]
-            ]
-            heapq.heapify(self._expiring)
-
-    def _expire_retained(self) -> None:
-        left = EXPIRED_A_TURN
-        while left and self._expiring and self._expiring[0][0] <= self.now:
-            left -= 1
-            _, _, message = heapq.heappop(self._expiring)
-            if self.retained.get(message.topic) is message:
-                self._retain(Message(message.topic, b"", retain=True))
 
     # --- subscribing ---------------------------------------------------------------------------
 
@@ -865,7 +801,7 @@ class Broker:
                 continue
             topic, message = found
             if message.expires_at is not None and message.expires_at <= self.now:
-                self._retain(Message(topic, b"", retain=True))
+                self.retained.delete(topic)
                 yield None
             elif not self.may_receive(session, topic):
                 yield None
@@ -943,7 +879,7 @@ class Broker:
         """
         self.ledger.now = now
         self.complaints.tick(now)
-        self._expire_retained()
+        self.retained.expire(now)
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
             left -= client.tick(now)

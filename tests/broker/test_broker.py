@@ -291,10 +291,10 @@ def test_an_empty_retained_message_clears_the_topic(join: Join, broker: Broker, 
     publisher.publish("a", b"x", retain=True)
     publisher.publish("a", b"", retain=True)
     assert retained(broker, version) == []
-    assert (len(broker.retained), broker.retained_bytes) == (0, 0)
+    assert (len(broker.retained), broker.retained.bytes) == (0, 0)
     assert subscriber.payloads() == [b"x", b""]  # it goes to who listens like any other
     code = publisher.publish("a", b"", 1, retain=True)  # and once more, with nothing there
-    assert code == ReasonCode.SUCCESS and broker.retained_bytes == 0
+    assert code == ReasonCode.SUCCESS and broker.retained.bytes == 0
     assert subscriber.payloads() == [b""]
 
 
@@ -453,7 +453,7 @@ def test_an_expired_retained_message_is_gone(join: Join, broker: Broker):
     join("publisher").publish("a", b"x", retain=True, properties={MESSAGE_EXPIRY: 100})
     broker.tick(broker.now + 100)
     assert retained(broker, 5) == []
-    assert (len(broker.retained), broker.retained_bytes) == (0, 0)
+    assert (len(broker.retained), broker.retained.bytes) == (0, 0)
 
 
 def test_an_expired_queued_message_is_not_sent(join: Join, broker: Broker):

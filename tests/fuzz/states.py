@@ -246,7 +246,7 @@ class World:
         limits = broker.limits
         # What there was room for at its PUBREC is delivered though there is none left at PUBREL.
         assert broker.ledger.queued_bytes <= 2 * limits.memory
-        assert broker.retained_bytes <= limits.retained_bytes
+        assert broker.retained.bytes <= limits.retained_bytes
         assert len(broker.sessions) <= limits.sessions
         for session in broker.sessions.values():
             assert len(session.queue) <= limits.queue_messages + 6 * limits.inflight, session

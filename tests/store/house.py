@@ -80,7 +80,7 @@ def state(broker: Broker) -> dict[str, Any]:
             if session.identity is not None and session.persistent
         },
         "retained": {topic: _message(message) for topic, message in broker.retained.find("#")},
-        "bytes": broker.retained_bytes,
+        "bytes": broker.retained.bytes,
     }
 
 
