@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Protocol, cast
 
-from appliance.broker.broker import Broker, Route
+from appliance.broker.broker import Broker
 from appliance.broker.handshake import (
     agree,
     connack_properties,
@@ -23,6 +23,7 @@ from appliance.broker.handshake import (
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Exchange, Identity, Refusal, Secured
+from appliance.broker.routing import Route
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
 from appliance.broker.subscribing import subscribe, unsubscribe
 from appliance.mqtt.codec import Properties, Property, quote
@@ -123,6 +124,7 @@ class Client:
         self.connection = Connection(broker.limits.packet_size, broker.limits.topic_alias)
         self.writable = True
         self.session: Session | None = None
+        self._router = broker.router
         self._ledger = broker.ledger
         self._counters = broker.counters
         self._store = broker.store
@@ -218,19 +220,19 @@ class Client:
     def _on_raw_publish(self, event: RawPublish) -> None:
         """The data path: a PUBLISH without properties."""
         first, topic_wire, packet_id, payload, head = event
-        broker = self.broker
+        router = self._router
         session = self.session
         assert session is not None
         counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(payload)
         # The route has the topic decoded and checked, which would else be done for each message.
-        if session.epoch == broker.epoch and topic_wire in session.routes:
+        if session.epoch == router.epoch and topic_wire in session.routes:
             route = session.routes[topic_wire]
         else:
-            route = broker.route(session, topic_wire)
+            route = router.route(session, topic_wire)
         targets = route.targets
-        if first == 0x30 and route.allowed and broker.observer is None:
+        if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.effort += 1 + len(targets)
             # A plain QoS 0 message to receivers of the same version leaves as it came: no message
             # object is made for it. Who cannot take it like this is left for the long way.
@@ -255,7 +257,7 @@ class Client:
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
-        code = broker.publish_to(targets, route, message, session)
+        code = self.broker.publish_to(targets, route, message, session)
         if qos:
             self._acknowledge(0x40, packet_id, code, _reason(code, route))
 
@@ -278,7 +280,7 @@ class Client:
         )
         if packet.dup:
             message = Late(message, math.inf)
-        route = broker.route(session, message.topic_wire)
+        route = self._router.route(session, message.topic_wire)
         packet_id = packet.packet_id or 0
         if broker.features.check_payload_format and not is_text(message.payload, packet.properties):
             self._refuse_payload(session, message, packet_id)
@@ -372,7 +374,7 @@ class Client:
             # Its PUBCOMP may depend on what is not kept yet.
             postpone = session.persistent
         else:
-            route = self.broker.route(session, held.message.topic_wire)
+            route = self._router.route(session, held.message.topic_wire)
             postpone = self.broker.must_store(route, held.message, session)
         if postpone:
             self._postponed[packet_id] = None
@@ -464,7 +466,7 @@ class Client:
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
         will = packet.will
-        excess = self.broker.excess(will.topic) if will is not None else ""
+        excess = self._router.excess(will.topic) if will is not None else ""
         if excess:
             self.refuse(ReasonCode.TOPIC_NAME_INVALID, f"its will's topic has {excess}")
             return

@@ -15,7 +15,7 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 if TYPE_CHECKING:
-    from appliance.broker.broker import Route
+    from appliance.broker.routing import Route
     from appliance.broker.shared import Share
 
 

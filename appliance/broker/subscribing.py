@@ -119,6 +119,6 @@ def _check_filter(broker: Broker, topic_filter: str) -> None:
         shared = parse_shared(topic_filter)
     except ValueError as error:
         raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
-    excess = broker.excess(shared[1] if shared else topic_filter)
+    excess = broker.router.excess(shared[1] if shared else topic_filter)
     if excess:
         raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic filter with {excess}")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import cast
 
 from appliance.broker.broker import Broker
+from appliance.broker.kept import restore
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Held, Session
@@ -216,8 +217,10 @@ class SqliteStore:
             )
 
     def _adopt(self, broker: Broker, loaded: Loaded, rows: database.Rows) -> None:
-        broker.restore(
-            [session.kept for session in loaded.sessions.values()], list(loaded.retained.values())
+        restore(
+            broker,
+            [session.kept for session in loaded.sessions.values()],
+            list(loaded.retained.values()),
         )
         for key, message in loaded.retained.items():
             before = self._retained.get(message.topic)
