@@ -346,7 +346,7 @@ class ClientProtocol:
             return
         if self._client.session is None:
             self.complain("no TLS connection", reason)
-            self._client.abandon()
+            self._client.output.abandon()
         else:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
         self._broker.flush()
@@ -399,7 +399,7 @@ class ClientProtocol:
             self._broker.flush()
             # The client and its wire know each other: this lets both, and the TLS connection with
             # them, go now, and not when all that lives here is searched for garbage.
-            self._client.wire = _Gone(self.address)
+            self._client.let_go(_Gone(self.address))
 
     def _forget(self) -> None:
         self._network.closed(self)
@@ -596,7 +596,7 @@ class ClientProtocol:
         limit = OUTPUT_LOW_WATER if much else OUTPUT_HIGH_WATER
         size = self._output_size()
         if size > limit and self._slow is None:
-            self._client.writable = False
+            self._client.output.writable = False
             # From here on its output grows by what it is answered only, and by no more than this.
             self._output_limit = size + limit
             self._slow = self._loop.call_later(SLOW_AFTER, self._tell_slow)
@@ -626,14 +626,14 @@ class ClientProtocol:
         if self._slow is None:
             if self._has_told_behind:
                 self._has_told_behind = False
-                self._client.caught_up()
+                self._client.output.caught_up()
                 self._broker.flush()
             return
         self._slow.cancel()
         self._slow = None
         self._has_told_behind = False
         self._choked = False
-        self._client.resume_writing()
+        self._client.output.resume_writing()
         self._broker.flush()
         self._read_on()
 

@@ -372,7 +372,7 @@ async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeyp
     publisher = await house.join("pub")
     for _ in range(10):
         await publisher.say(Publish("a", bytes(MIB)))
-    await until(lambda: not house.protocol("deaf")._client.writable)
+    await until(lambda: not house.protocol("deaf")._client.output.writable)
     await caller.say(b"\0\0")
     await until(lambda: len(house.network.open) == 1)
 
@@ -389,7 +389,7 @@ async def test_stop_with_open_clients(house: House, tls):
         await callers[0].say(Publish("a", bytes(MIB)))
     await callers[0].say(Pingreq())  # all of it has been read, or a reset would be the answer
     assert isinstance(await callers[0].hear(), Pingresp)
-    assert not house.protocol("deaf")._client.writable
+    assert not house.protocol("deaf")._client.output.writable
     await asyncio.wait_for(house.listeners.stop(), PATIENCE)
     for caller in callers:
         assert await caller.hear() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)

@@ -56,7 +56,17 @@ ENDINGS_A_TURN = 128
 
 
 class Ticking(Protocol):
-    """A network client, as the broker's clock sees it."""
+    """A network client, as the broker's clock and its store see it."""
+
+    def tick(self, now: float) -> bool:
+        """Check its keep alive; True when that ended the connection."""
+
+    def resume(self) -> None:
+        """The store keeps again what is to be kept."""
+
+
+class Flushing(Protocol):
+    """What a network client is sent, as the flush and the commits see it."""
 
     def flush(self) -> None:
         """Write what was sent to it."""
@@ -67,14 +77,8 @@ class Ticking(Protocol):
     def release(self, committed: int) -> bool:
         """Write what does not depend on a later batch; True when some does."""
 
-    def resume(self) -> None:
-        """The store keeps again what is to be kept."""
-
     def abandon(self) -> None:
         """Close it without writing what was sent to it."""
-
-    def tick(self, now: float) -> bool:
-        """Check its keep alive; True when that ended the connection."""
 
 
 #: Who a message may be owed to: a session, or one of a group.
@@ -111,10 +115,10 @@ class Broker:
         self.journal: Journal | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
-        #: Network clients with bytes to write.
-        self.unflushed: list[Ticking] = []
-        #: Network clients with bytes that wait for a commit, in the order in which they do.
-        self._waiting: dict[Ticking, None] = {}
+        #: The outputs of network clients with bytes to write.
+        self.unflushed: list[Flushing] = []
+        #: Those with bytes that wait for a commit, in the order in which they do.
+        self._waiting: dict[Flushing, None] = {}
         store.listen(self._committed)
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
@@ -674,23 +678,23 @@ class Broker:
                 ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
             )
         while self.unflushed:  # what was written makes room for what waited
-            clients = self.unflushed
+            outputs = self.unflushed
             self.unflushed = []
             if self.store.staged:
-                clients = self._hold_back(clients)
-            for client in clients:
-                client.flush()
+                outputs = self._hold_back(outputs)
+            for output in outputs:
+                output.flush()
 
-    def _hold_back(self, clients: list[Ticking]) -> list[Ticking]:
+    def _hold_back(self, outputs: list[Flushing]) -> list[Flushing]:
         """Let those wait whose bytes depend on what is not committed; returns the others."""
         self.store.fresh = False
         committed = self.store.committed
-        free: list[Ticking] = []
-        for client in clients:
-            if client.wait(committed):
-                self._waiting[client] = None
+        free: list[Flushing] = []
+        for output in outputs:
+            if output.wait(committed):
+                self._waiting[output] = None
             else:
-                free.append(client)
+                free.append(output)
         if self._waiting:
             self.store.hurry()
         return free
@@ -699,7 +703,7 @@ class Broker:
         waiting, self._waiting = self._waiting, {}
         if kept:
             committed = self.store.committed
-            self._waiting = {client: None for client in waiting if client.release(committed)}
+            self._waiting = {output: None for output in waiting if output.release(committed)}
             if self.ledger.failing:
                 self._recover()
         else:
@@ -707,8 +711,8 @@ class Broker:
                 self.ledger.failing = self.ledger.refusing = True
                 for session in self.sessions.values():
                     session.hold_back()
-            for client in waiting:
-                client.abandon()
+            for output in waiting:
+                output.abandon()
         if self._waiting:
             self.store.hurry()
         self.flush()

@@ -371,11 +371,11 @@ class Peer:
 
     def slow(self) -> None:
         """The network takes nothing more."""
-        self.client.writable = False
+        self.client.output.writable = False
 
     def fast(self) -> None:
         """The network takes bytes again."""
-        self.client.resume_writing()
+        self.client.output.resume_writing()
         self.broker.flush()
 
     def farewell(self) -> ReasonCode:

@@ -514,7 +514,7 @@ def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_
     assert peer.payloads() == [b"s"]
     assert counted.skipped == broker.counters.publish_dropped == 1
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE + b"2"]
 
@@ -535,7 +535,7 @@ def test_large_messages_go_one_by_one_and_behind_small_ones(broker: Broker, join
     peer.fast()
     assert peer.payloads() == []
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE, LARGE]
 
@@ -549,7 +549,7 @@ def test_retained_messages_that_are_large_are_all_sent(broker: Broker, join: Joi
     peer.subscribe("map/#")
     assert peer.payloads() == []
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert len(peer.payloads()) == 20
     assert broker.counters.publish_dropped == 0

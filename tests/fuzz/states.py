@@ -177,7 +177,7 @@ class World:
         elif what < 0.33:
             for _ in range(peer.wire.laters):
                 peer.wire.laters -= 1
-                peer.client.resume_writing()
+                peer.client.output.resume_writing()
             self.broker.flush()
         elif client.open_ids and what < 0.6:
             self._answer(client)
@@ -255,7 +255,7 @@ class World:
         connected = {
             session.link for session in broker.sessions.values() if session.link is not None
         }
-        assert broker.clients == connected, (
+        assert {client.output for client in broker.clients} == connected, (
             "who is connected has a session, and the other way round"
         )
         filters = [name for session in broker.sessions.values() for name in session.subscriptions]
