@@ -11,8 +11,8 @@ import asyncio
 import contextlib
 import socket
 import ssl
-from collections.abc import Callable, Iterable
-from typing import Final, TypeAlias, cast
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, TypeAlias, cast
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -316,3 +316,30 @@ class TlsTransport:
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
         """Tell another one what happens from now on."""
         self._protocol = cast(asyncio.Protocol, protocol)
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong in a handshake, in words for the person who reads the log."""
+    said = getattr(error, "reason", None) or str(error) or type(error).__name__
+    text = str(said).replace("_", " ").lower()
+    if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
+        return f"the client does not trust our certificate; does it have ca.crt? ({text})"
+    if "http request" in text or "wrong version number" in text:
+        return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
+    if "certificate verify failed" in text:
+        why = getattr(error, "verify_message", "")
+        return f"the client's certificate is not accepted: {why or text} (broker.tls.ca)"
+    if "peer did not return a certificate" in text:
+        return f"it has no client certificate, and one is required ({text})"
+    return text
+
+
+def name_in(certificate: Mapping[str, Any] | None) -> str:
+    """The common name of a certificate's subject, or else its first alternative name."""
+    if not certificate:
+        return ""
+    for part in certificate.get("subject", ()):
+        for key, value in part:
+            if key == "commonName":
+                return str(value)
+    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")
