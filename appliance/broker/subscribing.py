@@ -20,7 +20,7 @@ from appliance.mqtt.topics import check_filter, parse_shared
 MAXIMUM_LEVELS = 20_000
 
 #: The effort of a subscription, in and out; its levels come on top.
-SUBSCRIBE_EFFORT = 10
+SUBSCRIBE_EFFORT = 20
 
 #: The effort to check a filter, and to look for its retained messages.
 CHECK_EFFORT = 3
