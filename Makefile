@@ -24,12 +24,14 @@ run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
 
+# Most of a test's time is waiting, so three at a time; those that compare times come after them, alone.
 test: .venv/test.stamp $(INTEROP)/node_modules
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not timed'
+	$(BIN)/pytest -m timed
 
 compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .

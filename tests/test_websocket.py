@@ -369,14 +369,16 @@ async def test_a_text_frame_ends_the_connection(house: House, caplog):  # [MQTT-
 @pytest.mark.parametrize(
     ("data", "code"),
     [
-        (Frame(Opcode.BINARY, b"\xc0\0").serialize(mask=False), 1002),
-        (b"\xc2" + frame(b"\xc0\0")[1:], 1002),  # a reserved bit
-        (b"\x83" + frame(b"\xc0\0")[1:], 1002),  # an unknown kind
-        (frame(b"\xc0\0", Opcode.CONT), 1002),  # of nothing
-        (frame(b"\xc0", fin=False) + frame(b"\0"), 1002),  # a message inside a message
-        (b"\x09\x80\0\0\0\0", 1002),  # a part of a ping
-        (b"\x89\xfe\x00\x7e" + bytes(4 + 126), 1002),  # a ping that is too long
-        (b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009),
+        pytest.param(Frame(Opcode.BINARY, b"\xc0\0").serialize(mask=False), 1002, id="not masked"),
+        pytest.param(b"\xc2" + frame(b"\xc0\0")[1:], 1002, id="a reserved bit"),
+        pytest.param(b"\x83" + frame(b"\xc0\0")[1:], 1002, id="an unknown kind"),
+        pytest.param(frame(b"\xc0\0", Opcode.CONT), 1002, id="more of nothing"),
+        pytest.param(
+            frame(b"\xc0", fin=False) + frame(b"\0"), 1002, id="a message inside a message"
+        ),
+        pytest.param(b"\x09\x80\0\0\0\0", 1002, id="a part of a ping"),
+        pytest.param(b"\x89\xfe\x00\x7e" + bytes(4 + 126), 1002, id="a ping that is too long"),
+        pytest.param(b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009, id="too long"),
     ],
 )
 async def test_wrong_frames_end_the_connection(house: House, data, code, caplog):
