@@ -30,21 +30,12 @@ from appliance.broker.ports import (
 )
 from appliance.broker.retained import Retained
 from appliance.broker.routing import Route, Router
-from appliance.broker.session import (
-    Delivery,
-    Held,
-    PendingWill,
-    Session,
-    subscription_size,
-)
+from appliance.broker.session import Delivery, Held, PendingWill, Session, subscription_size
 from appliance.broker.shared import Share, Target
 from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import (
-    check_filter,
-    parse_shared,
-)
+from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
 

@@ -1,6 +1,6 @@
 """A network client's conversation: what each of its packets does, and what it is answered.
 
-Pure like the rest of the broker: bytes come in at `receive`, and go out at `flush` to a `Wire`.
+Pure like the rest of the broker: bytes come in at `receive`, and go out through an `Output`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,7 @@ from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
 from appliance.broker.subscribing import subscribe, unsubscribe
 from appliance.mqtt.codec import Properties, Property, quote
-from appliance.mqtt.connection import (
-    PUBACK,
-    PUBREC,
-    PUBREL,
-    Connection,
-    RawPublish,
-)
+from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, RawPublish
 from appliance.mqtt.packets import (
     Auth,
     Connack,
@@ -227,6 +221,10 @@ class Client:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos:
                 self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
+
+    def _expires_at(self, properties: Properties | None) -> float | None:
+        interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
+        return self._ledger.now + interval if isinstance(interval, int) else None
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
@@ -555,9 +553,7 @@ class Client:
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
 
-    def _expires_at(self, properties: Properties | None) -> float | None:
-        interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        return self._ledger.now + interval if isinstance(interval, int) else None
+    # --- turns, and bytes out ------------------------------------------------------------------
 
     def later(self) -> None:
         """Let the other clients have their turn."""
