@@ -129,13 +129,16 @@ class Converter:
         return self._exact(value, len(payload))
 
     def checked(self, cdr: bytes) -> bytes:
-        """The serialized message, as it is safe to hand on: nodes end over one that cannot be read,
-        and rclpy does not look.
+        """The serialized message, as it is safe to hand on: nodes end over one that cannot be read
+        (rclpy's over text that is not UTF-16), and rclpy does not look.
 
         Its options become 0, which say how many bytes of padding are at its end: more than there
         are would end a node, too, and fewer are passed over.
         """
-        self.to_dict(cdr)
+        try:
+            self._decode(cdr)
+        except MISFIT:
+            decode(self.description, cdr, strict=True)
         return cdr[:2] + b"\0\0" + cdr[4:]
 
     def to_dict(self, cdr: bytes) -> dict[str, Any]:
