@@ -279,8 +279,7 @@ class Switchboard:
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
-            may_tell = not set("/+#\0") & set(caller.client_id)
-            self._fail(offer, caller, fallback if may_tell else None, error)
+            self._fail(offer, caller, fallback if _is_level(caller.client_id) else None, error)
             return
         call = Call(caller, message.payload, topic, reply)
         try:
@@ -306,13 +305,14 @@ class Switchboard:
                     "there is no Response Topic, nor, for 3.1.1, a token as the topic's last "
                     f"level: publish to {message.topic}/TOKEN, and subscribe to {own}/TOKEN",
                 )
-            if set("/+#\0") & set(caller.client_id):
+            if not _is_level(caller.client_id):
                 raise CallError(
                     "no_response_topic",
                     f"the client id {quote(caller.client_id)} cannot be a level of a topic",
                 )
             topic = f"{own}/{token}"
-        if topic == own or topic.startswith(f"{own}/"):
+        # What is below the id of a client `alice/1` belongs to the client `alice`.
+        if _is_level(caller.client_id) and (topic == own or topic.startswith(f"{own}/")):
             if not self._broker.may_receive(caller, topic):
                 raise CallError("not_authorized", f"the caller may not read {quote(topic)}")
         else:
@@ -412,6 +412,11 @@ class Switchboard:
 def error_payload(error: CallError) -> bytes:
     """An error as every answer has it: `{"error": {"code": …, "message": …}}`."""
     return orjson.dumps({"error": {"code": error.code, "message": str(error)}})
+
+
+def _is_level(client_id: str) -> bool:
+    """Whether the id can be one level of a topic, as `_reply/{client id}` needs it."""
+    return not set("/+#\0") & set(client_id)
 
 
 def _stopping() -> CallError:
