@@ -130,9 +130,9 @@ class Commands(ToRos):
         broker = self._around.broker
         self._is_left = False
         broker.departures.append(self._departed)
-        if self.rules.exclusive:
-            broker.guards.setdefault(self.mqtt, []).append(self)
-            broker.guards_changed()
+        # Also when anybody may command: the topic is then known as one that no answer goes to.
+        broker.guards.setdefault(self.mqtt, []).append(self)
+        broker.guards_changed()
 
     def leave(self) -> None:
         if self._is_left:
@@ -145,12 +145,11 @@ class Commands(ToRos):
             self._timer = None
         broker = self._around.broker
         broker.departures.remove(self._departed)
-        if self.rules.exclusive:
-            guards = broker.guards[self.mqtt]
-            guards.remove(self)
-            if not guards:
-                del broker.guards[self.mqtt]
-            broker.guards_changed()
+        guards = broker.guards[self.mqtt]
+        guards.remove(self)
+        if not guards:
+            del broker.guards[self.mqtt]
+        broker.guards_changed()
         self._holder = self._source = None
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> None:

@@ -16,6 +16,7 @@ from appliance.broker.ports import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Disconnect, Publish, Pubrel, Will
 from appliance.ros.bridge import RouteSettings
+from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import Converter
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
@@ -599,3 +600,20 @@ def test_limits_reach_into_arrays_of_messages():
 def test_limits_that_a_type_cannot_have(type_name, rules, problem):
     with pytest.raises(ConversionError, match=problem):
         limits(type_name, **rules)
+
+
+async def test_no_answer_to_a_call_is_a_command(house):
+    """It would come late, as the appliance's own, and outlive the client that asked for it."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    board = house.bridge.calls.board
+
+    async def slow(call):
+        return Answer(GO)
+
+    board.offer(Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), slow))
+    driver = Driver(house.broker, "a")
+    properties = {Property.RESPONSE_TOPIC: TOPIC}
+    driver.say(Publish("r2d2/slow/_call", b"", properties=properties))
+    await asyncio.sleep(0.02)
+    board.withdraw("r2d2/slow/_call")
+    assert house.robot.received == []
