@@ -153,6 +153,8 @@ class ActionRoutes:
         self._counters: dict[ActionSettings, CallCounters] = {}
         self._excluded = Names(())
         self._actions: dict[str, Action] = {}
+        #: Those whose route has gone before their goals.
+        self._past: list[Action] = []
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
@@ -192,10 +194,12 @@ class ActionRoutes:
                         and (of_type is None or of_type.fullmatch(type_name))
                     ):
                         wanted[name] = route
+        self._past = [action for action in self._past if action.has_goals]
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
                 del self._actions[name]
+                self._past.append(action)
         for name, route in wanted.items():
             if name not in self._actions:
                 self._actions[name] = Action(name, route, self._counters[route], self)
@@ -211,8 +215,17 @@ class ActionRoutes:
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
         if session in self.goals:
-            for action in self._actions.values():
+            for action in self._all():
                 action.departed(session)
+
+    def server_came(self, ros: str) -> None:
+        """Another server of that action has come."""
+        for action in self._all():
+            if action.ros == ros:
+                action.check_goals()
+
+    def _all(self) -> list[Action]:
+        return [*self._actions.values(), *self._past]
 
     def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the actions that it offers now."""
@@ -240,7 +253,7 @@ class ActionRoutes:
         are not to go on without them."""
         cancels = [
             action._cancel_quietly(goal.id, "the appliance stops")
-            for action in self._actions.values()
+            for action in self._all()
             if action.route.cancel_on_disconnect
             for goal in action._goals.values()
             if goal.is_accepted
@@ -254,6 +267,7 @@ class ActionRoutes:
         for action in self._actions.values():
             action.forget()
         self._actions.clear()
+        self._past.clear()
         await self._tasks.stop()
 
     # The ROS thread
@@ -425,7 +439,11 @@ class Action:
             if len(kept) > RESULTS:
                 self._board.publish(Message(kept.popleft()[0], b"", 0, True))
 
-    def server_came(self) -> None:
+    @property
+    def has_goals(self) -> bool:
+        return bool(self._goals)
+
+    def check_goals(self) -> None:
         """Another server has come: it may have taken the place of one that was ended."""
         type_name = self.type
         if type_name is None:
@@ -517,7 +535,7 @@ class Action:
             return
         servers = node.count(f"{self.ros}/_action/status")[0]
         if servers > self._servers and self._subscribed is not None:
-            self._routes._post(self.server_came)
+            self._routes._post(self._routes.server_came, self.ros)
         self._servers = servers
         if type_name == self._subscribed:
             return

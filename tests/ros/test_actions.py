@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, until
+from call_house import AllTypes, House, action, call_routes, until
 
 from appliance.ros import actions as module
 from appliance.ros.convert import Converters
@@ -161,3 +161,22 @@ async def test_the_appliance_stops_with_goals_under_way(house):
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await house.bridge.stop()
     assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: walks.results, "the result is asked for")
+    changed = action("/walk", cancel_on_disconnect=True, keep_result=1)
+    house.bridge.calls.replace(call_routes(changed))
+    client.leave()
+    await until(lambda: walks.cancelled, "the goal is cancelled")
+    assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    await client.call(GOAL, {"order": 3})
+    house.bridge.calls.replace(call_routes())
+    await house.bridge.stop()
+    assert len(walks.cancelled) == 1
