@@ -472,3 +472,10 @@ def test_what_is_called_twice_is_told() -> None:
     assert problems("bridge: {actions: [/a, {ros: /a, timeout: 1 s}]}") == [
         "1: bridge.actions[1].ros: is the same as bridge.actions[0]"
     ]
+
+
+def test_what_would_be_called_at_one_topic_is_told() -> None:
+    assert problems("bridge: {services: [{ros: /a, mqtt: x}, {ros: /b, mqtt: x}]}") == [
+        "1: bridge.services[1].mqtt: is the topic of bridge.services[0]"
+    ]
+    assert problems("bridge: {parameters: [/a/b, /a/c, {ros: /c/b, mqtt: '{robot}/a/_param'}]}")

@@ -310,9 +310,12 @@ class Action:
         self._counted = Counters()
         self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
         self._status_lane = Lane(1, self._counted)
-        for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel)):
-            topic = f"{self.base}/{verb}"
-            self._board.offer(Offer(topic, f"{ros} {verb[1:]}", route.timeout, counters, handle))
+        self._offers = [
+            Offer(f"{self.base}/{verb}", f"{ros} {verb[1:]}", route.timeout, counters, handle)
+            for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
+        ]
+        for offer in self._offers:
+            self._board.offer(offer)
         log.info("%s can be called at %s/_goal", ros, self.base)
 
     def see(self, is_there: bool) -> None:
@@ -513,8 +516,8 @@ class Action:
 
     def stop(self) -> None:
         """The route was removed. Goals go on, and their results are published."""
-        for verb in ("_goal", "_cancel"):
-            self._board.withdraw(f"{self.base}/{verb}")
+        for offer in self._offers:
+            self._board.withdraw(offer)
         self.forget()
         self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
         try:

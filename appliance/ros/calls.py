@@ -171,7 +171,8 @@ class Switchboard:
         self._receivers: dict[int, Receive] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
-        self._offers: set[str] = set()
+        #: By topic, the first of those that were offered there; the others wait for it to go.
+        self._offers: dict[str, list[Offer]] = {}
         self._under_way: Counter[Session] = Counter()
         self._calls: set[Call] = set()
         self._report_at: dict[str, float] = {}
@@ -188,7 +189,8 @@ class Switchboard:
     async def stop(self) -> None:
         """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
         for topic in list(self._offers):
-            self.withdraw(topic)
+            del self._offers[topic]
+            self._ignore_calls(topic)
         tasks = [call.task for call in self._calls if call.task is not None]
         for task in tasks:
             task.cancel()
@@ -226,15 +228,35 @@ class Switchboard:
 
     def offer(self, offer: Offer) -> None:
         """Let `offer.topic`, which may have a `+` in it, be called."""
-        self._offers.add(offer.topic)
+        offers = self._offers.setdefault(offer.topic, [])
+        offers.append(offer)
+        if len(offers) == 1:
+            self._listen_for(offer)
+        else:
+            text = "%s cannot be called: calls at %s are for %s"
+            log.warning(text, offer.name, offer.topic, offers[0].name)
+
+    def _listen_for(self, offer: Offer) -> None:
         self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
         self.listen(
             f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
         )
 
-    def withdraw(self, topic: str) -> None:
+    def withdraw(self, offer: Offer) -> None:
         """Offer it no longer; calls under way have their answers yet."""
-        self._offers.remove(topic)
+        offers = self._offers.get(offer.topic, [])
+        if offer not in offers:
+            return  # `stop` has withdrawn all
+        was_first = offers[0] is offer
+        offers.remove(offer)
+        if not offers:
+            del self._offers[offer.topic]
+        if was_first:
+            self._ignore_calls(offer.topic)
+            if offers:
+                self._listen_for(offers[0])
+
+    def _ignore_calls(self, topic: str) -> None:
         self.ignore(topic)
         self.ignore(f"{topic}/+")
 

@@ -85,6 +85,7 @@ class _Node:
     route: ParameterSettings
     wanted: Names
     shown: dict[str, bytes] = field(default_factory=dict)
+    offers: list[Offer] = field(default_factory=list)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
@@ -179,14 +180,16 @@ class ParameterRoutes:
         counters = self._counters[route]
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
             what = f"{name}'s parameters"
-            self._board.offer(Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle))
+            offer = Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle)
+            node.offers.append(offer)
+            self._board.offer(offer)
         self._load(node)
 
     def _leave(self, node: _Node) -> None:
         del self._nodes[node.name]
         node.is_gone = True
-        for topic in ("+/set", "_set"):
-            self._board.withdraw(f"{node.base}/{topic}")
+        for offer in node.offers:
+            self._board.withdraw(offer)
         for parameter in node.shown:
             self._board.publish(Message(f"{node.base}/{parameter}", b"", 0, True))
         node.shown.clear()

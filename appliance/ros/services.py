@@ -156,7 +156,7 @@ class ServiceRoutes:
         wanted = self._wanted()
         for name, (route, offer) in list(self._offered.items()):
             if wanted.get(name) != route:
-                self._board.withdraw(offer.topic)
+                self._board.withdraw(offer)
                 del self._offered[name]
         for name, route in wanted.items():
             if name not in self._offered:

@@ -610,10 +610,11 @@ async def test_no_answer_to_a_call_is_a_command(house):
     async def slow(call):
         return Answer(GO)
 
-    board.offer(Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), slow))
+    offer = Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), slow)
+    board.offer(offer)
     driver = Driver(house.broker, "a")
     properties = {Property.RESPONSE_TOPIC: TOPIC}
     driver.say(Publish("r2d2/slow/_call", b"", properties=properties))
     await asyncio.sleep(0.02)
-    board.withdraw("r2d2/slow/_call")
+    board.withdraw(offer)
     assert house.robot.received == []

@@ -511,3 +511,19 @@ async def test_a_client_id_with_a_slash_gives_no_way_into_the_answers_of_another
     assert switch.asked == [] and alice.received == []
     status, _ = await mallory.call(CALL, {"data": True})  # where it may publish, it has answers
     assert status == "ok"
+
+
+async def test_of_two_services_at_one_topic_the_second_waits_for_it(house, caplog):
+    first, second = service("/switch"), service("/other", mqtt="r2d2/switch")
+    house.start(first)
+    switch, other = Switch(house), Switch(house, "/other")
+    client = house.client("alice")
+    house.bridge.calls.replace(call_routes(first, second))
+    assert "/other cannot be called: calls at r2d2/switch/_call are for /switch" in caplog.text
+    await client.call(CALL, {"data": True})
+    assert (switch.asked, other.asked) == ([True], [])
+    house.bridge.calls.replace(call_routes(second))
+    await client.call(CALL, {"data": False})
+    assert (switch.asked, other.asked) == ([True], [False])
+    house.bridge.calls.replace(call_routes())
+    assert house.bridge.calls.board._offers == {}
