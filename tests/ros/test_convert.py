@@ -7,6 +7,7 @@ import json
 import math
 import random
 import struct
+import sys
 
 import orjson
 import pytest
@@ -701,3 +702,14 @@ def test_text_in_cdr_keeps_to_its_bound():
     with pytest.raises(ConversionError, match="data: 23 bytes of UTF-8, at most 22"):
         bounded.checked(cdr)
     assert converters.get("std_msgs/msg/String").checked(cdr) == cdr
+
+
+def test_a_type_name_does_not_get_just_anything_imported(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "broken_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "broken_msgs" / "msg" / "__init__.py").write_text("1 / 0")
+    with pytest.raises(UnknownTypeError, match="broken_msgs is broken: ZeroDivisionError"):
+        import_message("broken_msgs/msg/A")
+    with pytest.raises(UnknownTypeError, match="this is not a package of messages"):
+        import_message("this/msg/A")
+    assert "this" not in sys.modules
