@@ -731,10 +731,12 @@ class ParameterRoute(_CalledRoute):
 
 
 class BridgeLimits(_Section):
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and what one message for ROS
+    may have, in bytes."""
 
     calls: Count = 500
     calls_per_client: Count = 20
+    payload: Annotated[Size, Field(gt=0)] = 1 << 20
 
 
 class Bridge(_Section):

@@ -425,7 +425,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         "  services: [/reset, {ros: '/arm/**', type: 'std_srvs/srv/*'}, '!/arm/off']\n"
         "  actions: [{ros: /walk, keep_result: 1 min, cancel_on_disconnect: true}]\n"
         "  parameters: [/arm/*, '/**/use_*', '!/arm/key']\n"
-        "  limits: {calls: 9, calls_per_client: 3}"
+        "  limits: {calls: 9, calls_per_client: 3, payload: 2 MiB}"
     ).bridge
     assert [(r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services] == [
         ("/reset", False, "r2{ros}"),
@@ -438,7 +438,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         ("/**", "use_*", True),
         ("!/arm", "key", False),
     ]
-    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3)
+    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3, payload=2 << 20)
 
 
 @pytest.mark.parametrize(

@@ -345,8 +345,8 @@ class Action:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
         fields = orjson.loads(call.payload or b"{}")
-        request = self._converters.get(request_type).from_dict(
-            {"goal_id": {"uuid": id_}, "goal": fields}
+        request = self._converters.get(request_type).from_values(
+            {"goal_id": {"uuid": id_}, "goal": fields}, len(call.payload)
         )
         goal = _Goal(id_, call.caller, asyncio.get_running_loop().create_future())
         self._goals[id_] = goal

@@ -35,6 +35,7 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.ros.backlog import Backlog
+from appliance.ros.payloads import too_large
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ ErrorCode: TypeAlias = Literal[
     "expired",  # it was sent long before it came
     "no_response_topic",  # there is no way to answer
     "not_authorized",  # the caller may not have the answer there, or not ask for that
+    "too_large",  # the payload is larger than what is converted
     "too_many",  # the caller, or all together, have too many calls under way
     "unavailable",  # there is no such service, action or node on the bus now
     "vanished",  # there was, and it went away before it answered
@@ -61,6 +63,14 @@ JSON = "application/json"
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
+
+
+#: Bytes that are converted in a microsecond or so, and count for that in the broker's
+#: `Counters.effort`: who sends much then waits for the others.
+BYTES_AN_EFFORT = 16
+
+#: Bytes of payload of all calls under way.
+TOTAL_BYTES = 64 * 1024 * 1024
 
 
 class CallError(Exception):
@@ -82,10 +92,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and bytes of a call."""
 
     client: int = 20
     total: int = 500
+    payload: int = 1024 * 1024
 
 
 @dataclass(eq=False, slots=True)
@@ -175,6 +186,7 @@ class Switchboard:
         self._offers: dict[str, list[Offer]] = {}
         self._under_way: Counter[Session] = Counter()
         self._calls: set[Call] = set()
+        self._bytes = 0
         self._report_at: dict[str, float] = {}
 
     def start(self) -> None:
@@ -262,6 +274,7 @@ class Switchboard:
 
     def receive(self, origin: Session, message: Message, identifier: int) -> None:
         """A message came through the subscription with that identifier."""
+        self._broker.counters.effort += len(message.payload) // BYTES_AN_EFFORT
         receive = self._receivers.get(identifier)
         if receive is not None:
             receive(origin, message)
@@ -312,6 +325,7 @@ class Switchboard:
         self._under_way[caller] += 1
         offer.counters.under_way += 1
         self._calls.add(call)
+        self._bytes += len(call.payload)
         call.task = self._loop.create_task(self._run(offer, call))
         call.task.add_done_callback(lambda _: self._forget(offer, call))
 
@@ -364,6 +378,11 @@ class Switchboard:
             # Nobody waits for its answer any more, and what it would do nobody expects now.
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
         limits = self.limits
+        size = len(message.payload)
+        if size > limits.payload:
+            raise CallError("too_large", too_large(size, limits.payload))
+        if self._bytes + size > TOTAL_BYTES:
+            raise CallError("too_many", f"{self._bytes} bytes of calls are under way")
         if self._under_way[caller] >= limits.client:
             raise CallError(
                 "too_many", f"{limits.client} calls of this client are under way, as many as may be"
@@ -403,6 +422,7 @@ class Switchboard:
             self._fail(offer, call.caller, call.reply, _stopping())
         offer.counters.under_way -= 1
         self._calls.discard(call)
+        self._bytes -= len(call.payload)
         self._under_way[call.caller] -= 1
         if not self._under_way[call.caller]:
             del self._under_way[call.caller]

@@ -66,7 +66,7 @@ class RouteSettings:
     (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
     is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
     paths of those that go to MQTT, all of them when there are none; what comes from MQTT has at
-    most `largest` bytes when it is decompressed.
+    most `largest` bytes, and no more when it is decompressed.
     """
 
     ros: str | tuple[str, ...]
@@ -81,7 +81,7 @@ class RouteSettings:
     compression: Compression = "none"
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
-    largest: int = 16 * 1024 * 1024
+    largest: int = 1024 * 1024
     #: What holds for what goes to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 

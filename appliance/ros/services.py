@@ -41,6 +41,7 @@ from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.payloads import too_large
 from appliance.ros.requests import Key, Requests
 
 log = logging.getLogger(__name__)
@@ -384,6 +385,10 @@ class Provided:
         asked = self._forget(message.topic.rpartition("/")[2])
         if asked is None:
             log.debug("%s: a response to nothing under way", self._route.ros)
+            return
+        size, most = len(message.payload), self._board.limits.payload
+        if size > most:
+            self._fail(asked.respond, f"too_large: {too_large(size, most)}")
             return
         told = (message.properties or {}).get(Property.USER_PROPERTY)
         if isinstance(told, list) and ("status", "error") in told:

@@ -15,6 +15,7 @@ from appliance.broker.message import Late, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros import calls
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls import CallLimits
 from appliance.ros.convert import Converters
@@ -527,3 +528,39 @@ async def test_of_two_services_at_one_topic_the_second_waits_for_it(house, caplo
     assert (switch.asked, other.asked) == ([True], [False])
     house.bridge.calls.replace(call_routes())
     assert house.bridge.calls.board._offers == {}
+
+
+async def test_a_call_that_is_too_large(house):
+    house.start(service("/switch"), service("/ask", to="mqtt", type=SET_BOOL, on_error="{}"))
+    house.bridge.calls.board.limits = CallLimits(payload=100)
+    switch = Switch(house)
+    client = house.client("alice", "r2d2/ask/_request/+")
+    before = house.broker.counters.effort
+    code, text = await client.error(CALL, b'{"data": true}' + b" " * 87)
+    assert (code, switch.asked) == ("too_large", [])
+    assert "101 bytes" in text and "bridge.limits.payload" in text
+    assert house.broker.counters.effort > before + 101 // 16
+    said = []
+    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    await until(lambda: client.received[1:], "the request")
+    request = client.received[-1].topic
+    client.send(request.replace("_request", "_response"), b'{"success": true}' + b" " * 100)
+    await until(lambda: said, "the response")
+    assert value(f"{SET_BOOL}_Response", said[0])["success"] is False
+
+
+async def test_calls_are_bounded_in_bytes(house, monkeypatch):
+    monkeypatch.setattr(calls, "TOTAL_BYTES", 100)
+    house.start(service("/switch"))
+    switch = Switch(house)
+    switch.holds = True
+    client = house.client("alice")
+    for token in (1, 2):
+        client.send(f"{CALL}/{token}", b'{"data": true}' + b" " * 26)
+    code, _ = await client.error(CALL, b'{"data": true}' + b" " * 26)
+    assert code == "too_many"
+    await until(lambda: len(switch.asked) == 2, "the calls")
+    switch.answer()
+    await until(lambda: house.counters().under_way == 0, "the answers")
+    switch.holds = False
+    assert (await client.call(CALL, {"data": True}))[0] == "ok"
