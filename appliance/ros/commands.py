@@ -256,6 +256,9 @@ class Commands(ToRos):
             self._source = None
             if self._is_driven:
                 self._publish_stop(f"{session} has left")
+            if self._stop is not None and not self._stop.is_like(self._last):
+                # Its library may have queued what it commanded since, and marks none of it as old.
+                self._backlog.expect(session.client_id)
 
     def _arm(self) -> None:
         due = math.inf

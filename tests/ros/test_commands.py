@@ -15,6 +15,7 @@ from appliance.broker.message import Late
 from appliance.broker.ports import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Disconnect, Publish, Pubrel, Will
+from appliance.ros import backlog
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
@@ -361,7 +362,11 @@ async def test_who_drives_and_falls_silent_is_disconnected(house):
     assert driver.wire.written == Disconnect(0x98).encode(5)
     driver.drive()
     assert house.robot.received == [twist(0.5), STOP]
-    Driver(house.broker, "a").drive()
+    driver = Driver(house.broker, "a")
+    driver.drive()  # what it had queued, perhaps
+    assert house.robot.received == [twist(0.5), STOP]
+    await asyncio.sleep(AFTER + 0.02)
+    driver.drive()
     assert house.robot.received[-1] == twist(0.5)
 
 
@@ -618,3 +623,51 @@ async def test_no_answer_to_a_call_is_a_command(house):
     await asyncio.sleep(0.02)
     board.withdraw(offer)
     assert house.robot.received == []
+
+
+async def test_a_backlog_that_takes_longer_than_a_command_may(house):
+    """Bursts of it, as the acknowledgements let them through, over a slow network."""
+    house.start(CommandRules(expire=0.1))
+    driver = Driver(house.broker, "a")
+    driver.drive(qos=1, dup=True)
+    for _ in range(6):
+        for _ in range(5):
+            driver.drive(qos=1)
+        await asyncio.sleep(0.03)
+    assert house.robot.received == []
+    for _ in range(8):  # commands as they are made
+        await asyncio.sleep(0.02)
+        driver.drive(qos=1)
+    assert 1 <= len(house.robot.received) <= 7
+
+
+async def test_who_is_always_fast_is_heard_again(house, monkeypatch):
+    monkeypatch.setattr(backlog, "LONGEST", 0.1)
+    house.start(CommandRules(expire=0.05))
+    driver = Driver(house.broker, "a")
+    driver.drive(qos=1, dup=True)
+    end = time.monotonic() + 0.2
+    while time.monotonic() < end:
+        driver.drive()
+        await asyncio.sleep(0.001)
+    assert house.robot.received
+
+
+async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
+    """Libraries queue what is said without a connection, and send it as if it were new."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    driver.cut()
+    assert house.robot.received == [twist(0.5), STOP]
+    driver = Driver(house.broker, "a")
+    for _ in range(50):
+        driver.drive(qos=1)
+    assert house.robot.received == [twist(0.5), STOP]
+    await asyncio.sleep(AFTER + 0.02)
+    driver.drive()
+    assert house.robot.received == [twist(0.5), STOP, twist(0.5)]
+    driver.drive(b"{}")  # it stops by itself, and is trusted when it comes back
+    driver.cut()
+    Driver(house.broker, "a").drive()
+    assert house.robot.received[2:] == [twist(0.5), STOP, twist(0.5)]
