@@ -81,7 +81,7 @@ class Commands(ToRos):
         #: Both replaced as one by the ROS thread.
         self._limits: FieldLimits | None = None
         self._stop: _Stop | None = None
-        #: Looks that have found a subscription.
+        #: Looks that have found a subscription, since there is this publisher.
         self._looks = 0
         #: Who may command alone, None while nobody does.
         self._holder: Session | None = None
@@ -122,6 +122,9 @@ class Commands(ToRos):
             except ConversionError as error:
                 raise ConversionError("on_silence.publish", str(error)) from None
         self._limits, self._stop = limits, stop
+        # Another publisher has not been found by anybody: as at the route's beginning, a stop
+        # message that it sends now may be lost, and is sent again.
+        self._looks = 0
         return super()._open(node, type_name, qos, type_hash)
 
     # The loop's thread
@@ -305,7 +308,7 @@ class Commands(ToRos):
         if self._is_left:
             return
         if not self._has_stopped:
-            self._publish_stop("the route begins")
+            self._publish_stop("there is somebody to hear it")
         message, self._waiting = self._waiting, None
         if message is not None:
             self.receive(message, True, None)
@@ -330,7 +333,7 @@ class Commands(ToRos):
                 self._stop_later()
             return
         self._is_driven = self._must_stop = False
-        self._has_stopped = True
+        self._has_stopped = self._looks >= LOOKS_TO_MATCH
         self.counters.stops += 1
         self._mention("stopped", "%s: the stop message was published: %s", why)
 

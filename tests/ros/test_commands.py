@@ -20,6 +20,7 @@ from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import Converter
+from appliance.ros.node import Durability, QosProfile
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
@@ -671,3 +672,20 @@ async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
     driver.cut()
     Driver(house.broker, "a").drive()
     assert house.robot.received[2:] == [twist(0.5), STOP, twist(0.5)]
+
+
+async def test_a_stop_message_that_may_have_been_lost_is_published_again(house):
+    """A publisher that was made anew has not found the robot yet: what it sends goes nowhere."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    house.node.spin()
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    latched = QosProfile(durability=Durability.TRANSIENT_LOCAL)
+    house.node.add_subscriber("/cmd_vel", TWIST, latched)  # for which the publisher is made anew
+    house.robot.received.clear()
+    driver.cut()
+    assert house.robot.received == [STOP]
+    for _ in range(3):
+        house.node.spin()
+        await asyncio.sleep(0.01)
+    assert house.robot.received == [STOP, STOP]
