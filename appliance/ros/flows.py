@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, Property, encode_string
+from appliance.mqtt.codec import Properties, Property, encode_string, quote
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters, Meter
@@ -545,7 +545,8 @@ class ToRos(Flow):
         wanted = self._wanted
         claimed = claim(properties, "ros-type")
         if wanted is not None and claimed is not None and claimed != wanted[0]:
-            raise ConversionError("", f"it says to be {claimed}, {self.ros} carries {wanted[0]}")
+            problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
+            raise ConversionError("", problem)
         try:
             return convert(message.payload)
         except ConversionError as error:
@@ -553,7 +554,9 @@ class ToRos(Flow):
             encoding = self.settings.encoding
             if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
                 raise
-            problem = f"{error.problem} (it says to be {said}, and the route takes {encoding})"
+            problem = (
+                f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"
+            )
             raise ConversionError(error.path, problem) from None
 
     def _why_not(self) -> str:

@@ -451,12 +451,10 @@ class Provided:
             log.debug("%s: the bus has gone", self._route.ros)
 
     def stop(self) -> None:
-        """Offer it no longer; what is under way gets no response."""
+        """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
         self._board.ignore(f"{self._base}/_response/+")
-        for asked in self._asked.values():
-            asked.timer.cancel()
-        self._counters.under_way -= len(self._asked)
-        self._asked.clear()
+        for token in list(self._asked):
+            self._give_up(token, "stopping: the service is offered no longer")
         try:
             self._node.call_soon(self._close)
         except BusError:

@@ -244,7 +244,8 @@ def test_every_encoding_can_be_compressed(encoding):
 @pytest.mark.parametrize(
     ("payload", "properties", "problem"),
     [
-        (b"{}", {Property.USER_PROPERTY: [("ros-type", TWIST)]}, f"says to be {TWIST}"),
+        (b"{}", {Property.USER_PROPERTY: [("ros-type", TWIST)]}, f"says to be '{TWIST}'"),
+        (b"{}", {Property.USER_PROPERTY: [("ros-type", "x\n" * 999)]}, "x\\n'…, /chatter carries"),
         (b"\xa0", {Property.CONTENT_TYPE: "application/cbor"}, "the route takes json"),
     ],
 )

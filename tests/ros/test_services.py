@@ -564,3 +564,15 @@ async def test_calls_are_bounded_in_bytes(house, monkeypatch):
     await until(lambda: house.counters().under_way == 0, "the answers")
     switch.holds = False
     assert (await client.call(CALL, {"data": True}))[0] == "ok"
+
+
+async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(house):
+    on_error = '{"success": false, "message": "gone"}'
+    house.start(service("/ask", to="mqtt", type=SET_BOOL, on_error=on_error))
+    house.client("alice", "r2d2/ask/_request/+")
+    said = []
+    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    await until(lambda: house.counters().under_way, "the request")
+    house.bridge.calls.replace(call_routes())
+    await until(lambda: said, "the response")
+    assert value(f"{SET_BOOL}_Response", said[0])["message"] == "gone"
