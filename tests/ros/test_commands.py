@@ -20,7 +20,7 @@ from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import Converter
-from appliance.ros.node import Durability, QosProfile
+from appliance.ros.node import Durability, Endpoint, FakePeer, QosProfile
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
@@ -689,3 +689,22 @@ async def test_a_stop_message_that_may_have_been_lost_is_published_again(house):
         house.node.spin()
         await asyncio.sleep(0.01)
     assert house.robot.received == [STOP, STOP]
+
+
+async def test_retained_commands_of_more_topics_than_one_turn_is_for(house):
+    """A network client goes on in its next turn; the bridge has to be given one."""
+    rules = CommandRules(take_retained=True)
+    names = [f"/arm/joint_{number}" for number in range(300)]
+    for name in names:
+        house.client.send(f"r2d2{name}", GO, retain=True)
+    robots = [FakePeer(house.node, name, Endpoint("/robot", TWIST, QosProfile())) for name in names]
+    house.node.remote_subscribers += robots
+    House.start(
+        house, *(RouteSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
+    )
+    for _ in range(3):
+        house.node.spin()
+        await house.settle()
+    assert [robot.received for robot in robots] == [[twist(0.5)]] * 300
+    house.client.send(f"r2d2{names[-1]}", b"{}")  # nothing is left that others would wait behind
+    assert robots[-1].received == [twist(0.5), STOP]
