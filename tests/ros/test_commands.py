@@ -708,3 +708,12 @@ async def test_retained_commands_of_more_topics_than_one_turn_is_for(house):
     assert [robot.received for robot in robots] == [[twist(0.5)]] * 300
     house.client.send(f"r2d2{names[-1]}", b"{}")  # nothing is left that others would wait behind
     assert robots[-1].received == [twist(0.5), STOP]
+
+
+@pytest.mark.parametrize(("low", "high"), [(1e-50, 1.0), (-1.0, -1e-50)])
+def test_a_bound_that_is_next_to_zero(low, high):
+    converter = Converter(load_description("std_msgs/msg/Float32"), time.time_ns)
+    limits = FieldLimits(CommandRules(clamp=(("data", low, high),)), converter)
+    for number in (0.0, -0.0, -5.0, 5.0, 1e-45, -1e-45):
+        limited, _ = limits.apply(converter.from_dict({"data": number}))
+        assert low <= converter.to_dict(limited)["data"] <= high
