@@ -576,3 +576,12 @@ async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(h
     house.bridge.calls.replace(call_routes())
     await until(lambda: said, "the response")
     assert value(f"{SET_BOOL}_Response", said[0])["message"] == "gone"
+
+
+async def test_a_service_of_another_type_than_the_route_says(house):
+    house.start(service("/switch", type=TRIGGER, timeout=1.0))
+    Switch(house)
+    client = house.client("alice")
+    code, text = await client.error(CALL)
+    assert code == "unavailable"
+    assert text == f"/switch is a {SET_BOOL} on the bus, not a {TRIGGER}"
