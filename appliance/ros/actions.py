@@ -61,6 +61,9 @@ STATUS = "action_msgs/msg/GoalStatusArray"
 #: By the numbers of action_msgs/msg/GoalStatus.
 STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
+#: Those of a goal that goes on.
+_ACCEPTED, _EXECUTING = 1, 2
+
 #: By the numbers of action_msgs/srv/CancelGoal.
 _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
     1: ("rejected", "the action's server does not cancel it"),
@@ -73,6 +76,9 @@ LANES = 256
 
 #: Results that one action keeps at a time; the oldest go first.
 RESULTS = 1000
+
+#: Goals of one action that were given up before they were accepted; the oldest are forgotten first.
+UNWANTED = 1000
 
 #: Seconds that a server which has just come has to say that it does not know a goal.
 CHECK_TIME = 5.0
@@ -300,6 +306,8 @@ class Action:
         self._requests = routes._requests
         self._converters = routes._converters
         self._goals: dict[bytes, _Goal] = {}
+        #: Goals that nobody waits for any more, should their server accept them yet.
+        self._unwanted: OrderedDict[bytes, None] = OrderedDict()
         #: Topics of results that are retained, and until when; they all have the same time.
         self._kept: deque[tuple[str, float]] = deque()
         # The ROS thread's.
@@ -359,8 +367,12 @@ class Action:
             if not said["accepted"]:
                 raise CallError("rejected", f"{self.ros} does not accept the goal")
         except asyncio.CancelledError:
-            # It may be accepted yet, and nobody would know of it.
+            # It may be accepted yet, and nobody would know of it: it is cancelled now, and once
+            # more should it begin after that.
             self._forget(goal)
+            self._unwanted[id_] = None
+            if len(self._unwanted) > UNWANTED:
+                self._unwanted.popitem(last=False)
             self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
             raise
         except BaseException:
@@ -500,6 +512,13 @@ class Action:
         else:
             log.info("goal %s of %s is cancelled: %s", id_.hex(), self.ros, why)
 
+    def _cancel_unwanted(self, ids: list[bytes]) -> None:
+        for id_ in ids:
+            if id_ in self._unwanted:
+                del self._unwanted[id_]
+                why = "it was accepted when nobody waited for it any more"
+                self._routes._tasks.begin(self._cancel_quietly(id_, why))
+
     def departed(self, session: Session) -> None:
         """The client has gone."""
         if not self.route.cancel_on_disconnect:
@@ -579,6 +598,13 @@ class Action:
         except ConversionError as error:
             self._counters.last_error = str(error)
             return
+        late = [
+            _id(one["goal_info"]["goal_id"])
+            for one in (said["status_list"] if self._unwanted else ())
+            if one["status"] in (_ACCEPTED, _EXECUTING)
+        ]
+        if any(id_ in self._unwanted for id_ in late):
+            self._routes._post(self._cancel_unwanted, late)
         goals = [
             {
                 "goal_id": _id(one["goal_info"]["goal_id"]).hex(),
