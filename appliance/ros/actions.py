@@ -369,11 +369,14 @@ class Action:
         except asyncio.CancelledError:
             # It may be accepted yet, and nobody would know of it: it is cancelled now, and once
             # more should it begin after that.
-            self._forget(goal)
-            self._unwanted[id_] = None
-            if len(self._unwanted) > UNWANTED:
-                self._unwanted.popitem(last=False)
+            self._give_up(goal)
             self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
+            raise
+        except CallError as error:
+            if error.code == "vanished":  # for a moment only, perhaps
+                self._give_up(goal)
+            else:
+                self._forget(goal)
             raise
         except BaseException:
             self._forget(goal)
@@ -400,6 +403,13 @@ class Action:
             goals[goal.owner] -= 1
             if not goals[goal.owner]:
                 del goals[goal.owner]
+
+    def _give_up(self, goal: _Goal) -> None:
+        """Nobody waits for its acceptance any more: should it come, it is cancelled."""
+        self._forget(goal)
+        self._unwanted[goal.id] = None
+        if len(self._unwanted) > UNWANTED:
+            self._unwanted.popitem(last=False)
 
     async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
         """Wait for the result, as long as it takes, and publish it."""
