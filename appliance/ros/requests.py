@@ -107,6 +107,11 @@ class Requests:
 
     # The ROS thread
 
+    @property
+    def has_clients(self) -> bool:
+        """Whether there is a client of a service: something may be under way, or it is idle yet."""
+        return bool(self._remotes)
+
     def look(self) -> None:
         """Follow the graph, send what has waited for its server, tell who waits in vain."""
         services = self._node.services()

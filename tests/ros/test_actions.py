@@ -10,6 +10,7 @@ pytest.importorskip("test_msgs.action")
 from call_house import AllTypes, House, action, call_routes, until
 
 from appliance.ros import actions as module
+from appliance.ros import requests
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
 from appliance.ros.node import Durability, FakeNode, QosProfile
@@ -204,3 +205,17 @@ async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(house):
     latched.publish(CONVERTERS.get(module.STATUS).from_dict({"status_list": [status]}))
     await asyncio.sleep(0.01)
     assert len(set(walks.cancelled)) == 1 and len(walks.cancelled) == 2
+
+
+async def test_the_server_of_a_goal_vanishes_after_the_last_route(house, monkeypatch):
+    monkeypatch.setattr(requests, "IDLE_LOOKS", 2)
+    walks, client = await begin(house)
+    await client.call(GOAL, {"order": 3})
+    await until(lambda: walks.results, "the result is asked for")
+    house.bridge.calls.replace(call_routes())
+    walks.vanish()
+    await until(lambda: results(client), "the result")
+    assert client.payloads(results(client)[0].topic)[0]["error"]["code"] == "vanished"
+    for _ in range(4):
+        house.node.spin()
+    assert house.node.clients == []
