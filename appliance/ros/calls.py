@@ -263,6 +263,7 @@ class Switchboard:
         offers.remove(offer)
         if not offers:
             del self._offers[offer.topic]
+            self._report_at.pop(offer.topic, None)
         if was_first:
             self._ignore_calls(offer.topic)
             if offers:

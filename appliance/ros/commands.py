@@ -95,8 +95,8 @@ class Commands(ToRos):
         self._backlog = Backlog()
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
-        #: A retained message from before there was anybody on ROS to have it.
-        self._waiting: Message | None = None
+        #: Whether the topic had a retained message before there was anybody on ROS to have it.
+        self._is_awaited = False
         self._timer: asyncio.TimerHandle | None = None
         self._is_left = True
         self._told: dict[str, float] = {}
@@ -159,8 +159,9 @@ class Commands(ToRos):
         if self._is_left or not self._is_in_time(message, retain, origin):
             return
         out = self._out
-        if retain and (out is None or self._looks < LOOKS_TO_MATCH):
-            self._waiting = message
+        is_kept = retain or (message.retain and self.rules.take_retained)
+        if is_kept and (out is None or self._looks < LOOKS_TO_MATCH):
+            self._is_awaited = True
             return
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
@@ -216,7 +217,7 @@ class Commands(ToRos):
         self._is_driven = self._stop is not None and cdr != self._stop.example
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
-        self._waiting = None
+        self._is_awaited = False
         if self.rules.exclusive and self._holder is None and origin is not None and origin.link:
             self._holder = origin
             self._around.broker.guards_changed()
@@ -309,9 +310,12 @@ class Commands(ToRos):
             return
         if not self._has_stopped:
             self._publish_stop("there is somebody to hear it")
-        message, self._waiting = self._waiting, None
-        if message is not None:
-            self.receive(message, True, None)
+        if self._is_awaited:
+            self._is_awaited = False
+            # What is retained now: it may have been replaced, or taken back.
+            message = self._around.broker.retained.get(self.mqtt)
+            if message is not None:
+                self.receive(message, True, None)
 
     def _publish_stop(self, why: str) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""

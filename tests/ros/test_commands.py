@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import struct
 import time
 
@@ -11,11 +12,11 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
-from appliance.broker.message import Late
+from appliance.broker.message import Late, Message
 from appliance.broker.ports import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Disconnect, Publish, Pubrel, Will
-from appliance.ros import backlog
+from appliance.ros.backlog import EXPECTED, Backlog
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
@@ -626,32 +627,39 @@ async def test_no_answer_to_a_call_is_a_command(house):
     assert house.robot.received == []
 
 
-async def test_a_backlog_that_takes_longer_than_a_command_may(house):
-    """Bursts of it, as the acknowledgements let them through, over a slow network."""
-    house.start(CommandRules(expire=0.1))
-    driver = Driver(house.broker, "a")
-    driver.drive(qos=1, dup=True)
-    for _ in range(6):
-        for _ in range(5):
-            driver.drive(qos=1)
-        await asyncio.sleep(0.03)
-    assert house.robot.received == []
-    for _ in range(8):  # commands as they are made
-        await asyncio.sleep(0.02)
-        driver.drive(qos=1)
-    assert 1 <= len(house.robot.received) <= 7
+class TestBacklog:
+    """On times of its own."""
 
+    NEW = Message(TOPIC, GO)
 
-async def test_who_is_always_fast_is_heard_again(house, monkeypatch):
-    monkeypatch.setattr(backlog, "LONGEST", 0.1)
-    house.start(CommandRules(expire=0.05))
-    driver = Driver(house.broker, "a")
-    driver.drive(qos=1, dup=True)
-    end = time.monotonic() + 0.2
-    while time.monotonic() < end:
-        driver.drive()
-        await asyncio.sleep(0.001)
-    assert house.robot.received
+    def begin(self):
+        backlog = Backlog()
+        assert backlog.has(Late(self.NEW, math.inf), self, 0.5, 100.0)
+        return backlog
+
+    def test_it_takes_longer_than_a_command_may(self):
+        """Bursts of it, as the acknowledgements let them through, over a slow network."""
+        backlog, now = self.begin(), 100.0
+        for burst in range(20):
+            now = 100.0 + 0.4 * burst
+            assert all(backlog.has(self.NEW, self, 0.5, now + 0.001 * n) for n in range(5))
+        # Commands as they are made, of which one or the other pair comes together.
+        assert backlog.has(self.NEW, self, 0.5, now + 0.4)
+        assert backlog.has(self.NEW, self, 0.5, now + 0.401)
+        assert not backlog.has(self.NEW, self, 0.5, now + 0.52)
+        assert not backlog.has(self.NEW, self, 0.5, now + 0.521)
+
+    def test_who_is_always_fast_is_heard_again(self):
+        backlog = self.begin()
+        times = [100.0 + 0.002 * n for n in range(40_000)]
+        heard = next(now for now in times if not backlog.has(self.NEW, self, 0.5, now))
+        assert 150 < heard < 161
+
+    def test_clients_whose_return_is_expected_are_bounded(self):
+        backlog = Backlog()
+        for number in range(2 * EXPECTED):
+            backlog.expect(str(number))
+        assert len(backlog._expected) == EXPECTED
 
 
 async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
@@ -665,13 +673,12 @@ async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
     for _ in range(50):
         driver.drive(qos=1)
     assert house.robot.received == [twist(0.5), STOP]
-    await asyncio.sleep(AFTER + 0.02)
-    driver.drive()
-    assert house.robot.received == [twist(0.5), STOP, twist(0.5)]
+    await asyncio.sleep(1.2 * AFTER)
     driver.drive(b"{}")  # it stops by itself, and is trusted when it comes back
+    assert house.robot.received == [twist(0.5), STOP, STOP]
     driver.cut()
     Driver(house.broker, "a").drive()
-    assert house.robot.received[2:] == [twist(0.5), STOP, twist(0.5)]
+    assert house.robot.received == [twist(0.5), STOP, STOP, twist(0.5)]
 
 
 async def test_a_stop_message_that_may_have_been_lost_is_published_again(house):
@@ -717,3 +724,18 @@ def test_a_bound_that_is_next_to_zero(low, high):
     for number in (0.0, -0.0, -5.0, 5.0, 1e-45, -1e-45):
         limited, _ = limits.apply(converter.from_dict({"data": number}))
         assert low <= converter.to_dict(limited)["data"] <= high
+
+
+@pytest.mark.parametrize("now", [b"", b'{"linear":{"x":0.1}}'])
+async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(house, now):
+    house.client.send(TOPIC, GO, retain=True)
+    rules = CommandRules(take_retained=True)
+    House.start(house, RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
+    await house.settle()
+    house.client.send(TOPIC, now, retain=True)
+    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    robot.received.clear()
+    for _ in range(3):
+        house.node.spin()
+        await house.settle()
+    assert robot.received == ([twist(0.1)] if now else [])
