@@ -136,6 +136,12 @@ class Commands(ToRos):
         # Also when anybody may command: the topic is then known as one that no answer goes to.
         broker.guards.setdefault(self.mqtt, []).append(self)
         broker.guards_changed()
+        if self.rules.on_silence is not None:
+            # Of the time before, of another run even, nothing is known. Who drove then and is away
+            # may come back with what it had queued.
+            for session in broker.sessions.values():
+                if session.identity is not None and session.link is None:
+                    self._backlog.expect(session.client_id)
 
     def leave(self) -> None:
         if self._is_left:

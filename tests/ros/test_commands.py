@@ -739,3 +739,15 @@ async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(h
         house.node.spin()
         await house.settle()
     assert robot.received == ([twist(0.1)] if now else [])
+
+
+async def test_what_a_driver_had_queued_while_the_appliance_was_away(house):
+    away = Driver(house.broker, "a", clean=False, expiry=60)
+    away.cut()
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    for _ in range(50):
+        driver.drive(qos=1)
+    assert house.robot.received == []
+    Driver(house.broker, "b").drive()
+    assert house.robot.received == [twist(0.5)]
