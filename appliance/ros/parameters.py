@@ -42,6 +42,9 @@ RETRY = 2.0
 #: The longest that a node may take to tell them, in seconds.
 PATIENCE = 5.0
 
+#: Longer names, in characters, are not shown: they would be no topics.
+LONGEST_NAME = 1024
+
 #: Parameters that are asked for at a time.
 CHUNK = 200
 
@@ -289,7 +292,7 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or name not in node.wanted:
+        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or name not in node.wanted:
             return
         payload = b"" if value is None else _to_json(value)
         if payload == node.shown.get(name, b""):
