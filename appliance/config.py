@@ -731,10 +731,12 @@ class ParameterRoute(_CalledRoute):
 
 
 class BridgeLimits(_Section):
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and what one message for ROS
+    may have, in bytes."""
 
     calls: Count = 500
     calls_per_client: Count = 20
+    payload: Annotated[Size, Field(gt=0)] = 1 << 20
 
 
 class Bridge(_Section):
@@ -882,8 +884,14 @@ def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
     }
     for section, (placeholder, routes) in sections.items():
         seen: dict[str, int] = {}
+        topics: dict[str, tuple[str, int]] = {}
         for number, route in enumerate(routes):
             path: KeyPath = ("bridge", section, number)
+            name = route.node if isinstance(route, ParameterRoute) else route.ros
+            topic = route.mqtt.replace(placeholder, name)
+            other, taken = topics.setdefault(topic, (name, number))
+            if other != name:
+                yield (*path, "mqtt"), f"is the topic of bridge.{section}[{taken}]"
             first = seen.setdefault(route.ros, number)
             if first != number:
                 yield (*path, "ros"), f"is the same as bridge.{section}[{first}]"

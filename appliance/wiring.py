@@ -121,7 +121,7 @@ def routes(settings: Settings) -> list[RouteSettings]:
             compression=route.compression,
             fields=tuple(route.fields),
             bytes_per_second=route.bytes_per_second,
-            largest=settings.broker.limits.packet_size,
+            largest=_largest(route, settings),
             rules=_command_rules(route) if route.command_keys else None,
         )
         for route in settings.bridge.topics
@@ -164,8 +164,17 @@ def call_routes(settings: Settings) -> CallRoutes:
             )
             for route in bridge.parameters
         ),
-        limits=CallLimits(bridge.limits.calls_per_client, bridge.limits.calls),
+        limits=CallLimits(
+            bridge.limits.calls_per_client, bridge.limits.calls, bridge.limits.payload
+        ),
     )
+
+
+def _largest(route: TopicRoute, settings: Settings) -> int:
+    """Bytes of a payload for ROS: `binary` is not converted, and takes no time."""
+    packet_size = settings.broker.limits.packet_size
+    payload = packet_size if route.encoding == "binary" else settings.bridge.limits.payload
+    return min(packet_size, payload)
 
 
 def _command_rules(route: TopicRoute) -> CommandRules:

@@ -425,7 +425,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         "  services: [/reset, {ros: '/arm/**', type: 'std_srvs/srv/*'}, '!/arm/off']\n"
         "  actions: [{ros: /walk, keep_result: 1 min, cancel_on_disconnect: true}]\n"
         "  parameters: [/arm/*, '/**/use_*', '!/arm/key']\n"
-        "  limits: {calls: 9, calls_per_client: 3}"
+        "  limits: {calls: 9, calls_per_client: 3, payload: 2 MiB}"
     ).bridge
     assert [(r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services] == [
         ("/reset", False, "r2{ros}"),
@@ -438,7 +438,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         ("/**", "use_*", True),
         ("!/arm", "key", False),
     ]
-    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3)
+    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3, payload=2 << 20)
 
 
 @pytest.mark.parametrize(
@@ -472,3 +472,10 @@ def test_what_is_called_twice_is_told() -> None:
     assert problems("bridge: {actions: [/a, {ros: /a, timeout: 1 s}]}") == [
         "1: bridge.actions[1].ros: is the same as bridge.actions[0]"
     ]
+
+
+def test_what_would_be_called_at_one_topic_is_told() -> None:
+    assert problems("bridge: {services: [{ros: /a, mqtt: x}, {ros: /b, mqtt: x}]}") == [
+        "1: bridge.services[1].mqtt: is the topic of bridge.services[0]"
+    ]
+    assert problems("bridge: {parameters: [/a/b, /a/c, {ros: /c/b, mqtt: '{robot}/a/_param'}]}")

@@ -61,6 +61,9 @@ STATUS = "action_msgs/msg/GoalStatusArray"
 #: By the numbers of action_msgs/msg/GoalStatus.
 STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
+#: Those of a goal that goes on.
+_ACCEPTED, _EXECUTING = 1, 2
+
 #: By the numbers of action_msgs/srv/CancelGoal.
 _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
     1: ("rejected", "the action's server does not cancel it"),
@@ -73,6 +76,9 @@ LANES = 256
 
 #: Results that one action keeps at a time; the oldest go first.
 RESULTS = 1000
+
+#: Goals of one action that were given up before they were accepted; the oldest are forgotten first.
+UNWANTED = 1000
 
 #: Seconds that a server which has just come has to say that it does not know a goal.
 CHECK_TIME = 5.0
@@ -153,6 +159,8 @@ class ActionRoutes:
         self._counters: dict[ActionSettings, CallCounters] = {}
         self._excluded = Names(())
         self._actions: dict[str, Action] = {}
+        #: Those whose route has gone before their goals.
+        self._past: list[Action] = []
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
@@ -192,10 +200,12 @@ class ActionRoutes:
                         and (of_type is None or of_type.fullmatch(type_name))
                     ):
                         wanted[name] = route
+        self._past = [action for action in self._past if action.has_goals]
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
                 del self._actions[name]
+                self._past.append(action)
         for name, route in wanted.items():
             if name not in self._actions:
                 self._actions[name] = Action(name, route, self._counters[route], self)
@@ -211,8 +221,17 @@ class ActionRoutes:
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
         if session in self.goals:
-            for action in self._actions.values():
+            for action in self._all():
                 action.departed(session)
+
+    def server_came(self, ros: str) -> None:
+        """Another server of that action has come."""
+        for action in self._all():
+            if action.ros == ros:
+                action.check_goals()
+
+    def _all(self) -> list[Action]:
+        return [*self._actions.values(), *self._past]
 
     def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the actions that it offers now."""
@@ -240,7 +259,7 @@ class ActionRoutes:
         are not to go on without them."""
         cancels = [
             action._cancel_quietly(goal.id, "the appliance stops")
-            for action in self._actions.values()
+            for action in self._all()
             if action.route.cancel_on_disconnect
             for goal in action._goals.values()
             if goal.is_accepted
@@ -254,6 +273,7 @@ class ActionRoutes:
         for action in self._actions.values():
             action.forget()
         self._actions.clear()
+        self._past.clear()
         await self._tasks.stop()
 
     # The ROS thread
@@ -286,6 +306,8 @@ class Action:
         self._requests = routes._requests
         self._converters = routes._converters
         self._goals: dict[bytes, _Goal] = {}
+        #: Goals that nobody waits for any more, should their server accept them yet.
+        self._unwanted: OrderedDict[bytes, None] = OrderedDict()
         #: Topics of results that are retained, and until when; they all have the same time.
         self._kept: deque[tuple[str, float]] = deque()
         # The ROS thread's.
@@ -296,9 +318,12 @@ class Action:
         self._counted = Counters()
         self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
         self._status_lane = Lane(1, self._counted)
-        for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel)):
-            topic = f"{self.base}/{verb}"
-            self._board.offer(Offer(topic, f"{ros} {verb[1:]}", route.timeout, counters, handle))
+        self._offers = [
+            Offer(f"{self.base}/{verb}", f"{ros} {verb[1:]}", route.timeout, counters, handle)
+            for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
+        ]
+        for offer in self._offers:
+            self._board.offer(offer)
         log.info("%s can be called at %s/_goal", ros, self.base)
 
     def see(self, is_there: bool) -> None:
@@ -328,8 +353,8 @@ class Action:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
         fields = orjson.loads(call.payload or b"{}")
-        request = self._converters.get(request_type).from_dict(
-            {"goal_id": {"uuid": id_}, "goal": fields}
+        request = self._converters.get(request_type).from_values(
+            {"goal_id": {"uuid": id_}, "goal": fields}, len(call.payload)
         )
         goal = _Goal(id_, call.caller, asyncio.get_running_loop().create_future())
         self._goals[id_] = goal
@@ -342,9 +367,16 @@ class Action:
             if not said["accepted"]:
                 raise CallError("rejected", f"{self.ros} does not accept the goal")
         except asyncio.CancelledError:
-            # It may be accepted yet, and nobody would know of it.
-            self._forget(goal)
+            # It may be accepted yet, and nobody would know of it: it is cancelled now, and once
+            # more should it begin after that.
+            self._give_up(goal)
             self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
+            raise
+        except CallError as error:
+            if error.code == "vanished":  # for a moment only, perhaps
+                self._give_up(goal)
+            else:
+                self._forget(goal)
             raise
         except BaseException:
             self._forget(goal)
@@ -371,6 +403,13 @@ class Action:
             goals[goal.owner] -= 1
             if not goals[goal.owner]:
                 del goals[goal.owner]
+
+    def _give_up(self, goal: _Goal) -> None:
+        """Nobody waits for its acceptance any more: should it come, it is cancelled."""
+        self._forget(goal)
+        self._unwanted[goal.id] = None
+        if len(self._unwanted) > UNWANTED:
+            self._unwanted.popitem(last=False)
 
     async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
         """Wait for the result, as long as it takes, and publish it."""
@@ -425,7 +464,11 @@ class Action:
             if len(kept) > RESULTS:
                 self._board.publish(Message(kept.popleft()[0], b"", 0, True))
 
-    def server_came(self) -> None:
+    @property
+    def has_goals(self) -> bool:
+        return bool(self._goals)
+
+    def check_goals(self) -> None:
         """Another server has come: it may have taken the place of one that was ended."""
         type_name = self.type
         if type_name is None:
@@ -479,6 +522,13 @@ class Action:
         else:
             log.info("goal %s of %s is cancelled: %s", id_.hex(), self.ros, why)
 
+    def _cancel_unwanted(self, ids: list[bytes]) -> None:
+        for id_ in ids:
+            if id_ in self._unwanted:
+                del self._unwanted[id_]
+                why = "it was accepted when nobody waited for it any more"
+                self._routes._tasks.begin(self._cancel_quietly(id_, why))
+
     def departed(self, session: Session) -> None:
         """The client has gone."""
         if not self.route.cancel_on_disconnect:
@@ -495,8 +545,8 @@ class Action:
 
     def stop(self) -> None:
         """The route was removed. Goals go on, and their results are published."""
-        for verb in ("_goal", "_cancel"):
-            self._board.withdraw(f"{self.base}/{verb}")
+        for offer in self._offers:
+            self._board.withdraw(offer)
         self.forget()
         self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
         try:
@@ -517,7 +567,7 @@ class Action:
             return
         servers = node.count(f"{self.ros}/_action/status")[0]
         if servers > self._servers and self._subscribed is not None:
-            self._routes._post(self.server_came)
+            self._routes._post(self._routes.server_came, self.ros)
         self._servers = servers
         if type_name == self._subscribed:
             return
@@ -558,6 +608,13 @@ class Action:
         except ConversionError as error:
             self._counters.last_error = str(error)
             return
+        late = [
+            _id(one["goal_info"]["goal_id"])
+            for one in (said["status_list"] if self._unwanted else ())
+            if one["status"] in (_ACCEPTED, _EXECUTING)
+        ]
+        if any(id_ in self._unwanted for id_ in late):
+            self._routes._post(self._cancel_unwanted, late)
         goals = [
             {
                 "goal_id": _id(one["goal_info"]["goal_id"]).hex(),

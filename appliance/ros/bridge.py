@@ -13,7 +13,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
-from time import time_ns
+from time import thread_time, time_ns
 
 import orjson
 
@@ -31,6 +31,7 @@ from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSett
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
@@ -42,6 +43,9 @@ CLIENT_ID = "_bridge"
 
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
+
+#: Bytes of a payload up to which converting it takes some ten microseconds.
+LITTLE = 1024
 
 #: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
 #: one may have been replaced by another. At each look it is the turn of some topics.
@@ -285,8 +289,16 @@ class Bridge:
         return self._node.name
 
     def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+        payload = message.payload
+        # A few bytes can be a megabyte when they are decompressed, and a list of texts takes ten
+        # times as long as one of numbers: only the clock knows whose turn is over. It is that of
+        # the thread's own work, and too dear for a command.
+        is_long = len(payload) > LITTLE or payload.startswith(ZSTD_MAGIC)
+        begun = thread_time() if is_long else 0.0
         for receiver in self._receivers.get(message.topic, ()):
             receiver.receive(message, retain, origin)
+        if is_long:
+            self._broker.counters.effort += int((thread_time() - begun) * 1e6)
 
     def _drain(self) -> None:
         if self._deliver():

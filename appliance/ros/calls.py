@@ -35,6 +35,7 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.ros.backlog import Backlog
+from appliance.ros.payloads import too_large
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ ErrorCode: TypeAlias = Literal[
     "expired",  # it was sent long before it came
     "no_response_topic",  # there is no way to answer
     "not_authorized",  # the caller may not have the answer there, or not ask for that
+    "too_large",  # the payload is larger than what is converted
     "too_many",  # the caller, or all together, have too many calls under way
     "unavailable",  # there is no such service, action or node on the bus now
     "vanished",  # there was, and it went away before it answered
@@ -61,6 +63,14 @@ JSON = "application/json"
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
+
+
+#: Bytes that are converted in a microsecond or so, and count for that in the broker's
+#: `Counters.effort`: who sends much then waits for the others.
+BYTES_AN_EFFORT = 16
+
+#: Bytes of payload of all calls under way.
+TOTAL_BYTES = 64 * 1024 * 1024
 
 
 class CallError(Exception):
@@ -82,10 +92,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and bytes of a call."""
 
     client: int = 20
     total: int = 500
+    payload: int = 1024 * 1024
 
 
 @dataclass(eq=False, slots=True)
@@ -171,9 +182,11 @@ class Switchboard:
         self._receivers: dict[int, Receive] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
-        self._offers: set[str] = set()
+        #: By topic, the first of those that were offered there; the others wait for it to go.
+        self._offers: dict[str, list[Offer]] = {}
         self._under_way: Counter[Session] = Counter()
         self._calls: set[Call] = set()
+        self._bytes = 0
         self._report_at: dict[str, float] = {}
 
     def start(self) -> None:
@@ -188,7 +201,8 @@ class Switchboard:
     async def stop(self) -> None:
         """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
         for topic in list(self._offers):
-            self.withdraw(topic)
+            del self._offers[topic]
+            self._ignore_calls(topic)
         tasks = [call.task for call in self._calls if call.task is not None]
         for task in tasks:
             task.cancel()
@@ -226,20 +240,42 @@ class Switchboard:
 
     def offer(self, offer: Offer) -> None:
         """Let `offer.topic`, which may have a `+` in it, be called."""
-        self._offers.add(offer.topic)
+        offers = self._offers.setdefault(offer.topic, [])
+        offers.append(offer)
+        if len(offers) == 1:
+            self._listen_for(offer)
+        else:
+            text = "%s cannot be called: calls at %s are for %s"
+            log.warning(text, offer.name, offer.topic, offers[0].name)
+
+    def _listen_for(self, offer: Offer) -> None:
         self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
         self.listen(
             f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
         )
 
-    def withdraw(self, topic: str) -> None:
+    def withdraw(self, offer: Offer) -> None:
         """Offer it no longer; calls under way have their answers yet."""
-        self._offers.remove(topic)
+        offers = self._offers.get(offer.topic, [])
+        if offer not in offers:
+            return  # `stop` has withdrawn all
+        was_first = offers[0] is offer
+        offers.remove(offer)
+        if not offers:
+            del self._offers[offer.topic]
+            self._report_at.pop(offer.topic, None)
+        if was_first:
+            self._ignore_calls(offer.topic)
+            if offers:
+                self._listen_for(offers[0])
+
+    def _ignore_calls(self, topic: str) -> None:
         self.ignore(topic)
         self.ignore(f"{topic}/+")
 
     def receive(self, origin: Session, message: Message, identifier: int) -> None:
         """A message came through the subscription with that identifier."""
+        self._broker.counters.effort += len(message.payload) // BYTES_AN_EFFORT
         receive = self._receivers.get(identifier)
         if receive is not None:
             receive(origin, message)
@@ -279,8 +315,7 @@ class Switchboard:
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
-            may_tell = not set("/+#\0") & set(caller.client_id)
-            self._fail(offer, caller, fallback if may_tell else None, error)
+            self._fail(offer, caller, fallback if _is_level(caller.client_id) else None, error)
             return
         call = Call(caller, message.payload, topic, reply)
         try:
@@ -291,6 +326,7 @@ class Switchboard:
         self._under_way[caller] += 1
         offer.counters.under_way += 1
         self._calls.add(call)
+        self._bytes += len(call.payload)
         call.task = self._loop.create_task(self._run(offer, call))
         call.task.add_done_callback(lambda _: self._forget(offer, call))
 
@@ -306,13 +342,14 @@ class Switchboard:
                     "there is no Response Topic, nor, for 3.1.1, a token as the topic's last "
                     f"level: publish to {message.topic}/TOKEN, and subscribe to {own}/TOKEN",
                 )
-            if set("/+#\0") & set(caller.client_id):
+            if not _is_level(caller.client_id):
                 raise CallError(
                     "no_response_topic",
                     f"the client id {quote(caller.client_id)} cannot be a level of a topic",
                 )
             topic = f"{own}/{token}"
-        if topic == own or topic.startswith(f"{own}/"):
+        # What is below the id of a client `alice/1` belongs to the client `alice`.
+        if _is_level(caller.client_id) and (topic == own or topic.startswith(f"{own}/")):
             if not self._broker.may_receive(caller, topic):
                 raise CallError("not_authorized", f"the caller may not read {quote(topic)}")
         else:
@@ -342,6 +379,11 @@ class Switchboard:
             # Nobody waits for its answer any more, and what it would do nobody expects now.
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
         limits = self.limits
+        size = len(message.payload)
+        if size > limits.payload:
+            raise CallError("too_large", too_large(size, limits.payload))
+        if self._bytes + size > TOTAL_BYTES:
+            raise CallError("too_many", f"{self._bytes} bytes of calls are under way")
         if self._under_way[caller] >= limits.client:
             raise CallError(
                 "too_many", f"{limits.client} calls of this client are under way, as many as may be"
@@ -381,6 +423,7 @@ class Switchboard:
             self._fail(offer, call.caller, call.reply, _stopping())
         offer.counters.under_way -= 1
         self._calls.discard(call)
+        self._bytes -= len(call.payload)
         self._under_way[call.caller] -= 1
         if not self._under_way[call.caller]:
             del self._under_way[call.caller]
@@ -412,6 +455,11 @@ class Switchboard:
 def error_payload(error: CallError) -> bytes:
     """An error as every answer has it: `{"error": {"code": …, "message": …}}`."""
     return orjson.dumps({"error": {"code": error.code, "message": str(error)}})
+
+
+def _is_level(client_id: str) -> bool:
+    """Whether the id can be one level of a topic, as `_reply/{client id}` needs it."""
+    return not set("/+#\0") & set(client_id)
 
 
 def _stopping() -> CallError:

@@ -257,12 +257,17 @@ def import_message(name: str) -> type:
     if match is None:
         raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
     package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
+    # Any node may make up a type's name: it does not get what else there is in Python imported.
+    if package in sys.stdlib_module_names:
+        raise UnknownTypeError(f"no {name}: {package} is not a package of messages")
     if package not in sys.modules:
         _look_in_workspaces(package)
     try:
         module = import_module(f"{package}.{kind}")
     except ImportError as error:
         raise UnknownTypeError(f"no {name}: the package {package} is not installed here") from error
+    except Exception as error:  # what a package does when it is imported may be any
+        raise UnknownTypeError(f"no {name}: the package {package} is broken: {error!r}") from error
     found = getattr(module, type_name, None)
     if found is None and "_" in type_name:
         # The packages do not export an action's Goal, Result and Feedback: beside their action.

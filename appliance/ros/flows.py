@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, Property, encode_string
+from appliance.mqtt.codec import Properties, Property, encode_string, quote
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters, Meter
@@ -66,7 +66,7 @@ class RouteSettings:
     (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
     is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
     paths of those that go to MQTT, all of them when there are none; what comes from MQTT has at
-    most `largest` bytes when it is decompressed.
+    most `largest` bytes, and no more when it is decompressed.
     """
 
     ros: str | tuple[str, ...]
@@ -81,7 +81,7 @@ class RouteSettings:
     compression: Compression = "none"
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
-    largest: int = 16 * 1024 * 1024
+    largest: int = 1024 * 1024
     #: What holds for what goes to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 
@@ -545,7 +545,8 @@ class ToRos(Flow):
         wanted = self._wanted
         claimed = claim(properties, "ros-type")
         if wanted is not None and claimed is not None and claimed != wanted[0]:
-            raise ConversionError("", f"it says to be {claimed}, {self.ros} carries {wanted[0]}")
+            problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
+            raise ConversionError("", problem)
         try:
             return convert(message.payload)
         except ConversionError as error:
@@ -553,7 +554,9 @@ class ToRos(Flow):
             encoding = self.settings.encoding
             if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
                 raise
-            problem = f"{error.problem} (it says to be {said}, and the route takes {encoding})"
+            problem = (
+                f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"
+            )
             raise ConversionError(error.path, problem) from None
 
     def _why_not(self) -> str:

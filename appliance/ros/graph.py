@@ -140,7 +140,7 @@ class Calls:
     def look(self) -> None:
         """Follow what has come and gone on the graph."""
         routes = self._routes
-        if routes.services or routes.actions or routes.parameters:
+        if routes.services or routes.actions or routes.parameters or self._requests.has_clients:
             self._requests.look()
         self._services.look()
         self._actions.look()

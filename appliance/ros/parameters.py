@@ -42,6 +42,9 @@ RETRY = 2.0
 #: The longest that a node may take to tell them, in seconds.
 PATIENCE = 5.0
 
+#: Longer names, in characters, are not shown: they would be no topics.
+LONGEST_NAME = 1024
+
 #: Parameters that are asked for at a time.
 CHUNK = 200
 
@@ -85,6 +88,7 @@ class _Node:
     route: ParameterSettings
     wanted: Names
     shown: dict[str, bytes] = field(default_factory=dict)
+    offers: list[Offer] = field(default_factory=list)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
@@ -179,14 +183,16 @@ class ParameterRoutes:
         counters = self._counters[route]
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
             what = f"{name}'s parameters"
-            self._board.offer(Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle))
+            offer = Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle)
+            node.offers.append(offer)
+            self._board.offer(offer)
         self._load(node)
 
     def _leave(self, node: _Node) -> None:
         del self._nodes[node.name]
         node.is_gone = True
-        for topic in ("+/set", "_set"):
-            self._board.withdraw(f"{node.base}/{topic}")
+        for offer in node.offers:
+            self._board.withdraw(offer)
         for parameter in node.shown:
             self._board.publish(Message(f"{node.base}/{parameter}", b"", 0, True))
         node.shown.clear()
@@ -286,7 +292,7 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or name not in node.wanted:
+        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or name not in node.wanted:
             return
         payload = b"" if value is None else _to_json(value)
         if payload == node.shown.get(name, b""):

@@ -106,17 +106,23 @@ def unpacker(
 ) -> Callable[[bytes], bytes]:
     """The function that makes a serialized message of a payload, or raises ConversionError.
 
-    With a compression, payloads may be compressed or not; decompressed they have no more than
-    `largest` bytes.
+    They have at most `largest` bytes. With a compression, they may be compressed or not, and have
+    no more when they are decompressed.
     """
 
-    unpack = {
+    convert = {
         "json": converter.from_json,
         "cbor": converter.from_cbor,
         "text": converter.from_text,
         "binary": converter.from_binary,
         "cdr": converter.checked,
     }[encoding]
+
+    def unpack(payload: bytes) -> bytes:
+        if len(payload) > largest:
+            raise ConversionError("", too_large(len(payload), largest))
+        return convert(payload)
+
     if compression == "none":
         return unpack
     decompress = _decompressor(largest)
@@ -127,6 +133,11 @@ def unpacker(
         return unpack(payload)
 
     return unpack_compressed
+
+
+def too_large(size: int, largest: int) -> str:
+    """What is wrong with a payload for ROS that would hold up all others for too long."""
+    return f"it has {size} bytes, at most {largest} are converted (bridge.limits.payload)"
 
 
 def claim(properties: Properties, name: str) -> str | None:
@@ -155,8 +166,7 @@ def _decompressor(largest: int) -> Callable[[bytes], bytes]:
             # A size that is told is made room for, whatever it is: it is looked at first.
             size = frame_content_size(payload)
             if size > largest:
-                problem = f"{size} bytes when decompressed, at most {largest} are allowed"
-                raise ConversionError("", problem)
+                raise ConversionError("", too_large(size, largest))
             return decompressor.decompress(payload, max_output_size=largest, allow_extra_data=False)
         except ZstdError as error:
             problem = f"not zstd, or more than {largest} bytes of it: {error}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import re
 import sys
 import threading
 import time
@@ -33,6 +34,11 @@ POLL_INTERVAL = 0.15
 #: How many messages of a subscription are timed first, and of how many one is then.
 FIRST_TIMED = 100
 ONE_TIMED_OF = 16
+
+#: What ROS takes for the name of a topic or service, and no more characters than that. On DDS there
+#: may be others: asking ROS about one raises an error.
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+_LONGEST_NAME = 247
 
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -225,7 +231,7 @@ class Ros2Node:
         return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
 
     def topics(self) -> dict[str, list[str]]:
-        return dict(self._node.get_topic_names_and_types())
+        return _named(self._node.get_topic_names_and_types())
 
     def services(self) -> dict[str, list[str]]:
         from rclpy.node import NodeNameNonExistentError
@@ -233,8 +239,9 @@ class Ros2Node:
         # Asked for all at once, ROS also names the services that there are only clients of.
         found: dict[str, list[str]] = {}
         for node in self._node.get_node_names_and_namespaces():
-            with suppress(NodeNameNonExistentError):  # it has gone meanwhile
-                found.update(self._node.get_service_names_and_types_by_node(*node))
+            # It has gone meanwhile, or its name is none that ROS takes.
+            with suppress(NodeNameNonExistentError, *_errors()):
+                found.update(_named(self._node.get_service_names_and_types_by_node(*node)))
         return found
 
     def count(self, topic: str) -> tuple[int, int]:
@@ -302,6 +309,14 @@ class Ros2Node:
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
     ) -> _Service:
         return _Service(self._node, service, import_service(type_name), callback)
+
+
+def _named(found: list[tuple[str, list[str]]]) -> dict[str, list[str]]:
+    return {
+        name: types
+        for name, types in found
+        if len(name) <= _LONGEST_NAME and _NAME.match(name) is not None
+    }
 
 
 class _Subscription:

@@ -41,6 +41,7 @@ from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.payloads import too_large
 from appliance.ros.requests import Key, Requests
 
 log = logging.getLogger(__name__)
@@ -156,7 +157,7 @@ class ServiceRoutes:
         wanted = self._wanted()
         for name, (route, offer) in list(self._offered.items()):
             if wanted.get(name) != route:
-                self._board.withdraw(offer.topic)
+                self._board.withdraw(offer)
                 del self._offered[name]
         for name, route in wanted.items():
             if name not in self._offered:
@@ -385,6 +386,10 @@ class Provided:
         if asked is None:
             log.debug("%s: a response to nothing under way", self._route.ros)
             return
+        size, most = len(message.payload), self._board.limits.payload
+        if size > most:
+            self._fail(asked.respond, f"too_large: {too_large(size, most)}")
+            return
         told = (message.properties or {}).get(Property.USER_PROPERTY)
         if isinstance(told, list) and ("status", "error") in told:
             self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
@@ -446,12 +451,10 @@ class Provided:
             log.debug("%s: the bus has gone", self._route.ros)
 
     def stop(self) -> None:
-        """Offer it no longer; what is under way gets no response."""
+        """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
         self._board.ignore(f"{self._base}/_response/+")
-        for asked in self._asked.values():
-            asked.timer.cancel()
-        self._counters.under_way -= len(self._asked)
-        self._asked.clear()
+        for token in list(self._asked):
+            self._give_up(token, "stopping: the service is offered no longer")
         try:
             self._node.call_soon(self._close)
         except BusError:

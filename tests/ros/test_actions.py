@@ -7,12 +7,13 @@ import asyncio
 import pytest
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, until
+from call_house import AllTypes, House, action, call_routes, until
 
 from appliance.ros import actions as module
+from appliance.ros import requests
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
-from appliance.ros.node import FakeNode
+from appliance.ros.node import Durability, FakeNode, QosProfile
 
 FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
 CONVERTERS = Converters(load_description)
@@ -57,6 +58,9 @@ class Walks:
 
     def on_cancel(self, request, answer):
         self.cancelled.append(request["goal_info"]["goal_id"]["uuid"])
+        if self.late:
+            answer({"return_code": 2})
+            return
         answer({"goals_canceling": [request["goal_info"]]})
 
     def finish(self, status=4):
@@ -161,3 +165,57 @@ async def test_the_appliance_stops_with_goals_under_way(house):
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await house.bridge.stop()
     assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: walks.results, "the result is asked for")
+    changed = action("/walk", cancel_on_disconnect=True, keep_result=1)
+    house.bridge.calls.replace(call_routes(changed))
+    client.leave()
+    await until(lambda: walks.cancelled, "the goal is cancelled")
+    assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    await client.call(GOAL, {"order": 3})
+    house.bridge.calls.replace(call_routes())
+    await house.bridge.stop()
+    assert len(walks.cancelled) == 1
+
+
+async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(house):
+    """A server that is busy with accepting it knows of no such goal yet."""
+    walks, client = await begin(house, timeout=0.05)
+    walks.accepting = False
+    assert (await client.error(GOAL, {"order": 3}))[0] == "timeout"
+    await until(lambda: walks.cancelled, "the goal is cancelled, in vain")
+    latched = house.node.add_publisher(
+        "/walk/_action/status", module.STATUS, QosProfile(durability=Durability.TRANSIENT_LOCAL)
+    )
+    walks.late.pop()({"accepted": True})
+    status = {
+        "goal_info": {"goal_id": {"uuid": walks.cancelled[0]}},
+        "status": 2,
+    }
+    latched.publish(CONVERTERS.get(module.STATUS).from_dict({"status_list": [status]}))
+    await until(lambda: len(walks.cancelled) == 2, "the goal is cancelled")
+    latched.publish(CONVERTERS.get(module.STATUS).from_dict({"status_list": [status]}))
+    await asyncio.sleep(0.01)
+    assert len(set(walks.cancelled)) == 1 and len(walks.cancelled) == 2
+
+
+async def test_the_server_of_a_goal_vanishes_after_the_last_route(house, monkeypatch):
+    monkeypatch.setattr(requests, "IDLE_LOOKS", 2)
+    walks, client = await begin(house)
+    await client.call(GOAL, {"order": 3})
+    await until(lambda: walks.results, "the result is asked for")
+    house.bridge.calls.replace(call_routes())
+    walks.vanish()
+    await until(lambda: results(client), "the result")
+    assert client.payloads(results(client)[0].topic)[0]["error"]["code"] == "vanished"
+    for _ in range(4):
+        house.node.spin()
+    assert house.node.clients == []

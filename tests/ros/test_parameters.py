@@ -196,3 +196,14 @@ def test_what_may_have_any_type_takes_it_from_the_value():
     free = {"type": 2, "dynamic_typing": True}
     assert to_value("x", 1.5, free) == {"type": 3, "double_value": 1.5}
     assert to_value("x", ["a"], {}) == {"type": 9, "string_array_value": ["a"]}
+
+
+async def test_names_that_make_no_topic_hide_no_others(house):
+    house.start(parameters("/arm"))
+    arm = Declaring(house, **{"speed": 1, "a+b": 1, "x" * 70_000: 1})
+    house.node.spin()
+    await shown(house, "speed", 1)
+    arm.change("y" * 70_000, 2)
+    arm.change("speed", 2)
+    await shown(house, "speed", 2)
+    assert not house.bridge.calls._parameters._events

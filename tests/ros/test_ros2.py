@@ -122,6 +122,39 @@ async def test_no_request_ends_the_thread():
     await asyncio.to_thread(node.stop)
 
 
+async def test_names_that_only_dds_takes_are_passed_over():
+    """Of another vendor's tools, or by a stranger: asking ROS about one ended the bridge."""
+    node = ros2.Ros2Node()
+    looked, failures = [], []
+    odd = ["/a//b", "/a/", "/1a", "/a+b", "/" + "x" * 300]
+
+    def look():
+        own, node._node = node._node, Odd(node._node)
+        looked.append((node.topics(), node.services()))
+        node._node = own
+
+    class Odd:
+        def __init__(self, own):
+            self.own = own
+
+        def get_topic_names_and_types(self):
+            return [(name, ["std_msgs/msg/String"]) for name in ("/fine", *odd)]
+
+        def get_node_names_and_namespaces(self):
+            return [("no name", "/"), *self.own.get_node_names_and_namespaces()]
+
+        def get_service_names_and_types_by_node(self, *of):
+            self.own.get_service_names_and_types_by_node(*of)
+            return [(name, ["std_srvs/srv/Trigger"]) for name in ("/fine", *odd)]
+
+    node.start(look, failures.append)
+    await until(lambda: looked or failures, "a look")
+    await asyncio.to_thread(node.stop)
+    assert failures == []
+    topics, services = looked[0]
+    assert set(topics) == set(services) == {"/fine"}
+
+
 class House:
     """Broker, bridge and an MQTT client, as in test_bridge.py, on a real node."""
 
