@@ -144,21 +144,13 @@ def run(
 @contextmanager
 def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
-    from appliance.access import AccessFileError
-    from appliance.amqtt_broker import PluginSettingsError
-    from appliance.audit import AuditError
-    from appliance.certs import CertificateError
-    from appliance.store import StoreError
+    from appliance.app import START_ERRORS
 
     try:
         yield
-    except (
-        AccessFileError,
-        AuditError,
-        CertificateError,
-        PluginSettingsError,
-        StoreError,
-    ) as error:
+    except OSError:  # told by main
+        raise
+    except START_ERRORS as error:
         raise CommandError(str(error)) from None
 
 
