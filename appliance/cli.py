@@ -26,6 +26,7 @@ from appliance.console import (
 from appliance.console import load as _load
 from appliance.console import read_password as _read_password
 from appliance.console import shown as _shown
+from appliance.install_command import install, uninstall
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
@@ -274,6 +275,10 @@ def bench(
 
     cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
     raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))
+
+
+app.command()(install)
+app.command()(uninstall)
 
 
 # What is stored
