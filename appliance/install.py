@@ -224,6 +224,10 @@ class Installation:
 
     def _install_command(self) -> Iterator[Step]:
         if self.packaged:
+            # What was installed by hand before would stand in the way of the package's.
+            for path in (UNIT_FILE, COMMAND):
+                if (place := self._at(path)).is_file():
+                    yield self._step("removed", str(path), "it is the package's now", place.unlink)
             return
         if self.source is None:
             yield Step("kept", str(self.command), "the command, where it is")
