@@ -10,6 +10,7 @@ import stat
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -51,6 +52,9 @@ control: /run/appliance/control.sock
 crash_reports: {DATA}/crashes
 """
 
+#: How the unit of a single file is told from others.
+_SINGLE_FILE = "NotifyAccess=all"
+
 Verb = Literal["made", "replaced", "kept", "removed", "done"]
 
 
@@ -78,14 +82,15 @@ class Installation:
     """An appliance as a service below `root`.
 
     `source` is the single file that is to be the command; without one it is `command`, which stays
-    where it is. With `packaged` the command and the unit are a package's own, and it alone starts
-    the service. `environment` is what a sourced ROS is taken from.
+    where it is. The user is the one that the service had before, or its own. With `packaged` the
+    command and the unit are a package's own, and it alone starts the service. `environment` is what
+    a sourced ROS is taken from.
     """
 
     command: Path
     source: Path | None = None
     root: Path = Path("/")
-    user: str = OWN_USER
+    user: str = ""
     robot: str | None = None
     initialise: bool = True
     start: bool = True
@@ -96,6 +101,7 @@ class Installation:
 
     def __post_init__(self) -> None:
         self.root = self.root.resolve()
+        self.user = self.user or self._user_before() or OWN_USER
 
     def install(self) -> Iterator[Step | Credentials]:
         """Puts everything in place, or the newer version in that of the older one.
@@ -106,7 +112,8 @@ class Installation:
             OSError: a file cannot be written.
         """
         self._check()
-        account = None
+        if self.source is None and not self.packaged:
+            self._check_command()
         yield from self._install_command()
         account = self._account()
         if account is None:
@@ -130,14 +137,8 @@ class Installation:
         self._check()
         if self._lives_here and self._at(UNIT_FILE).exists():
             yield self._step("done", "systemctl", "the service is stopped", self._disable)
-        for path, text in (
-            (_ENABLED, "it is not started any more"),
-            (UNIT_FILE, "systemd's unit"),
-            (COMMAND, "the command"),
-        ):
-            place = self._at(path)
-            if place.is_symlink() or place.exists():
-                yield self._step("removed", str(path), text, place.unlink)
+        for path in self._put_before():
+            yield self._step("removed", str(path), "part of the service", self._at(path).unlink)
         if self._lives_here:
             self._systemctl("daemon-reload")
         for path, text in (
@@ -151,10 +152,26 @@ class Installation:
             if not purge:
                 yield Step("kept", str(path), f"{text}; --purge removes it")
             else:
-                yield self._step("removed", str(path), text, lambda place=place: _remove(place))  # type: ignore[misc]
+                yield self._step("removed", str(path), text, partial(_remove, place))
         if purge and self._account() is not None and self.user == OWN_USER:
-            remove = lambda: self._run("userdel", *self._prefix, OWN_USER)  # noqa: E731
+            remove = partial(self._run, "userdel", *self._prefix, OWN_USER)
             yield self._step("removed", OWN_USER, "the service's user", remove)
+
+    def _user_before(self) -> str:
+        try:
+            lines = self._at(UNIT_FILE).read_text().splitlines()
+        except OSError:
+            return ""
+        return next((line[5:].strip() for line in lines if line.startswith("User=")), "")
+
+    def _put_before(self) -> list[Path]:
+        """What an installation has put in place; a command that was there already is not in it."""
+        found = []
+        with contextlib.suppress(OSError):
+            unit = self._at(UNIT_FILE).read_text()
+            found = [COMMAND] if _SINGLE_FILE in unit.splitlines() else []
+        found = [_ENABLED, *found, UNIT_FILE]
+        return [path for path in found if self._at(path).is_symlink() or self._at(path).exists()]
 
     # What is checked before anything is changed
 
@@ -162,6 +179,10 @@ class Installation:
     def _lives_here(self) -> bool:
         """Whether it is for the system that runs, and systemd runs that."""
         return self.root == Path("/") and Path("/run/systemd/system").is_dir()
+
+    @property
+    def _starts(self) -> bool:
+        return self.start and self._lives_here and not self.packaged
 
     def _at(self, path: Path) -> Path:
         return self.root / path.relative_to("/")
@@ -176,8 +197,6 @@ class Installation:
                 "the Debian package is installed here, and looks after the same files: "
                 "apt upgrades and removes it"
             )
-        if self.source is None and not self.packaged:
-            self._check_command()
 
     def _check_command(self) -> None:
         for folder in ("/tmp", "/var/tmp", "/dev", "/run"):
@@ -225,9 +244,11 @@ class Installation:
     def _install_command(self) -> Iterator[Step]:
         if self.packaged:
             # What was installed by hand before would stand in the way of the package's.
-            for path in (UNIT_FILE, COMMAND):
-                if (place := self._at(path)).is_file():
-                    yield self._step("removed", str(path), "it is the package's now", place.unlink)
+            by_hand = self._at(UNIT_FILE)
+            if by_hand.is_file() and not by_hand.is_symlink():  # a link would be a mask
+                for path in self._put_before():
+                    unlink = self._at(path).unlink
+                    yield self._step("removed", str(path), "it is the package's now", unlink)
             return
         if self.source is None:
             yield Step("kept", str(self.command), "the command, where it is")
@@ -236,11 +257,9 @@ class Installation:
         if place.exists() and (place.samefile(self.source) or _same(place, self.source)):
             yield Step("kept", str(COMMAND), "the command, which is this version")
             return
-        source = self.source
         verb: Verb = "replaced" if place.exists() else "made"
-        yield self._step(
-            verb, str(COMMAND), "the command", lambda: self._put(COMMAND, source, 0o755)
-        )
+        put = partial(self._put, COMMAND, self.source, 0o755)
+        yield self._step(verb, str(COMMAND), "the command", put)
 
     def _account(self) -> _Account | None:
         """The service's user; None when there is none yet."""
@@ -328,7 +347,9 @@ class Installation:
             if taken
             else ""
         )
-        yield self._step("made", str(ENVIRONMENT), say, lambda: self._put(ENVIRONMENT, text, 0o644))
+        yield self._step(
+            "made", str(ENVIRONMENT), say, partial(self._put, ENVIRONMENT, text, 0o644)
+        )
 
     def unit(self, account: _Account | None = None) -> Unit:
         """The unit for this computer."""
@@ -354,7 +375,7 @@ class Installation:
             yield Step("kept", str(UNIT_FILE), "systemd's unit")
         else:
             verb: Verb = "replaced" if place.exists() else "made"
-            put = lambda: self._put(UNIT_FILE, text, 0o644)  # noqa: E731
+            put = partial(self._put, UNIT_FILE, text, 0o644)
             yield self._step(verb, str(UNIT_FILE), "systemd's unit", put)
         enabled = self._at(_ENABLED)
         if not enabled.is_symlink():
@@ -366,7 +387,7 @@ class Installation:
             yield self._step("made", str(_ENABLED), "it starts when the computer does", enable)
 
     def _start(self) -> Iterator[Step]:
-        if not self.start or not self._lives_here:
+        if not self._starts:
             if self.root == Path("/"):
                 yield Step("kept", NAME, "not started: systemctl restart appliance")
             return
@@ -412,11 +433,11 @@ class Installation:
             draft.chmod(mode)
             with draft.open("rb") as file:
                 os.fsync(file.fileno())
-            if place.exists():
+            if place.exists() and self._starts:
                 before = _before(place)
                 before.unlink(missing_ok=True)
                 os.link(place, before)
-                self._undo.append(lambda: _replace(before, place))
+                self._undo.append(partial(os.replace, before, place))
             draft.replace(place)
         finally:
             draft.unlink(missing_ok=True)
@@ -463,10 +484,6 @@ def systemd_version() -> int:
 
 def _before(place: Path) -> Path:
     return place.with_name(f".{place.name}.before")
-
-
-def _replace(draft: Path, place: Path) -> None:
-    draft.replace(place)
 
 
 def _group(root: Path, gid: int) -> str:

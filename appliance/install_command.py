@@ -60,8 +60,8 @@ def install(
     from appliance.init import Credentials, InitError
     from appliance.install import InstallError
 
-    installation = _installation(root, dry_run)
-    installation.user, installation.robot = user, robot
+    installation = _installation(root, dry_run, user)
+    installation.robot = robot
     installation.start, installation.initialise = start, init
     installation.packaged = packaged
     try:
@@ -115,12 +115,12 @@ def _say(step: Step) -> None:
     typer.echo(f"{step.verb:<8}  {step.subject}: {step.text}")
 
 
-def _installation(root: Path, dry_run: bool) -> Installation:
+def _installation(root: Path, dry_run: bool, user: str = "") -> Installation:
     from appliance.install import COMMAND, Installation
 
     if hasattr(sys, "frozen"):
-        return Installation(COMMAND, Path(sys.executable), root=root, dry_run=dry_run)
+        return Installation(COMMAND, Path(sys.executable), root, user, dry_run=dry_run)
     called = Path(sys.argv[0]).absolute()
     if called.name != "appliance":  # python -m appliance
         called = Path(sysconfig.get_path("scripts"), "appliance")
-    return Installation(called, root=root, dry_run=dry_run)
+    return Installation(called, None, root, user, dry_run=dry_run)

@@ -37,6 +37,7 @@ class Unit:
         steps = "RestartSteps=6\nRestartMaxDelaySec=1min\n" if self.systemd >= KNOWS_STEPS else ""
         return _UNIT.format(
             executable=_escaped(self.executable),
+            argument=_escaped(self.executable).replace("$", "$$"),
             user=self.user,
             group=self.group,
             configuration=CONFIGURATION,
@@ -49,7 +50,7 @@ class Unit:
 
 
 def _escaped(path: Path) -> str:
-    return '"' + str(path).replace("%", "%%").replace("$", "$$").replace('"', '\\"') + '"'
+    return '"' + str(path).replace("%", "%%").replace('"', '\\"') + '"'
 
 
 _UNIT = """\
@@ -65,8 +66,8 @@ Type=notify
 SyslogIdentifier=appliance
 NotifyAccess={notify_access}
 EnvironmentFile=-{environment}
-ExecStart=/bin/sh -c 'if [ -n "$ROS_SETUP" ]; then . "$ROS_SETUP"; fi; exec "$0" "$@"' \\
-    {executable} run --config {configuration}/appliance.yaml
+ExecStart=/bin/sh -c 'if [ -n "$$ROS_SETUP" ]; then . "$$ROS_SETUP"; fi; exec "$$0" "$$@"' \\
+    {argument} run --config {configuration}/appliance.yaml
 # Waits for the end of it, and fails with the reason when files cannot be used.
 ExecReload={executable} reload --config {configuration}/appliance.yaml
 Restart=always
