@@ -114,19 +114,15 @@ class Installation:
         self._check()
         if self.source is None and not self.packaged:
             self._check_command()
-        yield from self._install_command()
-        account = self._account()
-        if account is None:
-            yield self._add_user()
-            account = self._account()
-        if account is not None and self._lives_here and not self.dry_run:
-            self._try_as(account)
-        yield from self._configuration(account)
-        yield from self._data(account)
-        if not self.packaged:
-            yield from self._variables()
-            yield from self._unit(account)
-            yield from self._start()
+        try:
+            yield from self._install()
+        except Exception:
+            self._put_back()
+            raise
+        finally:
+            for path in (COMMAND, UNIT_FILE):
+                if self._starts:
+                    _before(self._at(path)).unlink(missing_ok=True)
 
     def uninstall(self, *, purge: bool = False) -> Iterator[Step]:
         """Takes the service and the command away; with `purge` what they have written as well.
@@ -156,6 +152,27 @@ class Installation:
         if purge and self._account() is not None and self.user == OWN_USER:
             remove = partial(self._run, "userdel", *self._prefix, OWN_USER)
             yield self._step("removed", OWN_USER, "the service's user", remove)
+
+    def _install(self) -> Iterator[Step | Credentials]:
+        yield from self._install_command()
+        account = self._account()
+        if account is None:
+            yield self._add_user()
+            account = self._account()
+        if account is not None and self._lives_here and not self.dry_run:
+            self._try_as(account)
+        yield from self._configuration(account)
+        yield from self._data(account)
+        if not self.packaged:
+            yield from self._variables()
+            yield from self._unit(account)
+            yield from self._start()
+
+    def _put_back(self) -> None:
+        """Let the files be as they were."""
+        for undo in reversed(self._undo):
+            undo()
+        self._undo.clear()
 
     def _user_before(self) -> str:
         try:
@@ -400,14 +417,10 @@ class Installation:
         except InstallError as error:
             if not self._undo:
                 raise
-            for undo in reversed(self._undo):
-                undo()
+            self._put_back()
             self._systemctl("daemon-reload")
             self._systemctl("restart", NAME)
             raise InstallError(f"{error}\nThe version that was there before runs again.") from None
-        finally:
-            for path in (COMMAND, UNIT_FILE):
-                _before(self._at(path)).unlink(missing_ok=True)
 
     def _disable(self) -> None:
         self._systemctl("disable", "--now", NAME)

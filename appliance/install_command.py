@@ -65,6 +65,8 @@ def install(
     installation.start, installation.initialise = start, init
     installation.packaged = packaged
     try:
+        if dry_run:
+            typer.echo("Nothing is done. Without --dry-run this would be:")
         for step in installation.install():
             if isinstance(step, Credentials):
                 typer.secho(
@@ -75,7 +77,7 @@ def install(
             else:
                 _say(step)
         if dry_run and not packaged:
-            typer.echo(f"\n{installation.unit()}", nl=False)
+            typer.echo(f"\nThe unit:\n\n{installation.unit()}", nl=False)
     except (
         AccessFileError,
         CertificateError,
@@ -105,6 +107,8 @@ def uninstall(
             raise CommandError("no terminal to ask on; --yes says that it is meant")
         typer.confirm(f"{question}? Nothing brings them back.", abort=True)
     try:
+        if dry_run:
+            typer.echo("Nothing is done. Without --dry-run this would be:")
         for step in installation.uninstall(purge=purge):
             _say(step)
     except InstallError as error:

@@ -7,8 +7,6 @@ import itertools
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +15,7 @@ import pytest
 from appliance_process import eventually
 from raw_client import RawClient
 
+from appliance.control import ask
 from appliance.notify import Notifier
 from service.supervisor import NotifySocket, Supervised
 
@@ -43,9 +42,7 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
         assert all(b - a < 0.9 * WATCHDOG for a, b in itertools.pairwise(beats))
 
         for reloading in (
-            lambda: subprocess.run(
-                [sys.executable, "-m", "appliance", "reload", "-c", appliance.config], check=True
-            ),
+            lambda: ask(tmp_path / "house/state/control.sock", "reload"),
             lambda: os.kill(appliance.pid, signal.SIGHUP),
         ):
             notify.messages.clear()
@@ -66,7 +63,12 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
     assert notify.messages[-1][1] == {"STOPPING": "1", "STATUS": "stopping"}
 
 
-def test_a_hung_one_leaves_all_threads_tracebacks(tmp_path: Path, notify: NotifySocket) -> None:
+def test_a_hung_one_leaves_all_threads_tracebacks(tmp_path: Path) -> None:
+    with NotifySocket() as notify:
+        _hang(tmp_path, notify)
+
+
+def _hang(tmp_path: Path, notify: NotifySocket) -> None:
     appliance = Supervised(tmp_path)
     appliance.supervise(notify, WATCHDOG)
     appliance.start()
