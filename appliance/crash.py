@@ -9,6 +9,7 @@ caught is reported at once, with the last lines of the log.
 from __future__ import annotations
 
 import asyncio
+import errno
 import faulthandler
 import fcntl
 import logging
@@ -70,7 +71,8 @@ class CrashReports:
             _write(self._running, self._head())
         except OSError as error:
             self._close()
-            log.warning("crashes are not reported: %s: %s", self._folder, error.strerror)
+            why = "another appliance uses it" if error.errno == errno.EAGAIN else error.strerror
+            log.warning("crashes are not reported (crash_reports): %s: %s", self._folder, why)
             return
         faulthandler.enable(self._running, all_threads=True)
         threading.excepthook = self._on_thread

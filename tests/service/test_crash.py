@@ -111,7 +111,7 @@ def test_whatever_is_in_the_file(folder: Path, content: bytes) -> None:
 
 def test_two_appliances_with_one_folder(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, second = started(folder), started(folder)
-    assert "crashes are not reported" in caplog.text
+    assert f"{folder}: another appliance uses it" in caplog.text
     second.stop()
     assert (folder / "running").exists()
     first.stop()
@@ -120,7 +120,7 @@ def test_two_appliances_with_one_folder(folder: Path, caplog: pytest.LogCaptureF
 def test_a_folder_that_cannot_be(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder.write_text("a file")
     started(folder).stop()
-    assert f"crashes are not reported: {folder}" in caplog.text
+    assert f"crashes are not reported (crash_reports): {folder}: File exists" in caplog.text
     crash.CrashReports(None, config.loads("", folder)).start()
 
 
