@@ -35,6 +35,8 @@ KEPT = 5
 OF_ONE_RUN = 3
 LARGEST = 256 * 1024
 
+_enable = faulthandler.enable
+
 _RUNNING = "running"
 _REPORTED = "reported in "
 _END_OF_HEAD = "-- what it ended with --\n"
@@ -74,7 +76,9 @@ class CrashReports:
             why = "another appliance uses it" if error.errno == errno.EAGAIN else error.strerror
             log.warning("crashes are not reported (crash_reports): %s: %s", self._folder, why)
             return
-        faulthandler.enable(self._running, all_threads=True)
+        _enable(self._running, all_threads=True)
+        # rclpy's EventsExecutor would have it write to standard error, as soon as it is imported.
+        faulthandler.enable = lambda *_, **__: None
         threading.excepthook = self._on_thread
 
     def stop(self) -> None:
@@ -163,6 +167,7 @@ class CrashReports:
     def _close(self) -> None:
         if self._running is not None:
             faulthandler.disable()
+            faulthandler.enable = _enable
             threading.excepthook = threading.__excepthook__
             os.close(self._running)
             self._running = None

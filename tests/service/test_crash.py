@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -85,6 +86,23 @@ def test_they_are_bounded(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert f"run {KEPT + 1}" in reports(folder)[-1].read_text()
     logs.recent.extend(["z" * 2000] * 200)
     assert len(logs.recent) < 200
+
+
+def test_a_signal_whoever_else_wants_its_report(folder: Path) -> None:
+    """rclpy's EventsExecutor enables the fault handler for standard error."""
+    code = (
+        "import faulthandler, os, sys; from pathlib import Path\n"
+        "from appliance import config, crash;"
+        "folder = Path(sys.argv[1]);"
+        "crash.CrashReports(folder, config.loads('', folder / 'appliance.yaml')).start();"
+        "faulthandler.enable(); os.abort()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, folder], check=False)
+    assert ended.returncode == -signal.SIGABRT
+    found = started(folder)
+    (report,) = reports(folder)
+    assert found.previous == report and "Fatal Python error: Aborted" in report.read_text()
+    found.stop()
 
 
 def test_killed_is_no_crash(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
