@@ -28,9 +28,10 @@ from appliance.unit import (
     Unit,
 )
 
-#: Where the single file goes, where an administrator's own units go, and a package's unit.
+#: Where the single file goes, and an administrator's own units; and those of a package.
 COMMAND = Path("/usr/local/bin/appliance")
 UNIT_FILE = Path("/etc/systemd/system", NAME)
+PACKAGED_COMMAND = Path("/usr/bin/appliance")
 PACKAGED_UNIT = Path("/usr/lib/systemd/system", NAME)
 _ENABLED = Path("/etc/systemd/system/multi-user.target.wants", NAME)
 
@@ -256,6 +257,8 @@ class Installation:
 
     @property
     def _command(self) -> Path:
+        if self.packaged:
+            return PACKAGED_COMMAND
         return self.command if self.source is None else COMMAND
 
     def _install_command(self) -> Iterator[Step]:

@@ -20,11 +20,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from appliance.install import PACKAGED_UNIT, systemd_version
+from appliance.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
 from appliance.unit import ENVIRONMENT, VARIABLES, Unit
 
 PACKAGE = "appliance"
-COMMAND = Path("/usr/bin/appliance")
 DOCUMENTS = Path("/usr/share/doc", PACKAGE)
 PROJECT = Path(__file__).resolve().parent.parent
 SCRIPTS = Path(__file__).parent / "debian"
@@ -59,11 +58,11 @@ def build(command: Path, directory: Path) -> Path:
 
 
 def _stage(root: Path, command: Path) -> None:
-    place = root / COMMAND.relative_to("/")
+    place = root / PACKAGED_COMMAND.relative_to("/")
     place.parent.mkdir(parents=True)
     shutil.copyfile(command, place)
     place.chmod(0o755)
-    unit = Unit(COMMAND, single_file=True, systemd=systemd_version())
+    unit = Unit(PACKAGED_COMMAND, single_file=True, systemd=systemd_version())
     _write(root, PACKAGED_UNIT, str(unit).replace("`appliance install`, which", "a package that"))
     _write(root, ENVIRONMENT, VARIABLES.format(settings=""))
 
