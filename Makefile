@@ -2,6 +2,7 @@
 # make test  every check: format, lint, types, import directions, tests
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
+# make deb   dist/appliance_VERSION_ARCHITECTURE.deb of what `make binary` makes, with its service
 # What they install goes to .venv, what they make to run; both can be deleted at any time.
 
 PYTHON ?= python3
@@ -19,7 +20,7 @@ RUN_EXTRAS := [ros]
 TEST_EXTRAS := [ros,test]
 endif
 
-.PHONY: run test compiled
+.PHONY: run test compiled deb
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
@@ -35,6 +36,9 @@ test: .venv/test.stamp $(INTEROP)/node_modules
 
 compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
+
+deb: binary
+	@$(BIN)/python packaging/deb.py dist/appliance
 
 .venv/run.stamp: pyproject.toml constraints.txt
 	@echo "Setting up .venv; the first time this takes a minute."

@@ -16,9 +16,15 @@ import psutil
 import uvloop
 
 from appliance import wiring
-from appliance.access import FileAccess
-from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
-from appliance.audit import Audit
+from appliance.access import AccessFileError, FileAccess
+from appliance.amqtt_broker import (
+    Answers,
+    ApplianceBroker,
+    PluginSettingsError,
+    configuration,
+    plugin_kinds,
+)
+from appliance.audit import Audit, AuditError
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
@@ -35,11 +41,13 @@ from appliance.config import (
     secrets_in,
 )
 from appliance.control import Control, ControlError
+from appliance.crash import CrashReports
 from appliance.listeners import Listeners
+from appliance.notify import Notifier
 from appliance.reload import Parts, Reload, ReloadError
 from appliance.ros.bridge import Bridge
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
-from appliance.store import MemoryStore, SqliteStore
+from appliance.store import MemoryStore, SqliteStore, StoreError
 from appliance.watch import watch
 
 log = logging.getLogger(__name__)
@@ -55,6 +63,16 @@ YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
 
 
+#: What keeps the appliance from starting and a user can mend; each says what and how.
+START_ERRORS = (
+    AccessFileError,
+    AuditError,
+    CertificateError,
+    OSError,
+    PluginSettingsError,
+    StoreError,
+)
+
 #: Seconds between two looks at the server's certificate and this computer's names and addresses,
 #: and after which the log is told again of what has run out or does soon.
 CERTIFICATE_CHECK = 300.0
@@ -64,10 +82,18 @@ CERTIFICATE_WARNING = 86400.0
 class App:
     """The whole appliance, on the running event loop."""
 
-    def __init__(self, settings: Settings, ros_arguments: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        ros_arguments: Sequence[str] = (),
+        notifier: Notifier | None = None,
+        crashes: CrashReports | None = None,
+    ) -> None:
         """Assign only; `start` reads files and opens ports. For the arguments see `run`."""
         self.settings = settings
         self._ros_arguments = ros_arguments
+        self._notifier = notifier or Notifier()
+        self._crashes = crashes
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
         self.audit: Audit | None = None
@@ -275,28 +301,50 @@ class App:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)
+        if self._crashes is not None:
+            self._crashes.watch(loop)
         await self.start()
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
+        # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
+        self._notifier.start(loop, self._status)
         try:
             await self._stopping.wait()
             log.info("stopping")
+            self._notifier.stopping()
         finally:
             await self.stop()
 
     async def reload(self) -> list[str]:
         """Take over all files as they are now; see `Reload.run`."""
-        return await self._reload.run()
+        with self._notifier.reloading():
+            return await self._reload.run()
+
+    def _status(self) -> str:
+        """How it is, in a line for `systemctl status`."""
+        bridge = self.bridge
+        if bridge is None:
+            ros = "without ROS"
+        elif bridge.problem is not None:
+            ros = f"no ROS: {bridge.problem}"
+        elif bridge.on_bus:
+            ros = f"on ROS as {bridge.node_name}, {_count(len(bridge.topics()), 'topic')} bridged"
+        else:
+            ros = "joining ROS"
+        text = f"{_count(len(self.broker.clients), 'client')}, {ros}"
+        if self._crashes is not None and self._crashes.previous is not None:
+            text += f"; began after a crash, see {self._crashes.previous}"
+        return text
 
     async def _try_reload(self) -> None:
         with contextlib.suppress(ReloadError):  # the log was told
-            await self._reload.run()
+            await self.reload()
 
     def _on_hangup(self) -> None:
         self._listeners.network.in_background(self._try_reload())
 
     async def _answer_reload(self) -> list[str]:
         try:
-            return await self._reload.run()
+            return await self.reload()
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
 
@@ -324,13 +372,29 @@ class App:
         self._stopping.set()
 
 
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
     """Run the appliance until it is told to stop; returns the exit code of the command.
 
     `ros_arguments` are those that stood behind `--ros-args`; they come after the configuration's.
     """
     _spare_the_old()
-    uvloop.run(_main(settings, ros_arguments))
+    notifier = Notifier.from_environment(os.environ)
+    crashes = CrashReports(settings.crash_reports, settings)
+    crashes.start()
+    try:
+        uvloop.run(App(settings, ros_arguments, notifier, crashes).run())
+    except START_ERRORS:
+        raise
+    except Exception as error:
+        crashes.crash(error)
+        raise
+    finally:
+        crashes.stop()
+        notifier.close()
     return 0
 
 
@@ -344,7 +408,3 @@ def _spare_the_old() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(YOUNG_OBJECTS, 10, NEVER)
-
-
-async def _main(settings: Settings, ros_arguments: Sequence[str]) -> None:
-    await App(settings, ros_arguments).run()

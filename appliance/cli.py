@@ -26,6 +26,7 @@ from appliance.console import (
 from appliance.console import load as _load
 from appliance.console import read_password as _read_password
 from appliance.console import shown as _shown
+from appliance.install_command import install, uninstall
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
@@ -144,21 +145,13 @@ def run(
 @contextmanager
 def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
-    from appliance.access import AccessFileError
-    from appliance.amqtt_broker import PluginSettingsError
-    from appliance.audit import AuditError
-    from appliance.certs import CertificateError
-    from appliance.store import StoreError
+    from appliance.app import START_ERRORS
 
     try:
         yield
-    except (
-        AccessFileError,
-        AuditError,
-        CertificateError,
-        PluginSettingsError,
-        StoreError,
-    ) as error:
+    except OSError:  # told by main
+        raise
+    except START_ERRORS as error:
         raise CommandError(str(error)) from None
 
 
@@ -282,6 +275,10 @@ def bench(
 
     cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
     raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))
+
+
+app.command()(install)
+app.command()(uninstall)
 
 
 # What is stored

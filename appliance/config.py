@@ -788,6 +788,7 @@ class Settings(_Section):
     log: Log = _section()
     control: FilePath = Path("state/control.sock")
     reload_on_change: bool = True
+    crash_reports: OptionalPath = Field(Path("state/crashes"), validate_default=True)
     _file: Path | None = PrivateAttr(default=None)
 
     @property

@@ -98,9 +98,16 @@ def generate_password() -> str:
 
 
 def initialise(
-    directory: Path, *, robot: str | None = None, user: str = "operator", demo: bool = False
+    directory: Path,
+    *,
+    robot: str | None = None,
+    user: str = "operator",
+    demo: bool = False,
+    configuration: str = CONFIGURATION,
 ) -> Iterator[Step | Credentials]:
     """Makes what is missing in `directory`, telling each step as it is done.
+
+    `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
     made until then is good and stays.
@@ -112,7 +119,7 @@ def initialise(
     directory.mkdir(parents=True, exist_ok=True)
     file = directory / "appliance.yaml"
     name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
-    text = (DEMO_CONFIGURATION if demo else CONFIGURATION).format(robot=name)
+    text = (DEMO_CONFIGURATION if demo else configuration).format(robot=name)
     made = _write_new(file, text)
     settings = config.load(file)
     if robot and not made and settings.robot != name:

@@ -29,6 +29,7 @@ NEEDS_RESTART: Final = (
     "robot",
     "control",
     "reload_on_change",
+    "crash_reports",
     "broker.store",
     "broker.plugins",
     "broker.plugin_answers",

@@ -41,6 +41,7 @@ _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 _LONGEST_NAME = 247
 
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
+_UDP_PROFILE = _PROFILE.with_name("fastdds_udp.xml")
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
@@ -83,7 +84,7 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
     """
     if (
         not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
-        or "FASTDDS_BUILTIN_TRANSPORTS" in environment
+        or environment.get("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4") != "UDPv4"
         or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
         or any(variable in environment for variable in _PROFILE_VARIABLES)
         or any(Path(file).exists() for file in _PROFILE_FILES)
@@ -91,7 +92,12 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
         return False
     # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
     is_old = "fastrtps" in _resources("packages")
-    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(_PROFILE)
+    profile = _PROFILE
+    if "FASTDDS_BUILTIN_TRANSPORTS" in environment:
+        if not is_old:
+            return False
+        profile = _UDP_PROFILE  # in Humble and before it does not know the variable
+    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(profile)
     return True
 
 

@@ -455,6 +455,15 @@ def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
     assert not ros2.use_fastdds_profile({})
 
 
+def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(monkeypatch):
+    environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    assert not ros2.use_fastdds_profile(environment)
+    monkeypatch.setattr(ros2, "_resources", lambda kind: ["fastrtps"])
+    assert ros2.use_fastdds_profile(environment)
+    profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "UDPv4" in profile and "SHM" not in profile
+
+
 # The demo robot
 
 
