@@ -21,6 +21,7 @@ from appliance.app import App
 from appliance.config import Bind, Settings
 from appliance.environment import for_other_programs
 from appliance.init import PASSWORD_FILE
+from appliance.ros.installation import is_frozen
 
 STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -134,7 +135,8 @@ def instructions(settings: Settings, host: str, port: int) -> str:
         f"-h {host} -p {port} --cafile {_quoted(settings.broker.tls.ca)} "
         f"-u {shlex.quote(user)} -P {shown}"
     )
-    command = _quoted(Path(sys.executable).parent / "appliance")
+    python = Path(sys.executable)
+    command = _quoted(python if is_frozen() else python.parent / "appliance")
     options = f"-c {_quoted(settings.file or Path('appliance.yaml'))} -u {shlex.quote(user)}"
     if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
         options += f" -p {port}"

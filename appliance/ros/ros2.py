@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from appliance.ros import uncompiled
+from appliance.ros import installation, uncompiled
 from appliance.ros.definitions import UnknownTypeError, import_message
 from appliance.ros.node import (
     BusError,
@@ -46,11 +45,9 @@ def available() -> tuple[bool, str]:
     Imports nothing. A middleware that is asked for and not there is found out here because rcl
     would end the whole process over it.
     """
-    if find_spec("rclpy") is None:
-        return False, (
-            "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
-            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
-        )
+    found = installation.find()
+    if found.source == "none" or (found.advice and os.environ.get(installation.CHOICE) == "system"):
+        return False, found.advice
     wanted = os.environ.get("RMW_IMPLEMENTATION")
     installed = sorted(set(_resources("rmw_typesupport")) - {"rmw_implementation"})
     if wanted and installed and wanted not in installed:
@@ -420,8 +417,9 @@ def load_message(name: str) -> type[Any]:
             raise
         if definition.suffix != ".msg":
             raise UnknownTypeError(
-                f"{error}; its definition {definition} is not enough: rclpy makes no calls without "
-                f"support that is compiled for its Python, {sys.version_info[0]}.{sys.version_info[1]}"
+                f"{error}; its definition {definition} is not enough: rclpy makes calls only with "
+                f"support compiled for its own Python, here {sys.version_info[0]}."
+                f"{sys.version_info[1]}"
             ) from error
         found = uncompiled.message_class(name, definition, load_message)
         log.info("%s; %s is read from %s", error, name, definition)

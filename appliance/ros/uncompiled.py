@@ -67,7 +67,8 @@ def message_class(name: str, definition: Path, load: Callable[[str], type]) -> t
     kind = type(
         f"Metaclass_{type_name}", (type,), {"_TYPE_SUPPORT": support.capsule, **conversions}
     )
-    return kind(type_name, (), {"DESCRIPTION": description, "SUPPORT": support})
+    found: type[Any] = kind(type_name, (), {"DESCRIPTION": description, "SUPPORT": support})
+    return found
 
 
 def _read(name: str, definition: Path, load: Callable[[str], type]) -> TypeDescription:
