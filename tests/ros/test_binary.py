@@ -1,0 +1,241 @@
+"""The one file that `make binary` makes, in a root file system that has nothing else but glibc.
+
+Built once for all tests, which takes a minute; `APPLIANCE_BINARY=dist/appliance` takes one that is
+there. `APPLIANCE_BARE_ROOT` names a root file system for it, as debootstrap makes one:
+
+    debootstrap --variant=minbase bookworm /tmp/bare
+    APPLIANCE_BARE_ROOT=/tmp/bare APPLIANCE_BINARY=dist/appliance pytest tests/ros/test_binary.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import ssl
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from appliance_process import HOST, ROBOT, BrokerProcess, eventually
+
+from appliance.environment import for_other_programs
+
+pytest.importorskip("rclpy")
+pytest.importorskip("test_msgs.action")
+pytest.importorskip("PyInstaller")
+from test_own_interfaces import DRIVE, VALUE, build_workspace
+from test_robot import TURTLE, V5, Client, Robot
+from test_ros2 import Peer, domain, string, until
+
+__all__ = ["domain"]  # a fixture for all tests here
+
+PROJECT = Path(__file__).parent.parent.parent
+MIB = 1 << 20
+CONNECT = bytes.fromhex("10 10 0004 4d515454 05 02 003c 00 0003 616263")
+LISTENING = r"listening on \S+:(\d+)$"
+
+#: Run as root of a mount namespace of its own, and leaves nothing of itself in between.
+ENTER = 'mount --rbind /dev "$0/dev" && mount --rbind /proc "$0/proc" && exec env -i "$@"'
+
+
+@pytest.fixture(scope="session")
+def binary(tmp_path_factory):
+    if given := os.environ.get("APPLIANCE_BINARY"):
+        return Path(given).absolute()
+    folder = tmp_path_factory.mktemp("binary")
+    built = subprocess.run(
+        [sys.executable, "-m", "PyInstaller", "--noconfirm", "--distpath", folder]
+        + ["--workpath", PROJECT / "build", PROJECT / "appliance/binary/appliance.spec"],
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert built.returncode == 0, built.stderr[-4000:]
+    return folder / "appliance"
+
+
+@pytest.fixture(scope="session")
+def bare_root(binary, tmp_path_factory):
+    """A folder with the one file, the libraries that it asks for, and nothing else."""
+    if given := os.environ.get("APPLIANCE_BARE_ROOT"):
+        shutil.copy(binary, Path(given, "appliance"))
+        return Path(given)
+    root = tmp_path_factory.mktemp("root")
+    for folder in ("dev", "proc", "tmp"):
+        (root / folder).mkdir()
+    shutil.copy(binary, root / "appliance")
+    # What a minimal Debian has of glibc, some of which only its extension modules ask for.
+    asked_for = subprocess.run(["ldd", binary], capture_output=True, text=True, check=True).stdout
+    found = [Path(path) for path in re.findall(r"(/\S+) \(0x", asked_for)]
+    glibc = next(path.parent for path in found if path.name == "libc.so.6")
+    found += [glibc / name for name in ("libm.so.6", "librt.so.1", "libutil.so.1")]
+    for path in found:
+        (root / path.parent.relative_to("/")).mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, root / path.relative_to("/"))
+    return root
+
+
+class Box(BrokerProcess):
+    """The one file in the bare root, with an environment that has nothing but what is given."""
+
+    name = "the one file"
+
+    def __init__(self, root, name, bridge, *given, **environment):
+        super().__init__(root / name)
+        shutil.rmtree(self.directory, ignore_errors=True)
+        self.root = root
+        self.inside = f"/{name}"
+        self.config = f"{self.inside}/appliance.yaml"
+        self.environment = environment | {
+            variable: os.environ[variable]
+            for variable in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")
+        }
+        told = self.call("init", "--dir", self.inside, "--robot", ROBOT, "--user", "alice").stdout
+        self.passwords = {"alice": re.search(r"user alice, password (\S+)", told)[1]}
+        (self.directory / "password").write_text(self.passwords["alice"])
+        settings = yaml.safe_load((self.directory / "appliance.yaml").read_text())
+        settings["broker"] = {
+            "listeners": [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
+        }
+        settings["bridge"] = bridge
+        (self.directory / "appliance.yaml").write_text(yaml.safe_dump(settings))
+        (self.directory / "acl.conf").write_text(f"user alice\ntopic {ROBOT}/#\ntopic answers/#\n")
+
+    def command(self, *arguments):
+        user = [] if os.geteuid() == 0 else ["--map-root-user"]
+        given = [f"{name}={value}" for name, value in self.environment.items()]
+        chroot = shutil.which("chroot", path=f"{os.environ['PATH']}:/usr/sbin")
+        return [
+            *("unshare", "--mount", *user, "sh", "-c", ENTER, self.root, *given),
+            *(chroot, self.root, "/appliance", *arguments),
+        ]
+
+    def call(self, *arguments, code=0):
+        done = subprocess.run(
+            self.command(*arguments), capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == code, done.stdout + done.stderr
+        return done
+
+    def start(self):
+        self._run(self.command("run", "-c", self.config))
+        try:
+            ports = [line.rpartition(":")[2] for line in self.wait_for_log(LISTENING, 2)]
+        except AssertionError:
+            self.stop()
+            raise
+        self.port, self.plain_port = map(int, ports)
+
+    def mosquitto(self, program, *arguments):
+        login = ["-h", HOST, "-p", f"{self.port}", "--cafile", self.ca, "-u", "alice"]
+        return [f"mosquitto_{program}", *login, "-P", self.passwords["alice"], *arguments]
+
+
+@pytest.fixture
+def box(bare_root, request, tmp_path):
+    """Makes a Box, started; it ends with the test, and leaves nothing in the root."""
+    made = []
+
+    def make(bridge, **environment):
+        made.append(Box(bare_root, f"house-{os.getpid()}", bridge, **environment))
+        made[0].start()
+        return made[0]
+
+    yield make
+    for each in made:
+        try:
+            each.stop()
+        finally:
+            shutil.rmtree(each.directory, ignore_errors=True)
+
+
+def test_size_and_time_until_the_first_client_is_answered(binary, box):
+    assert binary.stat().st_size < 100 * MIB
+    house = box({"bus": "none"})
+    context = house.tls_context()
+    port = house.port
+    house.stop()
+    settings = house.directory / "appliance.yaml"
+    settings.write_text(settings.read_text().replace("127.0.0.1:0", f"127.0.0.1:{port}", 1))
+    # The best of three: other tests' processes may still be ending on this computer.
+    assert min(_seconds_until_answered(house, context, port) for _ in range(3)) < 2
+
+
+def _seconds_until_answered(house, context, port):
+    began = time.monotonic()
+    house._run(house.command("run", "-c", house.config))
+    try:
+        while True:
+            try:
+                with house.open(tls=True) as connection:
+                    connection.sendall(CONNECT)
+                    assert connection.recv(1) == b"\x20"  # CONNACK, that it may not come in
+                    return time.monotonic() - began
+            except ConnectionRefusedError:
+                assert time.monotonic() < began + 30, house.log
+                time.sleep(0.005)
+    finally:
+        house.stop()
+
+
+async def test_topics_services_and_actions_with_other_nodes(box, bare_root):
+    # No package in the one file has an action: it is taken from a workspace with compiled support.
+    overlay(bare_root, "ws", "test_msgs")
+    house = box(
+        {
+            "topics": [
+                {"ros": "/chatter", "to": "mqtt", "encoding": "text"},
+                {"ros": "/said", "to": "ros", "type": "std_msgs/msg/String"},
+            ],
+            "services": ["/turtle/*"],
+            "actions": ["/turtle/walk"],
+        },
+        AMENT_PREFIX_PATH="/ws",
+        LD_LIBRARY_PATH="/ws/lib",
+    )
+    peer, robot = Peer(), Robot()
+    try:
+        await peer.start()
+        await peer.do("subscribe", "/said", "std_msgs/msg/String")
+        await peer.do("advertise", "/chatter", "std_msgs/msg/String")
+        await peer.do("matched", "/chatter")
+        listener = subprocess.Popen(
+            house.mosquitto("sub", "-C", "1", "-t", f"{ROBOT}/chatter"), stdout=subprocess.PIPE
+        )
+        while listener.poll() is None:
+            await peer.do("publish", "/chatter", string("hello from ROS").hex())
+        assert listener.communicate()[0] == b"hello from ROS\n"
+
+        said = house.mosquitto("pub", "-t", f"{ROBOT}/said", "-m", '{"data": "hello"}')
+        subprocess.run(said, check=True, timeout=30)
+        await until(lambda: peer.received, "the message on /said")
+        assert bytes.fromhex(peer.received[0][1]) == string("hello")
+
+        robot.wait()
+        house.wait_for_log("/turtle/pen can be called")
+        house.wait_for_log("/turtle/walk can be called")
+        client = Client(house, V5)
+        assert client.call(f"{TURTLE}/pen/_call", {"data": True})["success"]
+        goal = client.call(f"{TURTLE}/walk/_goal", {"order": 3})
+        client.subscribe(f"{TURTLE}/walk/_result/{goal['goal_id']}")
+        assert client.next(f"{TURTLE}/walk/_result/{goal['goal_id']}")["result"]
+        client.leave()
+    finally:
+        await peer.stop()
+        robot.stop()
+
+
+def overlay(root, name, package):
+    """Put an installed package into the root as a workspace would have it."""
+    prefix, site = root / name, f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+    if prefix.exists():
+        return
+    for folder in (f"share/{package}", f"{site}/{package}"):
+        shutil.copytree(Path(sys.prefix, folder), prefix / folder)
+    for library in Path(sys.prefix, "lib").glob(f"lib{package}__*.so"):
+        shutil.copy(library, prefix / "lib")
