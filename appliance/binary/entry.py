@@ -62,6 +62,9 @@ def use_ros() -> None:
     else:
         libraries.append(INSIDE)
         sys.path[:0] = [*python, str(sourced.site)]
+        # What a distribution's ROS asks of its Python, numpy for one, and may be missing here.
+        version = f"/usr/lib/python{sys.version_info[0]}.{sys.version_info[1]}"
+        sys.path += [version, f"{version}/lib-dynload", "/usr/lib/python3/dist-packages"]
     environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     environment[PREFIXES] = os.pathsep.join(prefixes)
     if not os.access(environment.get("HOME", ""), os.W_OK):  # where ROS wants to put its logs
