@@ -194,7 +194,7 @@ def _answers(house, context, port):
 
 
 def test_the_commands(box):
-    house = box({"bus": "none"})
+    house = box({})
     config = ("-c", house.config)
     login = (*config, "-H", "127.0.0.1", "-p", f"{house.port}", "-u", "alice")
     login += ("--password-file", f"{house.inside}/password")
@@ -217,7 +217,7 @@ def test_programs_that_it_starts_run_in_it_too(box, bare_root):
     settings["bridge"] = {"topics": [{"ros": "/chatter", "to": "mqtt", "encoding": "text"}]}
     (house.directory / "appliance.yaml").write_text(yaml.safe_dump(settings))
     house._run(house.command("demo", "-c", house.config))
-    house.port = int(house.wait_for_log(LISTENING, 2)[-2].rpartition(":")[2])
+    house.port = int(house.wait_for_log(LISTENING, 4)[-2].rpartition(":")[2])
     listener = house.listen(f"{ROBOT}/chatter", "-C", "1")
     assert listener.communicate()[0].startswith("Hello World")
     assert "/appliance sub -c" in house.log
@@ -286,7 +286,7 @@ def test_a_sourced_ros_that_fits_is_used(box, bare_root):
         "ROS_FROM": "system",
     }
     house = box({"topics": [{"ros": "/x", "to": "mqtt"}]}, **environment)
-    house.wait_for_log("the bridge is the node|ROS 2")
+    house.wait_for_log("on ROS as /appliance")
     found = re.search("bridge: (.*)", house.call("check", "-c", house.config).stdout)[1]
     assert found.startswith(f"ROS 2 kilted in /{site.relative_to(bare_root)} (Python ")
     maps = Path(f"/proc/{psutil.Process(house.pid).children()[0].pid}/maps").read_text()
@@ -331,7 +331,7 @@ async def test_topics_services_and_actions_with_other_nodes(box, bare_root):
 
         house.publish(f"{ROBOT}/said", '{"data": "hello"}')
         await until(lambda: peer.received, "the message on /said")
-        assert bytes.fromhex(peer.received[0][1]) == string("hello")
+        assert bytes.fromhex(peer.received[0][1]).startswith(string("hello"))
 
         robot.wait()
         house.wait_for_log("/turtle/pen can be called")
