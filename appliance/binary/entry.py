@@ -6,7 +6,6 @@ those that are started from within `sys.executable` is the one file.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import runpy
 import signal
@@ -22,8 +21,8 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def main() -> None:
-    end_with_the_boot_loader()
     use_ros()
+    end_with_the_boot_loader()
     if sys.argv[1:2] == ["-m"] and sys.argv[2:]:
         module = sys.argv[2]
         del sys.argv[1:3]
@@ -36,6 +35,8 @@ def main() -> None:
 
 def end_with_the_boot_loader() -> None:
     """It waits to clear up behind this process, and who kills it means this one."""
+    import ctypes  # needs a library that is found only with the environment that use_ros makes
+
     parent = os.getppid()
     try:
         is_boot_loader = Path(f"/proc/{parent}/exe").samefile(sys.executable)

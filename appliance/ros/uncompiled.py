@@ -15,6 +15,7 @@ import functools
 import json
 import os
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from appliance.ros.definitions import (
     Field,
     FieldType,
     ItemType,
+    Primitive,
     Sequence,
     String,
     TypeDescription,
@@ -35,6 +37,11 @@ from appliance.ros.definitions import (
 
 #: The type whose support serves for others: it has no bounded size, as others may have none.
 MODEL = "std_msgs/msg/String"
+#: The longest array of fixed length: a value of it is made for its default.
+MOST_ITEMS = 1 << 24
+
+#: Of the types that contain one another, those that are just being read.
+_being_read: ContextVar[tuple[str, ...]] = ContextVar("_being_read", default=())
 _IDENTIFIER = b"rosidl_typesupport_fastrtps_c"
 
 
@@ -72,20 +79,21 @@ def message_class(name: str, definition: Path, load: Callable[[str], type]) -> t
 
 
 def _read(name: str, definition: Path, load: Callable[[str], type]) -> TypeDescription:
-    from rosidl_adapter.parser import (
-        InvalidResourceName,
-        InvalidSpecification,
-        InvalidValue,
-        parse_message_string,
-    )
+    from rosidl_adapter.parser import parse_message_string
 
     package, _, type_name = name.partition("/msg/")
+    outside = _being_read.get()
+    if name in outside:
+        raise UnknownTypeError(f"no {name}: {definition} contains itself")
     try:
-        text = definition.read_text("utf-8")
-        fields = parse_message_string(package, type_name, text).fields
-    except (InvalidResourceName, InvalidSpecification, InvalidValue, OSError, ValueError) as error:
+        fields = parse_message_string(package, type_name, definition.read_text("utf-8")).fields
+    except Exception as error:  # the parser raises many kinds, NameError and AssertionError too
         raise UnknownTypeError(f"no {name}: {definition} cannot be read: {error}") from error
-    return TypeDescription(name, tuple(_field(field, load) for field in fields))
+    token = _being_read.set((*outside, name))
+    try:
+        return TypeDescription(name, tuple(_field(field, load) for field in fields))
+    finally:
+        _being_read.reset(token)
 
 
 def _field(field: Any, load: Callable[[str], type]) -> Field:
@@ -94,12 +102,31 @@ def _field(field: Any, load: Callable[[str], type]) -> Field:
     if field.type.is_array:
         size = field.type.array_size
         is_fixed = size is not None and not field.type.is_upper_bound
+        if is_fixed and size > MOST_ITEMS:
+            raise UnknownTypeError(f"{field.name} has {size} items, the most is {MOST_ITEMS}")
         type_ = Array(item, size) if is_fixed else Sequence(item, size)
     default = field.default_value
-    if isinstance(default, (list, tuple)):
-        is_octets = getattr(item, "is_octet", False)
-        default = bytes(default) if is_octets else list(default)
+    if default is None:
+        default = _zero(type_)
+    elif isinstance(default, (list, tuple)):
+        default = _values(item, list(default))
     return Field(field.name, type_, default)
+
+
+def _zero(type_: FieldType) -> Any:
+    """What a compiled type has where its definition says nothing; None for messages."""
+    if isinstance(type_, Array):
+        zero = _zero(type_.item)
+        return None if zero is None else _values(type_.item, [zero] * type_.length)
+    if isinstance(type_, Sequence):
+        return None if isinstance(type_.item, TypeDescription) else _values(type_.item, [])
+    if isinstance(type_, Primitive):
+        return False if type_.code == "?" else 0.0 if type_.is_float else 0
+    return None if isinstance(type_, TypeDescription) else ""
+
+
+def _values(item: ItemType, values: list[Any]) -> Any:
+    return bytes(values) if isinstance(item, Primitive) and item.is_octet else values
 
 
 def _item(type_: Any, load: Callable[[str], type]) -> ItemType:
@@ -109,7 +136,7 @@ def _item(type_: Any, load: Callable[[str], type]) -> ItemType:
         return String(type_.string_upper_bound)
     if type_.type == "wstring":
         return WideString(type_.string_upper_bound)
-    return PRIMITIVES[type_.type]
+    return PRIMITIVES["uint8" if type_.type == "char" else type_.type]
 
 
 def _hash(name: str, file: Path) -> bytes | None:

@@ -32,6 +32,8 @@ from test_ros2 import Peer, domain, string, until
 
 __all__ = ["domain"]  # a fixture for all tests here
 
+pytestmark = pytest.mark.timeout(600)  # it may have to be built
+
 PROJECT = Path(__file__).parent.parent.parent
 MIB = 1 << 20
 CONNECT = bytes.fromhex("10 10 0004 4d515454 05 02 003c 00 0003 616263")
@@ -219,7 +221,7 @@ def test_programs_that_it_starts_run_in_it_too(box, bare_root):
     house._run(house.command("demo", "-c", house.config))
     house.port = int(house.wait_for_log(LISTENING, 4)[-2].rpartition(":")[2])
     listener = house.listen(f"{ROBOT}/chatter", "-C", "1")
-    assert listener.communicate()[0].startswith("Hello World")
+    assert listener.communicate()[0].startswith("Hello World"), house.log
     assert "/appliance sub -c" in house.log
 
 
