@@ -39,7 +39,7 @@ compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
 binary: .venv/binary.stamp
-	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build appliance/binary/appliance.spec
+	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build --distpath dist appliance/binary/appliance.spec
 	@ls -sh dist/appliance
 
 .venv/run.stamp: pyproject.toml constraints.txt

@@ -19,7 +19,6 @@ import uvloop
 from appliance.access import Passwords
 from appliance.app import App
 from appliance.config import Bind, Settings
-from appliance.environment import for_other_programs
 from appliance.init import PASSWORD_FILE
 from appliance.ros.installation import is_frozen
 
@@ -104,7 +103,6 @@ async def _start_robot(settings: Settings) -> Process | None:
         sys.executable,
         "-m",
         "appliance.demo",
-        env=for_other_programs(),
         # The robot must not drive on when this process is killed.
         preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
     )

@@ -132,7 +132,9 @@ class Box(BrokerProcess):
         self.port, self.plain_port = map(int, ports)
 
     def publish(self, topic, text):
-        subprocess.run([*self._mosquitto("pub"), "-t", topic, "-m", text], check=True, timeout=30)
+        """Publish it once a second until it is told to stop."""
+        command = [*self._mosquitto("pub"), "-t", topic, "-m", text, "--repeat", "60"]
+        return subprocess.Popen([*command, "--repeat-delay", "1"])
 
     def listen(self, topic, *options):
         """mosquitto_sub, which prints what comes."""
@@ -254,8 +256,10 @@ async def test_types_without_compiled_support(box, bare_root, tmp_path):
         )
         more = ("-t", f"{ROBOT}/raw", "-V", "5", "-C", "2", "-F", "%t %P %x")
         listener = house.listen(f"{ROBOT}/state", *more)
-        house.publish(f"{ROBOT}/drive", json.dumps(VALUE))
+        publisher = house.publish(f"{ROBOT}/drive", json.dumps(VALUE))
         await until(lambda: peer.received, "the message on /drive")
+        publisher.kill()
+        publisher.wait()
         cdr = peer.received[0][1]
         heard = {}
         for topic in ("/state", "/raw"):
@@ -331,8 +335,10 @@ async def test_topics_services_and_actions_with_other_nodes(box, bare_root):
             await peer.do("publish", "/chatter", string("hello from ROS").hex())
         assert listener.communicate()[0] == "hello from ROS\n"
 
-        house.publish(f"{ROBOT}/said", '{"data": "hello"}')
+        publisher = house.publish(f"{ROBOT}/said", '{"data": "hello"}')
         await until(lambda: peer.received, "the message on /said")
+        publisher.kill()
+        publisher.wait()
         assert bytes.fromhex(peer.received[0][1]).startswith(string("hello"))
 
         robot.wait()
