@@ -17,6 +17,8 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
+from appliance.ros import installation
+from appliance.ros.ros2 import available
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
 
@@ -196,9 +198,12 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
     bridge = settings.bridge
     if bridge.bus == "none":
         yield Finding("ok", "bridge", "off: a broker alone")
-    elif importlib.util.find_spec("rclpy") is None:
-        text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
-        yield Finding("warning", "bridge", text)
+        return
+    is_available, reason = available()
+    if not is_available:
+        yield Finding("warning", "bridge", f"{reason}; the broker runs without")
     else:
         called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
-        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics) + called}")
+        yield Finding(
+            "ok", "bridge", f"{installation.find()}; routes: {len(bridge.topics) + called}"
+        )

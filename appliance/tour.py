@@ -19,8 +19,8 @@ import uvloop
 from appliance.access import Passwords
 from appliance.app import App
 from appliance.config import Bind, Settings
-from appliance.environment import for_other_programs
 from appliance.init import PASSWORD_FILE
+from appliance.ros.installation import is_frozen
 
 STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -103,7 +103,6 @@ async def _start_robot(settings: Settings) -> Process | None:
         sys.executable,
         "-m",
         "appliance.demo",
-        env=for_other_programs(),
         # The robot must not drive on when this process is killed.
         preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
     )
@@ -134,7 +133,8 @@ def instructions(settings: Settings, host: str, port: int) -> str:
         f"-h {host} -p {port} --cafile {_quoted(settings.broker.tls.ca)} "
         f"-u {shlex.quote(user)} -P {shown}"
     )
-    command = _quoted(Path(sys.executable).parent / "appliance")
+    python = Path(sys.executable)
+    command = _quoted(python if is_frozen() else python.parent / "appliance")
     options = f"-c {_quoted(settings.file or Path('appliance.yaml'))} -u {shlex.quote(user)}"
     if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
         options += f" -p {port}"

@@ -190,6 +190,8 @@ def describe(message_class: type, load: Callable[[str], type]) -> TypeDescriptio
     Raises UnknownTypeError for a field of a type that rclpy has no support for (wchar, long
     double), and whatever `load` raises.
     """
+    if isinstance(read := getattr(message_class, "DESCRIPTION", None), TypeDescription):
+        return read  # from its definition, see uncompiled.py
     package, kind = message_class.__module__.split(".")[:2]
     name = f"{package}/{kind}/{message_class.__name__}"
     names = message_class.get_fields_and_field_types()  # type: ignore[attr-defined]

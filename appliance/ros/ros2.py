@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from appliance.ros import installation, uncompiled
 from appliance.ros.definitions import UnknownTypeError, import_message
 from appliance.ros.node import (
     BusError,
@@ -52,11 +52,9 @@ def available() -> tuple[bool, str]:
     Imports nothing. A middleware that is asked for and not there is found out here because rcl
     would end the whole process over it.
     """
-    if find_spec("rclpy") is None:
-        return False, (
-            "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
-            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
-        )
+    found = installation.find()
+    if found.source == "none" or (found.advice and os.environ.get(installation.CHOICE) == "system"):
+        return False, found.advice
     wanted = os.environ.get("RMW_IMPLEMENTATION")
     installed = sorted(set(_resources("rmw_typesupport")) - {"rmw_implementation"})
     if wanted and installed and wanted not in installed:
@@ -268,7 +266,7 @@ class Ros2Node:
         return [endpoint for endpoint in endpoints if endpoint.node != self.name]
 
     def load(self, type_name: str) -> type[Any]:
-        return import_message(type_name)
+        return load_message(type_name)
 
     # Subscriptions and publishers
 
@@ -281,7 +279,7 @@ class Ros2Node:
         *,
         timed: bool = False,
     ) -> _Subscription:
-        message_class = import_message(type_name)
+        message_class = load_message(type_name)
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
         if timed and not self._is_event_driven:
             callback = _with_time(callback)
@@ -295,7 +293,7 @@ class Ros2Node:
         return _Subscription(self._node, own)
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
-        message_class = import_message(type_name)
+        message_class = load_message(type_name)
         events = _event_callbacks().PublisherEventCallbacks(use_default_callbacks=False)
         with _as_bus_error():
             own = self._node.create_publisher(
@@ -427,11 +425,45 @@ class _Service:
         self._node.destroy_service(own)
 
 
+@functools.cache
+def load_message(name: str) -> type[Any]:
+    """The class of a message type: with its compiled support or, where that does not load, read
+    from its definition. Raises UnknownTypeError that says why it is neither.
+    """
+    try:
+        return _with_support(import_message(name))
+    except UnknownTypeError as error:
+        definition = uncompiled.find_definition(name)
+        if definition is None:
+            raise
+        if definition.suffix != ".msg":
+            raise UnknownTypeError(
+                f"{error}; its definition {definition} is not enough: rclpy makes calls only with "
+                f"support compiled for its own Python, here {sys.version_info[0]}."
+                f"{sys.version_info[1]}"
+            ) from error
+        found = uncompiled.message_class(name, definition, load_message)
+        log.info("%s; %s is read from %s", error, name, definition)
+        return found
+
+
+def _with_support(found: type[Any]) -> type[Any]:
+    from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
+
+    try:
+        found.__class__.__import_type_support__()  # type: ignore[attr-defined]
+    except UnsupportedTypeSupport as error:
+        package = found.__module__.partition(".")[0]
+        reason = str(error.__context__ or error).partition("\n")[0]
+        raise UnknownTypeError(f"the package {package} does not load: {reason}") from error
+    return found
+
+
 def import_service(name: str) -> Any:
     """The class of a service `std_srvs/srv/Trigger`, and of those that an action is made of,
     `pkg/action/Name_SendGoal` and `pkg/action/Name_GetResult`. Raises UnknownTypeError.
     """
-    request = import_message(f"{name}_Request")
+    request = load_message(f"{name}_Request")
     service = getattr(sys.modules[request.__module__], name.rpartition("/")[2], None)
     if service is None:
         raise UnknownTypeError(f"no {name}: it is not a service")
