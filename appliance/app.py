@@ -10,6 +10,7 @@ import os
 import signal
 from collections.abc import Coroutine, Sequence
 from dataclasses import asdict
+from datetime import timedelta
 from importlib.metadata import version
 
 import psutil
@@ -28,6 +29,7 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
+from appliance.clock import StepWatch
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -73,6 +75,7 @@ class App:
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
+        self._certificates_due = asyncio.Event()
 
     async def start(self) -> None:
         """Start everything, or nothing.
@@ -194,6 +197,7 @@ class App:
     async def _keep_certificates(self, tls: TlsContexts) -> None:
         """Renew the server's certificate when that is due, and tell of what has run out."""
         told: dict[str, float] = {}
+        due = self._certificates_due
         loop = asyncio.get_running_loop()
         reason = ""
         while True:
@@ -212,7 +216,9 @@ class App:
                 if text not in told:
                     told[text] = now
                     log.warning("%s", text)
-            await asyncio.sleep(CERTIFICATE_CHECK)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
+            due.clear()
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""
@@ -248,10 +254,14 @@ class App:
         interval = self.settings.broker.sys_interval
         next_sys = loop.time() + min(interval, TICK)
         timer: asyncio.TimerHandle
+        steps = StepWatch(loop.time())
 
         def tick() -> None:
             nonlocal timer, next_sys
             now = loop.time()
+            step = steps.look(now)
+            if step:
+                self._clock_was_set(step)
             due = self.broker.tick(now)
             if interval and now >= next_sys:
                 next_sys = now + interval
@@ -261,6 +271,16 @@ class App:
 
         timer = loop.call_later(TICK, tick)
         self._stack.callback(lambda: timer.cancel())
+
+    def _clock_was_set(self, step: float) -> None:
+        """The wall clock says something else; only dates depend on it."""
+        text = f"the computer's clock was set {'forward' if step > 0 else 'back'} by "
+        text += f"{timedelta(seconds=round(abs(step)))}"
+        log.warning("%s, or the computer slept: nothing expires by that", text)
+        if self.audit is not None:
+            self.audit.changed(text)
+        self._certificates_due.set()
+        self._listeners.network.in_background(self._listeners.check_certificates())
 
     def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         self.broker.publish(Message(topic, payload, 0, retain), self._inside)

@@ -278,7 +278,7 @@ class Ros2Node:
             )
         if timed and self._is_event_driven:
             own.__class__ = _timed_subscription()
-            own.since = time.time_ns()
+            own.since = time.monotonic_ns()
         return _Subscription(self._node, own)
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
@@ -447,7 +447,7 @@ def _new_executor(context: Any) -> tuple[Any, bool]:
 
 def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
     """What calls the callback with some messages' time; rclpy tells it of all that it is given."""
-    since = time.time_ns()
+    since = time.monotonic_ns()
     until_timed = ONE_TIMED_OF
 
     def timed(cdr: bytes, info: Any) -> None:
@@ -463,9 +463,13 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
 
 
 def _published_at(info: Any, since: int) -> int:
-    """0 for what was published before `since`, and kept for late subscribers."""
+    """0 for what was published before `since`, and kept for late subscribers.
+
+    `since` is of the clock that only counts: the other one may have been set meanwhile.
+    """
     published_at = int(info["source_timestamp"])
-    return published_at if published_at > since else 0
+    age = time.time_ns() - published_at
+    return published_at if age < time.monotonic_ns() - since else 0
 
 
 @functools.cache
