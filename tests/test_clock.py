@@ -7,7 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from appliance_process import ROBOT, ApplianceProcess, eventually
+from appliance_process import ROBOT, ApplianceProcess
 from raw_client import RawClient
 from wall_clock import HOUR, YEAR, WallClock
 
@@ -21,6 +21,7 @@ from appliance.mqtt.packets import (
     Subscription,
     Will,
 )
+from appliance.mqtt.reason import ReasonCode
 
 INBOX, WILLS = f"{ROBOT}/inbox", f"{ROBOT}/wills"
 ACL = f"user alice\ntopic readwrite {ROBOT}/#\n"
@@ -90,7 +91,8 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         told = process.wait_for_log("clock was set (forward|back) by ", 4)
         assert "forward by 1:00:00" in told[0] and "back by 2:00:00" in told[1]
         # Who is silent is disconnected, and not before its time.
-        assert silent.decode(silent.receive()).reason_code == 0x8D
+        told_why = silent.decode(silent.receive())
+        assert told_why == Disconnect(ReasonCode.KEEP_ALIVE_TIMEOUT)
         assert 4.4 < time.monotonic() - heard < 8
         [delivered] = wills
         assert 3 <= delivered - died < 5
