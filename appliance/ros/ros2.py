@@ -126,6 +126,8 @@ class Ros2Node:
             failed(reason)
             return
         use_fastdds_profile(os.environ)
+        if self._thread is not None:  # it has failed, and is about to end
+            self._thread.join()
         # Not a daemon: one that is alive when Python ends aborts the process.
         self._thread = threading.Thread(target=self._run, args=(poll, failed), name="ros")
         self._thread.start()
@@ -223,6 +225,10 @@ class Ros2Node:
     def now(self) -> int:
         clock = self._clock
         return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
+
+    def nodes(self) -> list[str]:
+        found = self._node.get_node_names_and_namespaces()
+        return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
 
     def topics(self) -> dict[str, list[str]]:
         return dict(self._node.get_topic_names_and_types())

@@ -17,11 +17,12 @@ from appliance.ros.bridge import Bridge
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import STRING, House, Peer, domain, route, until
+from test_ros2 import STRING, House, Peer, domain, route, string, until
 
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
 from appliance.ros.diagnostics import TYPE
+from appliance.ros.graph import CallRoutes, ServiceSettings
 
 __all__ = ["domain"]  # a fixture for all tests here
 
@@ -110,6 +111,56 @@ async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
     house = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
     await until(lambda: house.bridge.problem, "the problem")
     assert "not a remapping" in house.bridge.problem
+
+
+async def test_a_bus_that_is_late_is_joined_when_it_is_there(start, peer, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_of_tomorrow")
+    house = start(route("/a", "mqtt", "text"))
+    await until(lambda: house.bridge.problem, "the problem")
+    assert "rmw_of_tomorrow, which is not installed here" in house.bridge.problem
+    assert house.bridge.state == "waiting"
+    monkeypatch.delenv("RMW_IMPLEMENTATION")
+    await until(lambda: house.bridge.state == "joined", "the bus")
+    await peer.do("advertise", "/a", STRING)
+    await peer.do("matched", "/a")
+    await peer.do("publish", "/a", (b"\0\1\0\0\x02\0\0\0x\0").hex())
+    await until(lambda: house.payloads("r2d2/a") == [b"x"], "the message from ROS")
+    await until(lambda: house.bridge.peers == 1, "the peer")
+
+
+async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
+    """All is set up again: topics both ways, services, what is told on /diagnostics."""
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    house = start(
+        route("/a", "mqtt", "text"), route("/b", "ros", "text", type=STRING), diagnostics=0.1
+    )
+    offered = ServiceSettings(ros="/ask", mqtt="r2d2{ros}", to="mqtt", type="std_srvs/srv/Trigger")
+    house.bridge.calls.replace(CallRoutes(services=(offered,)))
+    await peer.do("advertise", "/a", STRING)
+    await peer.do("subscribe", "/b", STRING)
+    await peer.do("subscribe", "/diagnostics", TYPE)
+    await until(lambda: len(house.bridged()) == 2, "both")
+    for word in ("before", "after"):
+        await peer.do("matched", "/a")
+        await peer.do("publish", "/a", string(word).hex())
+        await until(lambda word=word: house.payloads("r2d2/a")[-1:] == [word.encode()], word)
+
+        def arrives(word=word):
+            house.send("r2d2/b", word.encode())
+            return any(topic == "/b" and word.encode().hex() in cdr for topic, cdr in peer.received)
+
+        await until(arrives, f"{word} on ROS")
+        peer.received.clear()
+        await until(lambda: any(topic == "/diagnostics" for topic, _ in peer.received), "health")
+        seen = {}
+        house.node.call_soon(lambda seen=seen: seen.update(house.node.services()))
+        await until(lambda seen=seen: "/ask" in seen, "the service")
+        if word == "before":
+            house.node._rclpy.shutdown(context=house.node._context)
+            await until(lambda: house.bridge.state == "lost", "the loss")
+            await until(lambda: house.bridge.state == "joined", "the return")
+            await until(lambda: len(house.bridged()) == 2, "both again")
 
 
 @pytest.mark.parametrize(
