@@ -24,11 +24,15 @@ from appliance.ros.node import (
     Reliability,
     Respond,
 )
+from appliance.ros.reach import Reach, look_again, reach
 
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
+
+#: Seconds between two looks at what networks there are.
+NETWORK_INTERVAL = 2.0
 
 #: How many messages of a subscription are timed first, and of how many one is then.
 FIRST_TIMED = 100
@@ -146,7 +150,7 @@ class Ros2Node:
         except Exception as error:
             # The thread's end, whatever ended it: it must be told, and the bus be left in order.
             log.debug("the ROS thread ended", exc_info=True)
-            reason = f"{type(error).__name__}: {error}"
+            reason = str(error) if isinstance(error, BusError) else _described(error)
         finally:
             self._leave()
         if reason:
@@ -159,6 +163,7 @@ class Ros2Node:
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
+        look_again()
         self._rclpy = rclpy
         self._context = Context()
         rclpy.init(
@@ -187,6 +192,8 @@ class Ros2Node:
         from rclpy.executors import ExternalShutdownException
         from rclpy.task import Future
 
+        began_with = reach()
+        look_at = time.monotonic() + NETWORK_INTERVAL
         poll()
         never: Any = Future(executor=self._executor)
         try:
@@ -194,6 +201,10 @@ class Ros2Node:
                 # A finite time-out also mends EventsExecutor, whose endless wait overflows.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
+                if began_with < Reach.NETWORK and time.monotonic() >= look_at:
+                    look_at = time.monotonic() + NETWORK_INTERVAL
+                    if reach() > began_with:
+                        raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
                 raise
@@ -421,6 +432,10 @@ def import_service(name: str) -> Any:
     if service is None:
         raise UnknownTypeError(f"no {name}: it is not a service")
     return service
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _errors() -> tuple[type[Exception], ...]:

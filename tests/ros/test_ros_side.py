@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
+import psutil
 import pytest
 import yaml
 
@@ -23,6 +26,7 @@ from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
 from appliance.ros.diagnostics import TYPE
 from appliance.ros.graph import CallRoutes, ServiceSettings
+from appliance.ros.reach import Reach, reach
 
 __all__ = ["domain"]  # a fixture for all tests here
 
@@ -161,6 +165,39 @@ async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
             await until(lambda: house.bridge.state == "lost", "the loss")
             await until(lambda: house.bridge.state == "joined", "the return")
             await until(lambda: len(house.bridged()) == 2, "both again")
+
+
+async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
+    monkeypatch.setattr(ros2, "reach", lambda: found)
+    found = Reach.THIS_COMPUTER
+    house = start(route("/a", "mqtt", "text"))
+    await until(lambda: house.bridge.peers == 1, "the peer")
+    await asyncio.sleep(0.5)
+    assert house.bridge.state == "joined"
+    first, found = house.node._context, Reach.NETWORK
+    await until(lambda: house.bridge.state == "lost", "the new start")
+    assert house.bridge.problem == "there was no network yet when it was joined, and is now"
+    await until(lambda: house.bridge.peers == 1, "the peer again")
+    assert house.node._context is not first
+
+
+def test_how_far_one_can_be_heard(monkeypatch):
+    up, down = SimpleNamespace(isup=True), SimpleNamespace(isup=False)
+    states = {"lo": up, "eth0": down}
+    ends = {
+        name: [SimpleNamespace(family=socket.AF_INET, address=address)]
+        for name, address in (("lo", "127.0.0.1"), ("eth0", "10.0.0.1"), ("gone", "10.0.0.2"))
+    }
+    monkeypatch.setattr(psutil, "net_if_stats", lambda: states)
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: ends)
+    assert reach({}) is Reach.THIS_COMPUTER
+    states["eth0"] = up
+    assert reach({}) is Reach.NETWORK
+    assert reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is Reach.THIS_COMPUTER
+    states["lo"] = states["eth0"] = down
+    assert reach({}) is Reach.NOBODY
 
 
 @pytest.mark.parametrize(
