@@ -16,7 +16,7 @@ from importlib.metadata import version
 import psutil
 import uvloop
 
-from appliance import wiring
+from appliance import status, wiring
 from appliance.access import FileAccess
 from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
 from appliance.audit import Audit
@@ -76,6 +76,7 @@ class App:
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
         self._certificates_due = asyncio.Event()
+        self._status: status.Status | None = None
 
     async def start(self) -> None:
         """Start everything, or nothing.
@@ -166,6 +167,17 @@ class App:
         self._start_bridge(loop)
         self._reload = Reload(
             Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
+        )
+        self._status = status.Status(
+            status.Parts(
+                version("ros-mqtt-appliance"),
+                broker,
+                listeners,
+                store,
+                self.bridge,
+                self._reload,
+                tls.warnings if tls is not None else list,
+            )
         )
         if tls is not None:
             self._beside(self._keep_certificates(tls))
@@ -263,6 +275,8 @@ class App:
             if step:
                 self._clock_was_set(step)
             due = self.broker.tick(now)
+            if self._status is not None:
+                self._status.tick(now)
             if interval and now >= next_sys:
                 next_sys = now + interval
                 for topic, payload in sys_topics.update():
@@ -328,11 +342,19 @@ class App:
         topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
         return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
 
+    async def _answer_status(self) -> dict[str, object]:
+        assert self._status is not None
+        return await self._status.tell()
+
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        commands = {"reload": self._answer_reload, "routes": self._answer_routes}
+        commands = {
+            "reload": self._answer_reload,
+            "routes": self._answer_routes,
+            "status": self._answer_status,
+        }
         control = Control(settings.control, commands)
         await control.start()
         self._stack.push_async_callback(control.stop)

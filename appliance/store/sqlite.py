@@ -137,6 +137,11 @@ class SqliteStore:
         self._urgent = False
         self._outcome: asyncio.Future[None] | None = None
 
+    @property
+    def failing(self) -> bool:
+        """Whether nothing can be written now."""
+        return self._failing
+
     # --- start and end -------------------------------------------------------------------------
 
     def open(self) -> None:
