@@ -22,13 +22,23 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
 ) -> None:
     """Ask the running appliance how it is; exit code 1 when none is running."""
-    settings = load_settings(config)
-    from appliance.control import ControlError, ask
+    from appliance.config import SEARCH_PATH, loads
+    from appliance.control import ControlError, NotRunningError, ask
 
+    broken: CommandError | None = None
+    try:
+        settings = load_settings(config)
+    except CommandError as error:
+        # The running one goes on with what it has read before, and can still be asked.
+        broken, settings = error, loads("", config or SEARCH_PATH[0])
     try:
         told = ask(settings.control, "status")
+    except NotRunningError as error:
+        raise broken or CommandError(str(error)) from None
     except ControlError as error:
         raise CommandError(str(error)) from None
+    if broken is not None:
+        told["warnings"].append(str(broken))
     if as_json:
         typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
         return

@@ -34,6 +34,9 @@ MULTICAST_PATIENCE = 0.5
 
 NODE = "appliance_doctor"
 
+#: Topics that say nothing of what there is.
+_OF_EVERY_NODE = {"/parameter_events", "/rosout"}
+
 _MIB = 1 << 20
 
 
@@ -42,7 +45,7 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
     if settings.bridge.bus != "ros2":
         yield Finding("ok", "ROS", f"bridge.bus is {settings.bridge.bus}")
         return
-    yield from which_ros()
+    yield which_ros(is_needed=_has_routes(settings))
     yield from _discovery(settings)
     yield from shared_memory()
     yield from _networks()
@@ -51,14 +54,18 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
         yield from _look(settings, running)
 
 
-def which_ros() -> Iterator[Finding]:
-    """Which ROS 2 would be used, and from where."""
+def _has_routes(settings: Settings) -> bool:
+    bridge = settings.bridge
+    return bool(bridge.topics or bridge.services or bridge.actions or bridge.parameters)
+
+
+def which_ros(is_needed: bool) -> Finding:
+    """Which ROS 2 is used, and from where; without one the broker works alone."""
     is_available, reason = available()
     spec = find_spec("rclpy")
     if not is_available or spec is None or spec.origin is None:
         what, _, advice = reason.partition(". ")
-        yield Finding("problem", "ROS", what, advice)
-        return
+        return Finding("problem" if is_needed else "warning", "ROS", what, advice)
     distribution = os.environ.get("ROS_DISTRO")
     name = f"ROS 2 {distribution}" if distribution else "ROS 2"
     python = f"{sys.version_info[0]}.{sys.version_info[1]}"
@@ -70,9 +77,8 @@ def which_ros() -> Iterator[Finding]:
     ):
         advice = f"install this with the Python that {name} is for: pip install ros-mqtt-appliance"
         text = f"{name} in {folder.parent} is not for this Python, {python}"
-        yield Finding("problem", "ROS", text, advice)
-        return
-    yield Finding("ok", "ROS", text)
+        return Finding("problem", "ROS", text, advice)
+    return Finding("ok", "ROS", text)
 
 
 def _discovery(settings: Settings) -> Iterator[Finding]:
@@ -188,7 +194,8 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
             "start one (ros2 run demo_nodes_cpp talker); if it is running, compare "
             "RMW_IMPLEMENTATION, ROS_DOMAIN_ID and discovery range with its"
         )
-        yield Finding("warning", subject, f"none was seen within {PATIENCE:g} s", advice)
+        none = "none" if ours is None else f"none but the running appliance ({ours})"
+        yield Finding("warning", subject, f"{none} was seen within {PATIENCE:g} s", advice)
         return
     named = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
     text = f"seen: {len(others)} ({named}), with {len(seen.topics)} topics"
@@ -207,7 +214,7 @@ class _Seen:
 
     def look(self) -> None:
         self.nodes = {name for name in self._node.nodes() if name != self._node.name}
-        self.topics = set(self._node.topics())
+        self.topics = set(self._node.topics()) - _OF_EVERY_NODE
         if self.nodes:
             self._is_done.set()
 
