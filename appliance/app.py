@@ -10,12 +10,13 @@ import os
 import signal
 from collections.abc import Coroutine, Sequence
 from dataclasses import asdict
+from datetime import timedelta
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance import wiring
+from appliance import status, wiring
 from appliance.access import AccessFileError, FileAccess
 from appliance.amqtt_broker import (
     Answers,
@@ -34,6 +35,7 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
+from appliance.clock import StepWatch
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -99,6 +101,8 @@ class App:
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
+        self._certificates_due = asyncio.Event()
+        self._status: status.Status | None = None
 
     async def start(self) -> None:
         """Start everything, or nothing.
@@ -190,6 +194,17 @@ class App:
         self._reload = Reload(
             Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )
+        self._status = status.Status(
+            status.Parts(
+                version("ros-mqtt-appliance"),
+                broker,
+                listeners,
+                store,
+                self.bridge,
+                self._reload,
+                tls.warnings if tls is not None else list,
+            )
+        )
         if tls is not None:
             self._beside(self._keep_certificates(tls))
         if settings.file is not None:
@@ -220,6 +235,7 @@ class App:
     async def _keep_certificates(self, tls: TlsContexts) -> None:
         """Renew the server's certificate when that is due, and tell of what has run out."""
         told: dict[str, float] = {}
+        due = self._certificates_due
         loop = asyncio.get_running_loop()
         reason = ""
         while True:
@@ -238,7 +254,9 @@ class App:
                 if text not in told:
                     told[text] = now
                     log.warning("%s", text)
-            await asyncio.sleep(CERTIFICATE_CHECK)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
+            due.clear()
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""
@@ -274,11 +292,17 @@ class App:
         interval = self.settings.broker.sys_interval
         next_sys = loop.time() + min(interval, TICK)
         timer: asyncio.TimerHandle
+        steps = StepWatch(loop.time())
 
         def tick() -> None:
             nonlocal timer, next_sys
             now = loop.time()
+            step = steps.look(now)
+            if step:
+                self._clock_was_set(step)
             due = self.broker.tick(now)
+            if self._status is not None:
+                self._status.tick(now)
             if interval and now >= next_sys:
                 next_sys = now + interval
                 for topic, payload in sys_topics.update():
@@ -287,6 +311,16 @@ class App:
 
         timer = loop.call_later(TICK, tick)
         self._stack.callback(lambda: timer.cancel())
+
+    def _clock_was_set(self, step: float) -> None:
+        """The wall clock says something else; only dates depend on it."""
+        text = f"the computer's clock was set {'forward' if step > 0 else 'back'} by "
+        text += f"{timedelta(seconds=round(abs(step)))}"
+        log.warning("%s, or the computer slept: nothing expires by that", text)
+        if self.audit is not None:
+            self.audit.changed(text)
+        self._certificates_due.set()
+        self._listeners.network.in_background(self._listeners.check_certificates())
 
     def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         self.broker.publish(Message(topic, payload, 0, retain), self._inside)
@@ -356,11 +390,19 @@ class App:
         topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
         return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
 
+    async def _answer_status(self) -> dict[str, object]:
+        assert self._status is not None
+        return await self._status.tell()
+
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        commands = {"reload": self._answer_reload, "routes": self._answer_routes}
+        commands = {
+            "reload": self._answer_reload,
+            "routes": self._answer_routes,
+            "status": self._answer_status,
+        }
         control = Control(settings.control, commands)
         await control.start()
         self._stack.push_async_callback(control.stop)

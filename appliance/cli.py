@@ -26,7 +26,9 @@ from appliance.console import (
 from appliance.console import load as _load
 from appliance.console import read_password as _read_password
 from appliance.console import shown as _shown
+from appliance.doctor.command import doctor
 from appliance.install_command import install, uninstall
+from appliance.status_command import status
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
@@ -46,6 +48,8 @@ app.add_typer(store_app, name="store")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
 app.add_typer(cert_app, name="cert")
+app.command()(status)
+app.command()(doctor)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

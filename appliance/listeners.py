@@ -118,6 +118,10 @@ class Listeners:
         """Where is listened, with the port that the system chose where it was 0."""
         return [door.address for door in self._doors]
 
+    def doors(self) -> list[tuple[str, ListenerSettings]]:
+        """Each listener's address, as the log has it, and its settings."""
+        return [(str(door), door.settings) for door in self._doors]
+
     def prepare(self, settings: list[ListenerSettings]) -> list[_Door]:
         """Get ready to listen there, for `take`; where is listened already nothing changes yet.
 

@@ -60,6 +60,7 @@ class BrokerProcess:
         self.directory = directory
         self.ca = directory / "certs/ca.crt"
         self.passwords: dict[str, str] = {}
+        #: What its environment has beside this process's.
         self.environment: dict[str, str] = {}
         self.port = 0
         self.plain_port = 0
@@ -74,7 +75,8 @@ class BrokerProcess:
 
     def _run(self, arguments: list[str | Path]) -> None:
         self._ended = False
-        environment = os.environ | {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1"} | self.environment
+        environment = os.environ | {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        environment |= self.environment
         self._process = subprocess.Popen(
             arguments,
             stdin=subprocess.DEVNULL,

@@ -14,6 +14,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 from time import thread_time, time_ns
+from typing import Literal, TypeAlias
 
 import orjson
 
@@ -35,7 +36,7 @@ from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
-__all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus", "TopicStatus"]
+__all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 
 log = logging.getLogger(__name__)
 
@@ -51,10 +52,20 @@ LITTLE = 1024
 #: one may have been replaced by another. At each look it is the turn of some topics.
 THOROUGH_LOOK = 5
 
+#: Every so many looks the other nodes are counted.
+COUNTED_LOOK = 10
+
+#: Seconds until ROS is tried again when it could not be joined or was lost; each time twice as
+#: many, up to the second of these.
+RETRY = 1.0
+LONGEST_RETRY = 60.0
+
 #: Seconds between two looks at the counters, for the rates; and how many of these it takes until
 #: what is bridged is told again for the figures in it.
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
+
+BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
 SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
@@ -62,7 +73,8 @@ SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json
 class Bridge:
     """Carries the topics of routes between a node and the broker; belongs to the loop's thread.
 
-    `problem` is None, or why there is no ROS (any more).
+    `problem` is None, or why there is no ROS, or none any more; it is tried again and again.
+    `peers` is how many other nodes were seen, None while the bus is not joined.
     """
 
     def __init__(
@@ -80,6 +92,12 @@ class Bridge:
         goes on `/diagnostics`, not at all for 0.
         """
         self.problem: str | None = None
+        self.peers: int | None = None
+        self._was_joined = False
+        self._joined_at: float | None = None
+        self._retry = RETRY
+        self._retry_timer: asyncio.TimerHandle | None = None
+        self._is_stopping = False
         self._node = node
         self._broker = broker
         self._loop = loop
@@ -116,6 +134,7 @@ class Bridge:
         self._receivers: dict[str, list[ToRos]] = {}
         self._subscribed: dict[str, Subscription] = {}
         self._looks = 0
+        self._is_joined = False
         #: Services, actions and parameters.
         self.calls = Calls(
             node, broker, loop, self._converters, self._mailbox, self._post, self._announce
@@ -246,10 +265,23 @@ class Bridge:
         self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
             self._diagnostics.start(self._loop)
+        self._join()
+
+    def _join(self) -> None:
         self._node.start(self._look, self._failed)
+
+    @property
+    def state(self) -> BusState:
+        """Whether the bus is joined, was lost, or has not been there yet."""
+        if self._joined_at is not None:
+            return "joined"
+        return "lost" if self._was_joined else "waiting"
 
     async def stop(self) -> None:
         """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        self._is_stopping = True
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
         if self._meter_timer is not None:
             self._meter_timer.cancel()
         if self._diagnostics is not None:
@@ -362,9 +394,31 @@ class Bridge:
             )
         self._told = types
 
+    def _joined(self) -> None:
+        log.info("on ROS as %s", self._node.name)
+        self.problem = None
+        self._was_joined = True
+        self._joined_at = self._loop.time()
+
+    def _counted(self, peers: int) -> None:
+        self.peers = peers
+
     def _stopped(self, reason: str) -> None:
-        self.problem = reason
-        log.warning("there is no bridge to ROS: %s", reason)
+        before, self.problem = self.problem, reason
+        since, self._joined_at, self.peers = self._joined_at, None, None
+        if self._is_stopping:
+            return
+        now = self._loop.time()
+        if since is not None and now - since > LONGEST_RETRY:
+            self._retry = RETRY
+        delay, self._retry = self._retry, min(2 * self._retry, LONGEST_RETRY)
+        if reason != before:
+            log.warning(
+                "there is no bridge to ROS: %s (it is tried again, at least every %g s)",
+                reason,
+                LONGEST_RETRY,
+            )
+        self._retry_timer = self._loop.call_later(delay, self._join)
 
     # Any thread
 
@@ -390,8 +444,12 @@ class Bridge:
 
     def _look(self) -> None:
         """Follow what has come and gone on the graph."""
-        if self._looks == 0:
-            self._tell(logging.INFO, "on ROS as %s", self._node.name)
+        if not self._is_joined:
+            self._is_joined = True
+            self._looks = 0
+            self._post(self._joined)
+        if self._looks % COUNTED_LOOK == 0:
+            self._post(self._counted, len(set(self._node.nodes()) - {self._node.name}))
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
@@ -471,7 +529,8 @@ class Bridge:
         self._post(flow.route.past.add, flow.counters)
 
     def _failed(self, reason: str) -> None:
-        for flow in self._flows():
+        self._is_joined = False
+        for flow in (*self._flows(), *self._leaving):
             flow.lost()
         self.calls.lost()
         if self._diagnostics is not None:

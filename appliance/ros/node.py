@@ -126,7 +126,7 @@ class RosNode(Protocol):
 
         `poll` is called when the node is there and then 5 to 10 times a second: the time to look
         at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
-        node ends by itself; nothing is called after it.
+        node ends by itself; nothing is called after it, until the node is started again.
         """
 
     def stop(self) -> None:
@@ -138,6 +138,9 @@ class RosNode(Protocol):
     def now(self) -> int:
         """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
         the node is told so, and the computer's before there is any."""
+
+    def nodes(self) -> list[str]:
+        """The full names of all nodes on the bus, as far as they are known, this one included."""
 
     def topics(self) -> dict[str, list[str]]:
         """The types of each topic that has an endpoint, this node's own included."""
@@ -372,7 +375,7 @@ class FakeNode:
 
     def fail(self, reason: str) -> None:
         """The node ends by itself."""
-        self.running = False
+        self.stop()
         if self._failed:
             self._failed(reason)
 
@@ -422,6 +425,10 @@ class FakeNode:
 
     def now(self) -> int:
         return time.time_ns()
+
+    def nodes(self) -> list[str]:
+        ends = [*self.remote_publishers, *self.remote_subscribers]
+        return [self.name, *sorted({end.endpoint.node for end in ends})]
 
     def topics(self) -> dict[str, list[str]]:
         found: dict[str, set[str]] = {}

@@ -382,6 +382,7 @@ class ParameterRoutes:
     def lost(self) -> None:
         """The bus is gone, and with it the subscription."""
         self._subscription = None
+        self._is_refused = False
 
 
 def _json(payload: bytes) -> Any:

@@ -25,11 +25,15 @@ from appliance.ros.node import (
     Reliability,
     Respond,
 )
+from appliance.ros.reach import Reach, look_again, reach
 
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
+
+#: Seconds between two looks at what networks there are.
+NETWORK_INTERVAL = 2.0
 
 #: How many messages of a subscription are timed first, and of how many one is then.
 FIRST_TIMED = 100
@@ -136,6 +140,8 @@ class Ros2Node:
             failed(reason)
             return
         use_fastdds_profile(os.environ)
+        if self._thread is not None:  # it has failed, and is about to end
+            self._thread.join()
         # Not a daemon: one that is alive when Python ends aborts the process.
         self._thread = threading.Thread(target=self._run, args=(poll, failed), name="ros")
         self._thread.start()
@@ -154,7 +160,7 @@ class Ros2Node:
         except Exception as error:
             # The thread's end, whatever ended it: it must be told, and the bus be left in order.
             log.debug("the ROS thread ended", exc_info=True)
-            reason = f"{type(error).__name__}: {error}"
+            reason = str(error) if isinstance(error, BusError) else _described(error)
         finally:
             self._leave()
         if reason:
@@ -167,6 +173,7 @@ class Ros2Node:
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
+        look_again()
         self._rclpy = rclpy
         self._context = Context()
         rclpy.init(
@@ -195,6 +202,8 @@ class Ros2Node:
         from rclpy.executors import ExternalShutdownException
         from rclpy.task import Future
 
+        began_with = reach()
+        look_at = time.monotonic() + NETWORK_INTERVAL
         poll()
         never: Any = Future(executor=self._executor)
         try:
@@ -202,6 +211,10 @@ class Ros2Node:
                 # A finite time-out also mends EventsExecutor, whose endless wait overflows.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
+                if began_with < Reach.NETWORK and time.monotonic() >= look_at:
+                    look_at = time.monotonic() + NETWORK_INTERVAL
+                    if reach() > began_with:
+                        raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
                 raise
@@ -233,6 +246,10 @@ class Ros2Node:
     def now(self) -> int:
         clock = self._clock
         return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
+
+    def nodes(self) -> list[str]:
+        found = self._node.get_node_names_and_namespaces()
+        return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
 
     def topics(self) -> dict[str, list[str]]:
         return _named(self._node.get_topic_names_and_types())
@@ -289,7 +306,7 @@ class Ros2Node:
             )
         if timed and self._is_event_driven:
             own.__class__ = _timed_subscription()
-            own.since = time.time_ns()
+            own.since = time.monotonic_ns()
         return _Subscription(self._node, own)
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
@@ -470,6 +487,10 @@ def import_service(name: str) -> Any:
     return service
 
 
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
 def _errors() -> tuple[type[Exception], ...]:
     implementation = import_module("rclpy.impl.implementation_singleton").rclpy_implementation
     return implementation.RCLError, implementation.RMWError, implementation.InvalidHandle
@@ -500,7 +521,7 @@ def _new_executor(context: Any) -> tuple[Any, bool]:
 
 def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
     """What calls the callback with some messages' time; rclpy tells it of all that it is given."""
-    since = time.time_ns()
+    since = time.monotonic_ns()
     until_timed = ONE_TIMED_OF
 
     def timed(cdr: bytes, info: Any) -> None:
@@ -516,9 +537,13 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
 
 
 def _published_at(info: Any, since: int) -> int:
-    """0 for what was published before `since`, and kept for late subscribers."""
+    """0 for what was published before `since`, and kept for late subscribers.
+
+    `since` is of the clock that only counts: the other one may have been set meanwhile.
+    """
     published_at = int(info["source_timestamp"])
-    return published_at if published_at > since else 0
+    age = time.time_ns() - published_at
+    return published_at if age < time.monotonic_ns() - since else 0
 
 
 @functools.cache

@@ -463,6 +463,7 @@ class Provided:
     def lost(self) -> None:
         """The bus is gone, and with it the service; on the ROS thread."""
         self._service = None
+        self._is_tried = False
 
 
 def _is_error(payload: bytes) -> bool:
