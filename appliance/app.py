@@ -203,6 +203,7 @@ class App:
                 self.bridge,
                 self._reload,
                 tls.warnings if tls is not None else list,
+                self._crashes.previous if self._crashes is not None else None,
             )
         )
         if tls is not None:
@@ -340,7 +341,8 @@ class App:
         await self.start()
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
-        self._notifier.start(loop, self._status)
+        assert self._status is not None
+        self._notifier.start(loop, self._status.line)
         try:
             await self._stopping.wait()
             log.info("stopping")
@@ -352,22 +354,6 @@ class App:
         """Take over all files as they are now; see `Reload.run`."""
         with self._notifier.reloading():
             return await self._reload.run()
-
-    def _status(self) -> str:
-        """How it is, in a line for `systemctl status`."""
-        bridge = self.bridge
-        if bridge is None:
-            ros = "without ROS"
-        elif bridge.problem is not None:
-            ros = f"no ROS: {bridge.problem}"
-        elif bridge.on_bus:
-            ros = f"on ROS as {bridge.node_name}, {_count(len(bridge.topics()), 'topic')} bridged"
-        else:
-            ros = "joining ROS"
-        text = f"{_count(len(self.broker.clients), 'client')}, {ros}"
-        if self._crashes is not None and self._crashes.previous is not None:
-            text += f"; began after a crash, see {self._crashes.previous}"
-        return text
 
     async def _try_reload(self) -> None:
         with contextlib.suppress(ReloadError):  # the log was told
@@ -412,10 +398,6 @@ class App:
     def request_stop(self) -> None:
         """Let `run` end."""
         self._stopping.set()
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -39,6 +40,8 @@ class Parts:
     bridge: Bridge | None
     reload: Reload
     warnings: Callable[[], list[str]]
+    #: The report of the last run, when that crashed.
+    crash: Path | None = None
 
 
 class Status:
@@ -56,6 +59,22 @@ class Status:
         counters = self._parts.broker.counters
         self._received.tick(now, counters.publish_received, counters.publish_bytes_received)
         self._sent.tick(now, counters.publish_sent, counters.publish_bytes_sent)
+
+    def line(self) -> str:
+        """How it is, in a line for `systemctl status`."""
+        bridge = self._parts.bridge
+        if bridge is None:
+            ros = "without ROS"
+        elif bridge.problem is not None:
+            ros = f"no ROS: {bridge.problem}"
+        elif bridge.state == "joined":
+            ros = f"on ROS as {bridge.node_name}, {_count(len(bridge.topics()), 'topic')} bridged"
+        else:
+            ros = "joining ROS"
+        text = f"{_count(len(self._parts.broker.clients), 'client')}, {ros}"
+        if self._parts.crash is not None:
+            text += f"; began after a crash, see {self._parts.crash}"
+        return text
 
     async def tell(self) -> dict[str, Any]:
         """Everything, as JSON knows values; sizes are in bytes, times in seconds."""
@@ -201,6 +220,8 @@ class Status:
             )
         if told["ros"].get("problem"):
             yield f"there is no bridge to ROS: {told['ros']['problem']}"
+        if self._parts.crash is not None:
+            yield f"the last run crashed, see {self._parts.crash}"
         if told["reload"] is not None and not told["reload"]["done"]:
             yield f"the last reload took nothing over: {told['reload']['text']}"
 
@@ -230,3 +251,7 @@ def problem_of(route: RouteStatus) -> str | None:
     if route.dropped:
         found.append(f"messages dropped: {route.dropped}")
     return ", ".join(found) or None
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

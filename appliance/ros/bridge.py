@@ -316,11 +316,6 @@ class Bridge:
         ]
 
     @property
-    def on_bus(self) -> bool:
-        """Whether the node is on the bus."""
-        return self._looks > 0 and self.problem is None
-
-    @property
     def node_name(self) -> str:
         """The full name of the bridge's node."""
         return self._node.name
