@@ -42,11 +42,11 @@ compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
 binary: .venv/binary.stamp
-	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build --distpath dist appliance/binary/appliance.spec
+	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build --distpath dist appliance/packaging/appliance.spec
 	@ls -sh dist/appliance
 
 deb: binary
-	@$(BIN)/python packaging/deb.py dist/appliance
+	@$(BIN)/python -m appliance.packaging.deb dist/appliance
 
 .venv/run.stamp: pyproject.toml constraints.txt
 	@echo "Setting up .venv; the first time this takes a minute."

@@ -184,11 +184,13 @@ def test_the_debian_package(tmp_path: Path) -> None:
     built = subprocess.run(
         [
             sys.executable,
-            PROJECT / "packaging/deb.py",
+            "-m",
+            "appliance.packaging.deb",
             single_file(tmp_path),
             "--directory",
             tmp_path,
         ],
+        cwd=PROJECT,
         capture_output=True,
         text=True,
         check=True,

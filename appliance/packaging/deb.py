@@ -1,4 +1,4 @@
-"""Makes the Debian package of the single file: `python packaging/deb.py dist/appliance`.
+"""Makes the Debian package of the single file: `make deb`.
 
 It does what `appliance install` does, and with the same code: dpkg owns the command, the unit and
 /etc/default/appliance, and `postinst` has the command make the rest. Keys and users are made on the
@@ -18,14 +18,12 @@ from email.utils import formatdate
 from importlib.metadata import metadata, version
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 from appliance.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
 from appliance.unit import ENVIRONMENT, VARIABLES, Unit
 
 PACKAGE = "appliance"
 DOCUMENTS = Path("/usr/share/doc", PACKAGE)
-PROJECT = Path(__file__).resolve().parent.parent
+PROJECT = Path(__file__).resolve().parents[2]
 SCRIPTS = Path(__file__).parent / "debian"
 
 DESCRIPTION = """\
