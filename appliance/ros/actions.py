@@ -26,7 +26,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import orjson
 
@@ -38,6 +38,7 @@ from appliance.ros.calls import (
     Answer,
     Call,
     CallCounters,
+    CallEncoding,
     CallError,
     ErrorCode,
     Offer,
@@ -48,7 +49,7 @@ from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.patterns import assign, compile_pattern
 from appliance.ros.requests import Key, Requests
 from appliance.ros.services import to_request
 
@@ -83,23 +84,21 @@ LAST_WORD = 1.0
 
 @dataclass(frozen=True, slots=True)
 class ActionSettings:
-    """An action, or a pattern of actions. A `{ros}` in `mqtt` stands for the ROS name.
+    """Actions, by names and patterns; what begins with `!` is left out.
 
-    `timeout` is for the acceptance of a goal and for its cancelling, `keep_result` is how long a
-    result is retained, both in seconds.
+    A `{ros}` in `mqtt` stands for the ROS name. `timeout` is for the acceptance of a goal and for
+    its cancelling, `keep_result` is how long a result is retained, both in seconds. `encoding` is
+    for what is published, and for calls that do not name another.
     """
 
-    ros: str
+    names: tuple[str, ...]
     mqtt: str
     type: str | None = None
     timeout: float = 5.0
+    encoding: CallEncoding = "json"
     keep_result: float = 60.0
+    cancel: Literal["own", "any"] = "own"
     cancel_on_disconnect: bool = False
-
-    @property
-    def is_pattern(self) -> bool:
-        """Whether `ros` stands for many actions, or (`!`) for those that are left out."""
-        return "*" in self.ros or self.ros.startswith("!")
 
 
 @dataclass(eq=False, slots=True)
@@ -151,7 +150,6 @@ class ActionRoutes:
         self._post = post
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
-        self._excluded = Names(())
         self._actions: dict[str, Action] = {}
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.
@@ -164,34 +162,19 @@ class ActionRoutes:
 
     def replace(self, routes: Sequence[ActionSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.ros.startswith("!")
-        }
-        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         self.follow()
 
     def follow(self) -> None:
         """Offer what is on the bus now."""
         found = {
-            service.removesuffix(SEND_GOAL): min(types).removesuffix("_SendGoal")
+            service.removesuffix(SEND_GOAL): [min(types).removesuffix("_SendGoal")]
             for service, types in self._requests.services.items()
             if service.endswith(SEND_GOAL)
         }
-        wanted = {route.ros: route for route in reversed(self._counters) if not route.is_pattern}
-        for route in self._counters:
-            if route.is_pattern:
-                pattern = compile_pattern(route.ros)
-                of_type = compile_pattern(route.type) if route.type else None
-                for name, type_name in found.items():
-                    if (
-                        name not in wanted
-                        and pattern.fullmatch(name)
-                        and name not in self._excluded
-                        and (of_type is None or of_type.fullmatch(type_name))
-                    ):
-                        wanted[name] = route
+        wanted = assign(
+            list(self._counters), found, lambda route, name: _misfit(route, found[name][0]) is None
+        )
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
@@ -200,7 +183,8 @@ class ActionRoutes:
             if name not in self._actions:
                 self._actions[name] = Action(name, route, self._counters[route], self)
             fixed = route.type if route.type is not None and "*" not in route.type else None
-            self._actions[name].type = fixed or found.get(name) or self._actions[name].type
+            seen = found[name][0] if name in found else self._actions[name].type
+            self._actions[name].type = fixed or seen
             self._actions[name].see(name in found)
 
     def keys(self) -> Iterable[Key]:
@@ -267,6 +251,13 @@ class ActionRoutes:
         """The bus is gone, and with it all subscriptions."""
         for action in list(self._actions.values()):
             action.lost()
+
+
+def _misfit(route: ActionSettings, type_name: str) -> str | None:
+    """Why a pattern of the route does not take an action of that type; None when it does."""
+    if route.type is None or compile_pattern(route.type).fullmatch(type_name):
+        return None
+    return f"its type is {type_name}, the route takes {route.type}"
 
 
 class Action:

@@ -58,6 +58,7 @@ ErrorCode: TypeAlias = Literal[
 ]
 
 JSON = "application/json"
+CallEncoding: TypeAlias = Literal["json", "cbor", "cdr"]
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0

@@ -13,7 +13,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import orjson
 import pybase64
@@ -24,7 +24,7 @@ from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Off
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names
+from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.requests import Requests
 
 log = logging.getLogger(__name__)
@@ -64,16 +64,26 @@ _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 @dataclass(frozen=True, slots=True)
 class ParameterSettings:
-    """Parameters by patterns: of the nodes `node`, those called `name`.
+    """Parameters, by names and patterns such as `/node/parameter`; what begins with `!` is left
+    out.
 
     `mqtt` is the topic above a node's values; a `{node}` in it stands for the node's full name.
-    `timeout` is for setting, in seconds. With `!` before `node` they are left out.
+    `timeout` is for setting, in seconds.
     """
 
-    node: str
-    name: str
+    names: tuple[str, ...]
     mqtt: str
     timeout: float = 5.0
+    encoding: Literal["json", "cbor"] = "json"
+
+    def of(self, node: str) -> Names | None:
+        """Those that are wanted of a node; None for none at all."""
+        mine: list[str] = []
+        for text in self.names:
+            pattern, _, name = text.removeprefix("!").rpartition("/")
+            if compile_pattern(pattern).fullmatch(node):
+                mine.append(f"!{name}" if text.startswith("!") else name)
+        return Names(mine) if any(not name.startswith("!") for name in mine) else None
 
 
 @dataclass(eq=False, slots=True)
@@ -83,11 +93,15 @@ class _Node:
     name: str
     base: str
     route: ParameterSettings
-    wanted: Names
+    wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
+
+    def wants(self, parameter: str) -> bool:
+        """Whether it is shown, and may be set."""
+        return any(parameter in names for names in self.wanted)
 
 
 class ParameterRoutes:
@@ -130,11 +144,7 @@ class ParameterRoutes:
         if list(routes) == list(self._routes):
             return
         self._routes = routes
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.node.startswith("!")
-        }
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         for node in list(self._nodes.values()):  # which patterns a value is of has to be asked anew
             self._leave(node)
         self.follow()
@@ -153,17 +163,11 @@ class ParameterRoutes:
             self._join(name)
 
     def _join(self, name: str) -> None:
-        mine = [route for route in self._counters if name in Names([route.node])]
-        if not mine or name == self._node.name:
+        wanted = {route: names for route in self._counters if (names := route.of(name))}
+        if not wanted or name == self._node.name:
             return
-        excluded = [
-            f"!{route.name}"
-            for route in self._routes
-            if route.node.startswith("!") and name in Names([route.node[1:]])
-        ]
-        wanted = Names([*(route.name for route in mine), *excluded])
-        route = mine[0]
-        node = _Node(name, route.mqtt.replace("{node}", name), route, wanted)
+        route = next(iter(wanted))
+        node = _Node(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
         self._nodes[name] = node
 
         async def set_one(call: Call) -> Answer:
@@ -194,7 +198,7 @@ class ParameterRoutes:
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the nodes that it shows now."""
         return [
-            (route, counters, [name for name in self._nodes if name in Names([route.node])])
+            (route, counters, [name for name in self._nodes if route.of(name)])
             for route, counters in self._counters.items()
         ]
 
@@ -266,7 +270,7 @@ class ParameterRoutes:
 
     async def _get_all(self, node: _Node) -> dict[str, Any]:
         listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
-        names = [name for name in listed["result"]["names"] if name in node.wanted]
+        names = [name for name in listed["result"]["names"] if node.wants(name)]
         values: dict[str, Any] = {}
         for start in range(0, len(names), CHUNK):
             chunk = names[start : start + CHUNK]
@@ -286,7 +290,7 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or name not in node.wanted:
+        if set("+#\0") & set(name) or not node.wants(name):
             return
         payload = b"" if value is None else _to_json(value)
         if payload == node.shown.get(name, b""):
@@ -327,7 +331,7 @@ class ParameterRoutes:
 
     async def _set(self, node: _Node, values: dict[str, Any], *, at_once: bool) -> Answer:
         for name in values:
-            if name not in node.wanted:
+            if not node.wants(name):
                 text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
         names = list(values)

@@ -33,6 +33,7 @@ from appliance.ros.calls import (
     Answer,
     Call,
     CallCounters,
+    CallEncoding,
     CallError,
     Offer,
     Switchboard,
@@ -40,7 +41,7 @@ from appliance.ros.calls import (
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
-from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.patterns import assign, compile_pattern
 from appliance.ros.requests import Key, Requests
 
 log = logging.getLogger(__name__)
@@ -53,25 +54,21 @@ Post = Callable[..., None]
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """A service, or a pattern of services, that go `to` ROS or to MQTT (then `type` is needed).
+    """Services, by names and patterns, that go `to` ROS; or one to MQTT (then `type` is needed).
 
-    A `{ros}` in `mqtt` stands for the ROS name. `timeout` is in seconds. A pattern with a `type`,
-    in which `*` is a part of the name, takes only services of that type. `on_error` is the JSON of
+    What begins with `!` in `names` is left out. A `{ros}` in `mqtt` stands for the ROS name.
+    `timeout` is in seconds. With a `type`, in which `*` is a part of the name, patterns take only
+    services of that type. `encoding` is for what does not name another. `on_error` is the JSON of
     the response that a ROS client gets when MQTT gave none.
     """
 
-    ros: str
+    names: tuple[str, ...]
     mqtt: str
     to: Literal["ros", "mqtt"] = "ros"
     type: str | None = None
     timeout: float = 5.0
-    encoding: Literal["json", "cdr"] = "json"
+    encoding: CallEncoding = "json"
     on_error: str | None = None
-
-    @property
-    def is_pattern(self) -> bool:
-        """Whether `ros` stands for many services, or (`!`) for those that are left out."""
-        return "*" in self.ros or self.ros.startswith("!")
 
     def base(self, ros: str) -> str:
         """The MQTT topic above all that belong to this service."""
@@ -115,7 +112,6 @@ class ServiceRoutes:
         self._loop = loop
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
-        self._excluded = Names(())
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
         self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
         self._provided: dict[ServiceSettings, Provided] = {}
@@ -124,12 +120,7 @@ class ServiceRoutes:
 
     def replace(self, routes: Sequence[ServiceSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.ros.startswith("!")
-        }
-        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         wanted = [route for route in self._counters if route.to == "mqtt"]
         for route, provided in list(self._provided.items()):
             if route not in wanted:
@@ -168,27 +159,14 @@ class ServiceRoutes:
         }
 
     def _wanted(self) -> dict[str, ServiceSettings]:
-        """The services that MQTT may call, and the route of each; names go before patterns."""
-        own = {route.ros for route in self._provided}
-        routes = [route for route in self._counters if route.to == "ros"]
-        wanted = {route.ros: route for route in reversed(routes) if not route.is_pattern}
-        for route in routes:
-            if not route.is_pattern:
-                continue
-            pattern = compile_pattern(route.ros)
-            of_type = compile_pattern(route.type) if route.type else None
-            takes_all = "*" in route.ros.rpartition("/")[2]
-            for name, types in self._requests.services.items():
-                if (
-                    name not in wanted
-                    and name not in own
-                    and pattern.fullmatch(name)
-                    and name not in self._excluded
-                    and (of_type is None or any(map(of_type.fullmatch, types)))
-                    and not (of_type is None and takes_all and _OF_EVERY_NODE.fullmatch(min(types)))
-                ):
-                    wanted[name] = route
-        return wanted
+        """The services that MQTT may call, and the route of each."""
+        own = {route.names[0] for route in self._provided}
+        services = self._requests.services
+        return assign(
+            [route for route in self._counters if route.to == "ros"],
+            services,
+            lambda route, name: name not in own and _misfit(route, services[name]) is None,
+        )
 
     def _offer(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
@@ -228,7 +206,7 @@ class ServiceRoutes:
                 route,
                 counters,
                 [name for name, (of, _) in self._offered.items() if of is route]
-                + ([route.ros] if route in self._provided else []),
+                + (list(route.names) if route in self._provided else []),
             )
             for route, counters in self._counters.items()
         ]
@@ -241,8 +219,9 @@ class ServiceRoutes:
             if name in self._requests.services
         ]
         return entries + [
-            _entry("provided", route.ros, f"{route.base(route.ros)}/_request", route.type, route)
+            _entry("provided", name, f"{route.base(name)}/_request", route.type, route)
             for route in self._provided
+            for name in route.names
         ]
 
     def stop(self) -> None:
@@ -263,6 +242,18 @@ class ServiceRoutes:
         """The bus is gone, and with it the services."""
         for provided in list(self._provided.values()):
             provided.lost()
+
+
+def _misfit(route: ServiceSettings, types: Sequence[str]) -> str | None:
+    """Why a pattern of the route does not take a service of these types; None when it does."""
+    if route.type is not None:
+        if any(map(compile_pattern(route.type).fullmatch, types)):
+            return None
+        return f"its type is {min(types)}, the route takes {route.type}"
+    takes_all = any("*" in name.rpartition("/")[2] for name in route.names if name[0] != "!")
+    if takes_all and _OF_EVERY_NODE.fullmatch(min(types)):
+        return "every node has it; a route has to name it"
+    return None
 
 
 def _entry(
@@ -306,7 +297,8 @@ class Provided:
         self._node = node
         self._loop = loop
         self._post = post
-        self._base = route.base(route.ros)
+        (self._ros,) = route.names
+        self._base = route.base(self._ros)
         self._request_type = f"{route.type}_Request"
         self._response_type = f"{route.type}_Response"
         self._asked: dict[str, _Asked] = {}
@@ -327,12 +319,12 @@ class Provided:
         route = self._route
         assert route.type is not None
         try:
-            self._service = self._node.create_service(route.ros, route.type, self._on_request)
+            self._service = self._node.create_service(self._ros, route.type, self._on_request)
         except (BusError, UnknownTypeError) as error:
-            self._post(log.error, "%s is not offered: %s", route.ros, error)
+            self._post(log.error, "%s is not offered: %s", self._ros, error)
             self._counters.last_error = str(error)
             return
-        self._post(log.info, "%s is offered, and answered at %s", route.ros, self._base)
+        self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
 
     def _on_request(self, cdr: bytes, respond: Respond) -> None:
         try:
@@ -383,7 +375,7 @@ class Provided:
     def _on_response(self, origin: Session, message: Message) -> None:
         asked = self._forget(message.topic.rpartition("/")[2])
         if asked is None:
-            log.debug("%s: a response to nothing under way", self._route.ros)
+            log.debug("%s: a response to nothing under way", self._ros)
             return
         told = (message.properties or {}).get(Property.USER_PROPERTY)
         if isinstance(told, list) and ("status", "error") in told:
@@ -422,7 +414,7 @@ class Provided:
         if now >= self._report_at:
             self._report_at = now + REPORT_INTERVAL
             count = sum(self._counters.errors.values())
-            log.warning("a call of %s failed (%d so far): %s", self._route.ros, count, problem)
+            log.warning("a call of %s failed (%d so far): %s", self._ros, count, problem)
         cdr = None
         if self._route.on_error is not None:
             try:
@@ -430,7 +422,7 @@ class Provided:
                     self._route.on_error.encode()
                 )
             except (ConversionError, UnknownTypeError) as error:
-                log.warning("on_error of %s cannot be used: %s", self._route.ros, error)
+                log.warning("on_error of %s cannot be used: %s", self._ros, error)
         self._respond(respond, cdr)
 
     def _respond(self, respond: Respond, cdr: bytes | None) -> None:
@@ -438,12 +430,12 @@ class Provided:
             try:
                 respond(cdr)
             except BusError as error:
-                self._post(log.warning, "%s: no response could be sent: %s", self._route.ros, error)
+                self._post(log.warning, "%s: no response could be sent: %s", self._ros, error)
 
         try:
             self._node.call_soon(send)
         except BusError:
-            log.debug("%s: the bus has gone", self._route.ros)
+            log.debug("%s: the bus has gone", self._ros)
 
     def stop(self) -> None:
         """Offer it no longer; what is under way gets no response."""
