@@ -1,9 +1,10 @@
 """Parameters of other nodes: their values as retained topics, and calls that set them.
 
 `r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
-`/parameter_events`; byte arrays are base64. `…/_param/speed/set` sets it, `…/_param/_set` several
-of the node at once or none of them: `{"speed": 0.5, "mode": "slow"}`. The type is the one that the
-node has declared, so that `1` will do for a double. When the node goes, so do its values.
+`/parameter_events`; byte arrays are base64, or bytes where the encoding is `cbor`.
+`…/_param/speed/set` sets it, `…/_param/_set` several of the node at once or none of them:
+`{"speed": 0.5, "mode": "slow"}`. The type is the one that the node has declared, so that `1` will
+do for a double. When the node goes, so do its values.
 """
 
 from __future__ import annotations
@@ -20,11 +21,20 @@ import pybase64
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import (
+    WITHOUT_CDR,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    Offer,
+    Switchboard,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, loads
 from appliance.ros.requests import Requests
 
 log = logging.getLogger(__name__)
@@ -172,18 +182,29 @@ class ParameterRoutes:
 
         async def set_one(call: Call) -> Answer:
             parameter = call.topic.split("/")[-2]
-            return await self._set(node, {parameter: _json(call.payload)}, at_once=False)
+            return await self._set(node, {parameter: _value_of(call)}, call, at_once=False)
 
         async def set_all(call: Call) -> Answer:
-            values = _json(call.payload)
-            if not isinstance(values, dict) or not values:
+            values = _value_of(call)
+            is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
+            if not is_mapping or not values:
                 raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-            return await self._set(node, values, at_once=True)
+            return await self._set(node, values, call, at_once=True)
 
         counters = self._counters[route]
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
             what = f"{name}'s parameters"
-            self._board.offer(Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle))
+            self._board.offer(
+                Offer(
+                    f"{node.base}/{topic}",
+                    what,
+                    route.timeout,
+                    counters,
+                    handle,
+                    route.encoding,
+                    WITHOUT_CDR,
+                )
+            )
         self._load(node)
 
     def _leave(self, node: _Node) -> None:
@@ -210,7 +231,7 @@ class ParameterRoutes:
                 "mqtt": node.base,
                 "type": "rcl_interfaces/msg/ParameterValue",
                 "direction": "parameters",
-                "encoding": "json",
+                "encoding": node.route.encoding,
             }
             for node in self._nodes.values()
         ]
@@ -292,14 +313,15 @@ class ParameterRoutes:
         """Publish a parameter as it is now; None for one that is no more."""
         if set("+#\0") & set(name) or not node.wants(name):
             return
-        payload = b"" if value is None else _to_json(value)
+        encoding = node.route.encoding
+        payload = b"" if value is None else _to_payload(value, encoding)
         if payload == node.shown.get(name, b""):
             return
         if payload:
             node.shown[name] = payload
         else:
             del node.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: JSON}
+        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
         self._board.publish(Message(f"{node.base}/{name}", payload, 1, True, properties))
 
     def _take_events(self) -> None:
@@ -329,7 +351,9 @@ class ParameterRoutes:
 
     # Setting
 
-    async def _set(self, node: _Node, values: dict[str, Any], *, at_once: bool) -> Answer:
+    async def _set(
+        self, node: _Node, values: dict[str, Any], call: Call, *, at_once: bool
+    ) -> Answer:
         for name in values:
             if not node.wants(name):
                 text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
@@ -352,7 +376,8 @@ class ParameterRoutes:
         if not result.get("successful"):
             reason = result.get("reason") or "it gives no reason"
             raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
-        return Answer(orjson.dumps({"successful": True, "reason": result["reason"]}))
+        said = {"successful": True, "reason": result["reason"]}
+        return Answer(dumps(said, call.encoding), call.encoding)
 
     # The ROS thread
 
@@ -382,17 +407,22 @@ class ParameterRoutes:
         self._subscription = None
 
 
-def _json(payload: bytes) -> Any:
+def _value_of(call: Call) -> Any:
     try:
-        return orjson.loads(payload)
-    except orjson.JSONDecodeError as error:
-        raise CallError("bad_request", f"not JSON: {error}") from None
+        return loads(call.payload, call.encoding)
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
 
 
-def _to_json(value: Mapping[str, Any]) -> bytes:
-    """The JSON of a ParameterValue; empty when the parameter is not set."""
+def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
+    """The payload of a ParameterValue; empty when the parameter is not set."""
     kind = value["type"]
-    return orjson.dumps(value[_FIELDS[kind][0]]) if 0 < kind < len(_FIELDS) else b""
+    if not 0 < kind < len(_FIELDS):
+        return b""
+    plain = value[_FIELDS[kind][0]]
+    if encoding == "cbor" and kind == _BYTES:
+        plain = pybase64.b64decode(plain)
+    return dumps(plain, encoding)
 
 
 def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
@@ -435,7 +465,7 @@ def _to_bytes(name: str, value: Any) -> bytes:
     try:
         if isinstance(value, str):
             return pybase64.b64decode(value, validate=True)
-        if isinstance(value, list):
+        if isinstance(value, (bytes, list)):
             return bytes(value)
     except (TypeError, ValueError):
         pass
@@ -456,5 +486,8 @@ def _unlike(name: str, expected: str, value: Any) -> CallError:
 
 
 def _short(value: Any) -> str:
-    text = orjson.dumps(value).decode()
+    try:
+        text = orjson.dumps(value).decode()
+    except TypeError:  # what only CBOR has
+        text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}…"

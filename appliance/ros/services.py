@@ -21,19 +21,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-import orjson
-
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.calls import (
-    JSON,
     REPORT_INTERVAL,
     Answer,
     Call,
     CallCounters,
-    CallEncoding,
     CallError,
     Offer,
     Switchboard,
@@ -42,6 +38,7 @@ from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import assign, compile_pattern
+from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, loads, named_encoding
 from appliance.ros.requests import Key, Requests
 
 log = logging.getLogger(__name__)
@@ -76,7 +73,7 @@ class ServiceSettings:
 
 
 def to_request(
-    converters: Converters, type_name: str, payload: bytes, encoding: str = "json"
+    converters: Converters, type_name: str, payload: bytes, encoding: CallEncoding
 ) -> bytes:
     """The serialized message of a payload; an empty one has every field's default.
 
@@ -84,13 +81,23 @@ def to_request(
     """
     try:
         converter = converters.get(type_name)
+        if not payload:
+            return converter.from_dict({})
         if encoding == "cdr":
             return converter.checked(payload)
-        return converter.from_json(payload or b"{}")
+        return converter.from_cbor(payload) if encoding == "cbor" else converter.from_json(payload)
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
     except UnknownTypeError as error:
         raise CallError("unknown_type", str(error)) from None
+
+
+def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of a serialized message. Raises ConversionError, UnknownTypeError."""
+    if encoding == "cdr":
+        return cdr
+    converter = converters.get(type_name)
+    return converter.to_cbor(cdr) if encoding == "cbor" else converter.to_json(cdr)
 
 
 class ServiceRoutes:
@@ -171,7 +178,12 @@ class ServiceRoutes:
     def _offer(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
         offer = Offer(
-            topic, name, route.timeout, self._counters[route], partial(self._handle, name, route)
+            topic,
+            name,
+            route.timeout,
+            self._counters[route],
+            partial(self._handle, name, route),
+            route.encoding,
         )
         self._offered[name] = route, offer
         self._board.offer(offer)
@@ -185,12 +197,11 @@ class ServiceRoutes:
         type_name = self._type(name, route)
         if type_name is None:
             raise CallError("unavailable", f"there is no {name} on the bus")
-        request = to_request(self._converters, f"{type_name}_Request", call.payload, route.encoding)
+        request = to_request(self._converters, f"{type_name}_Request", call.payload, call.encoding)
         response = await self._requests.ask(name, type_name, request)
         response_type = f"{type_name}_Response"
-        if route.encoding == "cdr":
-            return Answer(response, response_type, "application/cdr")
-        return Answer(self._converters.get(response_type).to_json(response), response_type)
+        payload = from_ros(self._converters, response_type, response, call.encoding)
+        return Answer(payload, call.encoding, response_type)
 
     def keys(self) -> Iterable[Key]:
         """The services that a client should be ready for."""
@@ -328,12 +339,11 @@ class Provided:
 
     def _on_request(self, cdr: bytes, respond: Respond) -> None:
         try:
-            if self._route.encoding == "json":
-                cdr = self._converters.get(self._request_type).to_json(cdr)
+            payload = from_ros(self._converters, self._request_type, cdr, self._route.encoding)
         except (ConversionError, UnknownTypeError) as error:
             self._post(self._fail, respond, f"a request cannot be converted: {error}")
             return
-        self._post(self._ask, cdr, respond)
+        self._post(self._ask, payload, respond)
 
     def _close(self) -> None:
         self._is_over = True
@@ -350,13 +360,12 @@ class Provided:
             self._fail(respond, f"too_many: {len(self._asked)} requests are under way")
             return
         token = secrets.token_hex(8)
-        is_json = route.encoding == "json"
         message = Message(
             f"{self._base}/_request/{token}",
             payload,
             1,
             properties={
-                Property.CONTENT_TYPE: JSON if is_json else "application/cdr",
+                Property.CONTENT_TYPE: CONTENT_TYPE[route.encoding],
                 Property.RESPONSE_TOPIC: f"{self._base}/_response/{token}",
                 Property.CORRELATION_DATA: token.encode(),
                 Property.USER_PROPERTY: [("ros-type", self._request_type)],
@@ -377,16 +386,16 @@ class Provided:
         if asked is None:
             log.debug("%s: a response to nothing under way", self._ros)
             return
-        told = (message.properties or {}).get(Property.USER_PROPERTY)
+        properties = message.properties or {}
+        told = properties.get(Property.USER_PROPERTY)
+        encoding = named_encoding(properties.get(Property.CONTENT_TYPE)) or self._route.encoding
         if isinstance(told, list) and ("status", "error") in told:
             self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
             return
         try:
-            cdr = to_request(
-                self._converters, self._response_type, message.payload, self._route.encoding
-            )
+            cdr = to_request(self._converters, self._response_type, message.payload, encoding)
         except CallError as error:
-            is_error = _is_error(message.payload)
+            is_error = _is_error(message.payload, encoding)
             what = f"rejected: {message.payload[:200]!r}" if is_error else f"bad response: {error}"
             self._fail(asked.respond, what)
             return
@@ -454,9 +463,9 @@ class Provided:
         self._service = None
 
 
-def _is_error(payload: bytes) -> bool:
+def _is_error(payload: bytes, encoding: CallEncoding) -> bool:
     try:
-        value = orjson.loads(payload)
-    except orjson.JSONDecodeError:
+        value = loads(payload, encoding)
+    except ConversionError:
         return False
     return isinstance(value, dict) and isinstance(value.get("error"), dict)

@@ -12,6 +12,7 @@ from call_house import AllTypes, House, action, until
 from appliance.ros import actions as module
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
+from appliance.ros.goals import id_of
 from appliance.ros.node import FakeNode
 
 FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
@@ -160,4 +161,4 @@ async def test_the_appliance_stops_with_goals_under_way(house):
     walks, client = await begin(house, cancel_on_disconnect=True)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await house.bridge.stop()
-    assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+    assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
