@@ -15,21 +15,31 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
+from appliance.call_command import call, goal, param_app
 from appliance.cert_command import cert_app
 from appliance.console import (
+    CaOption,
+    CertOption,
+    ClientIdOption,
+    ClientPasswordOption,
     CommandError,
     ConfigOption,
     GenerateOption,
+    HostOption,
+    InsecureOption,
+    KeyOption,
     PasswordFileOption,
+    PortOption,
+    UserOption,
+    VersionOption,
+    connect_to,
     new_password,
 )
 from appliance.console import load as _load
-from appliance.console import read_password as _read_password
 from appliance.console import shown as _shown
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
-    from appliance.client import Target
     from appliance.config import Settings
 
 app = typer.Typer(
@@ -45,6 +55,7 @@ app.add_typer(store_app, name="store")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
 app.add_typer(cert_app, name="cert")
+app.add_typer(param_app, name="param")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -538,43 +549,6 @@ def acl_explain(
 
 # Client
 
-HostOption = Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")]
-PortOption = Annotated[
-    int | None, typer.Option("--port", "-p", help="Else the TLS listener's of the configuration.")
-]
-CaOption = Annotated[
-    Path | None,
-    typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
-]
-CertOption = Annotated[
-    Path | None,
-    typer.Option("--cert", metavar="FILE", help="A client certificate, with its key in it or in:"),
-]
-KeyOption = Annotated[
-    Path | None, typer.Option("--key", metavar="FILE", help="The key of the client certificate.")
-]
-UserOption = Annotated[
-    str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
-]
-ClientPasswordOption = Annotated[
-    str | None,
-    typer.Option(
-        "--password-file",
-        metavar="FILE",
-        help="Its first line is the password; else APPLIANCE_PASSWORD; else it is asked for.",
-    ),
-]
-VersionOption = Annotated[
-    Literal["5", "311"], typer.Option("--mqtt-version", "-V", help="MQTT 5 or 3.1.1.")
-]
-InsecureOption = Annotated[
-    bool,
-    typer.Option("--insecure", help="Do not check who the broker is. Never with a real password."),
-]
-ClientIdOption = Annotated[
-    str, typer.Option("--id", "-i", help="The client id; else a random one.")
-]
-
 
 @app.command()
 def pub(
@@ -614,7 +588,7 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
-    target = _target(
+    target = connect_to(
         config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
     )
     from appliance import client
@@ -652,7 +626,7 @@ def sub(
     config: ConfigOption = None,
 ) -> None:
     """Subscribe, and print what comes, a message a line."""
-    target = _target(
+    target = connect_to(
         config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
     )
     from appliance import client
@@ -673,44 +647,8 @@ def sub(
         raise CommandError(f"{received} of {count} messages came within {timeout:g} s")
 
 
-def _target(
-    config: Path | None,
-    host: str,
-    port: int | None,
-    ca: Path | None,
-    user: str | None,
-    password_file: str | None,
-    client_id: str,
-    version: Literal["5", "311"],
-    insecure: bool,
-    cert: Path | None = None,
-    key: Path | None = None,
-) -> Target:
-    """Where to connect and as whom; what no option says is taken from the configuration, if any."""
-    from paho.mqtt.enums import MQTTProtocolVersion
-
-    from appliance.client import Target
-    from appliance.config import SEARCH_PATH
-
-    # Without a configuration it is a client on some other computer: the options say everything.
-    if config or (port is None and ca is None and any(path.is_file() for path in SEARCH_PATH)):
-        broker = _load(config).broker
-        ports = [listener.bind.port for listener in broker.listeners if listener.is_mqtts]
-        port = port or (ports[0] if ports else None)
-        ca = ca or broker.tls.ca
-    if user is None:
-        password = None
-    elif password_file:
-        password = _read_password(password_file)
-    elif "APPLIANCE_PASSWORD" in os.environ:
-        password = os.environ["APPLIANCE_PASSWORD"]
-    elif sys.stdin.isatty():
-        password = typer.prompt(f"Password of {user}", hide_input=True)
-    else:
-        raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
-    protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
-    address = (host, port or 8883)
-    return Target(*address, ca, user, password, client_id, protocol, insecure, cert, key)
+app.command()(call)
+app.command()(goal)
 
 
 def _version(wanted: bool) -> None:
