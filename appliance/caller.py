@@ -172,11 +172,17 @@ class Caller:
             is_late = deadline is not None and time.monotonic() > deadline
             return result is not None or (not is_cancelled and (is_over() or is_late))
 
-        self._connection.run(work, None, STEP)
-        if result is None:
-            is_cancelled = True
-            self._cancel(action, id_)
-            self._connection.run(work, time.monotonic() + ANSWER_TIMEOUT, STEP)
+        try:
+            self._connection.run(work, None, STEP)
+            if result is None:
+                is_cancelled = True
+                self._cancel(action, id_)
+                self._connection.run(work, time.monotonic() + ANSWER_TIMEOUT, STEP)
+        except CallFailedError:
+            raise
+        except ClientError as error:
+            where = f"{action}/_result/{id_}"
+            raise ClientError(f"{error}; the goal may go on, its result is at {where}") from None
         if result is None:
             raise ClientError(f"goal {id_} is being cancelled, and there is no result yet")
         value = decode(result)

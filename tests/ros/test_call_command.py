@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -194,3 +196,42 @@ def test_parameters_are_read_and_set(run):
         assert (code, output) == (1, "") and what in errors, errors
     code, _, errors = run("param", "get", "/turtle", "nothing", "-W", "0.2")
     assert code == 1 and "nothing is retained at r2d2/turtle/_param/nothing" in errors
+
+
+async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
+    """From nothing to a service that was called, as somebody new to it does it."""
+    monkeypatch.chdir(tmp_path)
+    environment = for_other_programs() | {
+        "APPLIANCE_PORT": "0",
+        "APPLIANCE_PLAIN_PORT": "0",
+        "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 101),  # another robot's than the other tests'
+    }
+
+    async def start(*arguments):
+        return await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "appliance", *arguments),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment,
+        )
+
+    async def output(process):
+        out, errors = await asyncio.wait_for(process.communicate(), DEADLINE)
+        return process.returncode, out.decode(), errors.decode()
+
+    assert (await output(await start("init", "--demo", "--dir", "run")))[0] == 0
+    demo = await start("demo", "-c", "run/appliance.yaml")
+    try:
+        line = b""
+        while b" call " not in line:
+            line = await asyncio.wait_for(demo.stdout.readline(), DEADLINE)
+            assert line, (await demo.stderr.read()).decode()
+        words = shlex.split(line.decode())[1:]
+        code, answer, errors = await output(await start(*words))
+        while "there is no /reset on the bus" in errors:  # the robot has not come yet
+            code, answer, errors = await output(await start(*words))
+        assert code == 0, errors
+        assert json.loads(answer)["message"] == "was 0.0 m from its start"
+    finally:
+        demo.terminate()
+        await output(demo)
