@@ -301,18 +301,29 @@ class App:
             raise ControlError(f"nothing was reloaded: {error}") from None
 
     async def _answer_routes(self) -> list[dict[str, object]]:
+        bridge = self._bridge_that_runs()
+        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
+        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+
+    async def _answer_skipped(self) -> list[dict[str, object]]:
+        return [asdict(skip) for skip in self._bridge_that_runs().skips()]
+
+    def _bridge_that_runs(self) -> Bridge:
         if self.bridge is None:
             raise ControlError("there is no bridge (bridge.bus is none)")
         if self.bridge.problem is not None:
             raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
-        topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
-        return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
+        return self.bridge
 
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        commands = {"reload": self._answer_reload, "routes": self._answer_routes}
+        commands = {
+            "reload": self._answer_reload,
+            "routes": self._answer_routes,
+            "skipped": self._answer_skipped,
+        }
         control = Control(settings.control, commands)
         await control.start()
         self._stack.push_async_callback(control.stop)

@@ -85,7 +85,9 @@ class Caller:
         try:
             self._connection.subscribe([topic_filter], 1, retained=False)
         except RefusedError as error:
-            raise RefusedError(f"{error}. It takes the rule: pattern read {rule}/#") from None
+            raise RefusedError(
+                f"{error}. The ACL line that allows it: pattern read {rule}/#"
+            ) from None
         self._listening.add(topic_filter)
 
     def _send(self, topic: str, token: str, payload: bytes, reply: str) -> None:
@@ -99,7 +101,9 @@ class Caller:
         try:
             code: ReasonCode = self._connection.publish(to, payload, 1, False, properties)
         except RefusedError as error:
-            raise RefusedError(f"{error}. It takes the rule: topic write {topic}/#") from None
+            raise RefusedError(
+                f"{error}. The ACL line that allows it: topic write {topic}/#"
+            ) from None
         if code.value == NO_MATCHING_SUBSCRIBERS:
             raise ClientError(
                 f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
@@ -154,7 +158,9 @@ class Caller:
         try:
             self._connection.subscribe(topics, 1, retained=False)
         except RefusedError as error:
-            raise RefusedError(f"{error}. It takes the rule: topic read {action}/#") from None
+            raise RefusedError(
+                f"{error}. The ACL line that allows it: topic read {action}/#"
+            ) from None
         id_ = orjson.loads(self.call(f"{action}/_goal", payload, ANSWER_TIMEOUT))["goal_id"]
         accepted(id_)
         deadline = None if timeout is None else time.monotonic() + timeout

@@ -37,6 +37,7 @@ from appliance.console import (
 )
 from appliance.console import load as _load
 from appliance.console import shown as _shown
+from appliance.routes_command import routes
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
@@ -186,55 +187,7 @@ def reload(config: ConfigOption = None) -> None:
     typer.echo("\n".join(changed) if changed else "nothing has changed")
 
 
-@app.command()
-def routes(
-    config: ConfigOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON an entry.")] = False,
-) -> None:
-    """Show what the running appliance carries between ROS and MQTT now."""
-    settings = _load(config)
-    import json
-
-    from appliance.control import ControlError, ask
-
-    try:
-        bridged = ask(settings.control, "routes")
-    except ControlError as error:
-        raise CommandError(str(error)) from None
-    if as_json:
-        typer.echo("".join(f"{json.dumps(entry)}\n" for entry in bridged), nl=False)
-        return
-    if not bridged:
-        typer.echo("nothing is bridged now")
-        return
-    rows = [("ROS", "", "MQTT", "TYPE", "AS", "HZ", "BYTES", "LOST", "ERRORS", "MS")]
-    arrows = {"to_mqtt": "→", "to_ros": "←"}
-    for entry in sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])):
-        way = entry["direction"]
-        figures = [""] * 5  # services, actions and parameters have none
-        if way in arrows:
-            latency = entry["latency_ms"]
-            figures = [
-                f"{entry['rate']:g}",
-                str(entry["size"]),
-                str(entry["dropped"]),
-                str(entry["errors"]),
-                f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
-            ]
-        rows.append(
-            (
-                entry["ros"],
-                arrows.get(way, way),
-                entry["mqtt"],
-                entry["type"],
-                entry["encoding"],
-                *figures,
-            )
-        )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        typer.echo(line.rstrip())
+app.command()(routes)
 
 
 @app.command()

@@ -48,10 +48,11 @@ from appliance.ros.figures import Counters
 from appliance.ros.goals import ALL, CANCEL, STATUS
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import assign, compile_pattern
+from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps
 from appliance.ros.requests import Key, Requests
 from appliance.ros.services import from_ros, to_request
+from appliance.ros.skips import Skip, Why
 
 log = logging.getLogger(__name__)
 
@@ -150,6 +151,8 @@ class ActionRoutes:
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
         self._actions: dict[str, Action] = {}
+        #: Actions that patterns speak of and do not take.
+        self._refused: list[Skip] = []
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
@@ -173,9 +176,13 @@ class ActionRoutes:
             for service, types in self._requests.services.items()
             if service.endswith(SEND_GOAL)
         }
-        wanted = assign(
-            list(self._counters), found, lambda route, name: _misfit(route, found[name][0]) is None
-        )
+        routes = list(self._counters)
+
+        def misfit(route: ActionSettings, name: str) -> tuple[Why, str] | None:
+            return _misfit(route, found[name][0])
+
+        wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
+        self._refused = refusals(routes, found, wanted, "action", misfit)
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
@@ -230,6 +237,18 @@ class ActionRoutes:
             if action.is_there
         ]
 
+    def skips(self) -> list[Skip]:
+        """The actions that routes speak of and are not bridged."""
+        skips = list(self._refused)
+        for action in self._actions.values():
+            type_name = action.type or ""
+            problem = self._requests.problem(f"{action.ros}{SEND_GOAL}", f"{type_name}_SendGoal")
+            if problem is not None:
+                skips.append(Skip(action.ros, "action", type_name, "problem", problem))
+            elif not action.is_there:
+                skips.append(Skip(action.ros, "action", type_name, "absent", "no node offers it"))
+        return skips
+
     async def cancel_orphans(self) -> None:
         """The appliance stops, and with it every client's way to its goals: cancel those that
         are not to go on without them."""
@@ -249,6 +268,7 @@ class ActionRoutes:
         for action in self._actions.values():
             action.forget()
         self._actions.clear()
+        self._refused.clear()
         await self._tasks.stop()
 
     # The ROS thread
@@ -264,11 +284,11 @@ class ActionRoutes:
             action.lost()
 
 
-def _misfit(route: ActionSettings, type_name: str) -> str | None:
+def _misfit(route: ActionSettings, type_name: str) -> tuple[Why, str] | None:
     """Why a pattern of the route does not take an action of that type; None when it does."""
     if route.type is None or compile_pattern(route.type).fullmatch(type_name):
         return None
-    return f"its type is {type_name}, the route takes {route.type}"
+    return "other_type", f"the route takes {route.type}"
 
 
 class Action:

@@ -33,9 +33,10 @@ from appliance.ros.calls import (
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.patterns import Names, compile_pattern, is_plain
 from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, loads
 from appliance.ros.requests import Requests
+from appliance.ros.skips import Skip
 
 log = logging.getLogger(__name__)
 
@@ -108,6 +109,8 @@ class _Node:
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
+    #: Why its parameters cannot be read.
+    problem: str | None = None
 
     def wants(self, parameter: str) -> bool:
         """Whether it is shown, and may be set."""
@@ -236,6 +239,22 @@ class ParameterRoutes:
             for node in self._nodes.values()
         ]
 
+    def skips(self) -> list[Skip]:
+        """The nodes that routes name and are not there, or do not tell their parameters."""
+        if self._is_stopped:
+            return []
+        skips = [
+            Skip(node.name, "parameters", "", "problem", node.problem)
+            for node in self._nodes.values()
+            if node.problem is not None
+        ]
+        named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
+        return skips + [
+            Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
+            for node in sorted(named - self._nodes.keys())
+            if is_plain(node)
+        ]
+
     async def stop(self) -> None:
         """The bus has been left: no value is true any more."""
         self._is_stopped = True
@@ -275,12 +294,16 @@ class ParameterRoutes:
             try:
                 values = await asyncio.wait_for(self._get_all(node), PATIENCE)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
+                    return
+                why = str(error) or "no answer"
+                node.problem = f"its parameters cannot be read: {why}"
                 if not has_failed:
-                    why = error if str(error) else "no answer"
                     log.warning("the parameters of %s cannot be read: %s", node.name, why)
                 has_failed = node.is_stale = True
                 await asyncio.sleep(RETRY)
                 continue
+            node.problem = None
             if not node.is_stale and not node.is_gone:
                 for name in node.shown.keys() - values.keys():
                     self._show(node, name, None)

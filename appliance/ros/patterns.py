@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Protocol, TypeVar
+
+from appliance.ros.skips import Skip, Why
 
 
 def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:
@@ -29,8 +31,9 @@ class Names:
 
     def __init__(self, patterns: Iterable[str]) -> None:
         every = list(patterns)
-        self._texts = [text for text in every if not text.startswith("!")]
-        self._wanted = [compile_pattern(text) for text in self._texts]
+        wanted = [text for text in every if not text.startswith("!")]
+        self._wanted = [compile_pattern(text) for text in wanted]
+        self._spoken_of = [compile_pattern(text, hidden=True) for text in wanted]
         self._excluded = [(text, compile_pattern(text[1:])) for text in every if text[0] == "!"]
 
     def __contains__(self, name: str) -> bool:
@@ -38,16 +41,14 @@ class Names:
             pattern.fullmatch(name) for _, pattern in self._excluded
         )
 
-    def refusal(self, name: str) -> str | None:
+    def refusal(self, name: str) -> tuple[Why, str] | None:
         """Why a name that a pattern speaks of is not among them; None when it is, or none does."""
-        if name in self:
-            return None
-        if not any(compile_pattern(text, hidden=True).fullmatch(name) for text in self._texts):
+        if name in self or not any(pattern.fullmatch(name) for pattern in self._spoken_of):
             return None
         for text, pattern in self._excluded:
             if pattern.fullmatch(name):
-                return f"left out by {text}"
-        return "hidden: a part of its name begins with _, and no pattern spells that out"
+                return "left_out", f"left out by {text}"
+        return "hidden", "a part of its name begins with _, which the pattern does not spell out"
 
 
 class Listed(Protocol):
@@ -75,3 +76,22 @@ def assign(
             if name not in assigned and name in names and fits(route, name):
                 assigned[name] = route
     return assigned
+
+
+def refusals(
+    routes: Iterable[ListedT],
+    found: Mapping[str, Sequence[str]],
+    assigned: Container[str],
+    direction: str,
+    misfit: Callable[[ListedT, str], tuple[Why, str] | None],
+) -> list[Skip]:
+    """Of the names that were found, those that a route speaks of and none was assigned to."""
+    skips: dict[str, Skip] = {}
+    for route in routes:
+        names = Names(route.names)
+        for name, types in found.items():
+            if name not in assigned and name not in skips:
+                why = misfit(route, name) if name in names else names.refusal(name)
+                if why is not None:
+                    skips[name] = Skip(name, direction, min(types), *why)
+    return list(skips.values())

@@ -37,9 +37,10 @@ from appliance.ros.calls import (
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
-from appliance.ros.patterns import assign, compile_pattern
+from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, loads, named_encoding
 from appliance.ros.requests import Key, Requests
+from appliance.ros.skips import Skip, Why
 
 log = logging.getLogger(__name__)
 
@@ -122,6 +123,8 @@ class ServiceRoutes:
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
         self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
         self._provided: dict[ServiceSettings, Provided] = {}
+        #: Services that patterns speak of and do not take.
+        self._refused: list[Skip] = []
         #: The type that a service last had.
         self._types: dict[str, str] = {}
 
@@ -168,12 +171,17 @@ class ServiceRoutes:
     def _wanted(self) -> dict[str, ServiceSettings]:
         """The services that MQTT may call, and the route of each."""
         own = {route.names[0] for route in self._provided}
-        services = self._requests.services
-        return assign(
-            [route for route in self._counters if route.to == "ros"],
-            services,
-            lambda route, name: name not in own and _misfit(route, services[name]) is None,
-        )
+        found = {name: types for name, types in self._requests.services.items() if name not in own}
+        routes = [route for route in self._counters if route.to == "ros"]
+
+        def misfit(route: ServiceSettings, name: str) -> tuple[Why, str] | None:
+            return _misfit(route, found[name])
+
+        wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
+        # Those of actions belong to bridge.actions.
+        others = {name: types for name, types in found.items() if "/_action/" not in name}
+        self._refused = refusals(routes, others, wanted, "service", misfit)
+        return wanted
 
     def _offer(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
@@ -235,12 +243,27 @@ class ServiceRoutes:
             for name in route.names
         ]
 
+    def skips(self) -> list[Skip]:
+        """The services that routes speak of and cannot be called, or are not offered."""
+        skips = list(self._refused)
+        for name, (route, _) in self._offered.items():
+            type_name = self._type(name, route) or ""
+            problem = self._requests.problem(name, type_name)
+            if problem is not None:
+                skips.append(Skip(name, "service", type_name, "problem", problem))
+            elif name not in self._requests.services:
+                skips.append(Skip(name, "service", type_name, "absent", "no node offers it"))
+        for provided in self._provided.values():
+            skips += provided.skips()
+        return skips
+
     def stop(self) -> None:
         """The bus has been left: nothing is offered any more."""
         for provided in self._provided.values():
             provided.stop()
         self._provided.clear()
         self._offered.clear()
+        self._refused.clear()
 
     # The ROS thread
 
@@ -255,15 +278,15 @@ class ServiceRoutes:
             provided.lost()
 
 
-def _misfit(route: ServiceSettings, types: Sequence[str]) -> str | None:
+def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[Why, str] | None:
     """Why a pattern of the route does not take a service of these types; None when it does."""
     if route.type is not None:
         if any(map(compile_pattern(route.type).fullmatch, types)):
             return None
-        return f"its type is {min(types)}, the route takes {route.type}"
+        return "other_type", f"the route takes {route.type}"
     takes_all = any("*" in name.rpartition("/")[2] for name in route.names if name[0] != "!")
     if takes_all and _OF_EVERY_NODE.fullmatch(min(types)):
-        return "every node has it; a route has to name it"
+        return "of_every_node", "every node has one; patterns take it only where they name it"
     return None
 
 
@@ -314,6 +337,8 @@ class Provided:
         self._response_type = f"{route.type}_Response"
         self._asked: dict[str, _Asked] = {}
         self._report_at = 0.0
+        #: Why ROS does not have it.
+        self._problem: str | None = None
         self._board.listen(f"{self._base}/_response/+", self._on_response)
         # The ROS thread's.
         self._service: RosService | None = None
@@ -333,9 +358,15 @@ class Provided:
             self._service = self._node.create_service(self._ros, route.type, self._on_request)
         except (BusError, UnknownTypeError) as error:
             self._post(log.error, "%s is not offered: %s", self._ros, error)
-            self._counters.last_error = str(error)
+            self._counters.last_error = self._problem = str(error)
             return
         self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
+
+    def skips(self) -> list[Skip]:
+        """Why it is not offered, where it is not; from any thread."""
+        if self._problem is None:
+            return []
+        return [Skip(self._ros, "provided", self._route.type or "", "problem", self._problem)]
 
     def _on_request(self, cdr: bytes, respond: Respond) -> None:
         try:

@@ -122,6 +122,19 @@ async def test_one_parameter_that_cannot_be_given_hides_no_others(house):
     assert house.retained("r2d2/arm/_param/void") is None
 
 
+async def test_the_appliance_stops_just_when_a_node_cannot_be_read(house):
+    house.start(parameters("/mute/*"))
+    kind = "rcl_interfaces/srv/GetParameters"
+    house.node.add_service("/mute/get_parameters", kind, lambda request, respond: None)
+    for turns in range(12):  # one of these is between the failure and the task's hearing of it
+        house.node.spin()
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await asyncio.wait_for(house.bridge.stop(), 5)
+        house.bridge = None
+        house.start(parameters("/mute/*"))
+
+
 async def test_routes_that_change_while_they_run(house):
     house.start(parameters("/arm/sp*"))
     Declaring(house, speed=1, spin=3, steps=2)

@@ -322,6 +322,9 @@ def test_the_command_shows_what_can_be_called(appliance):
         ],
     ):
         assert line in lines
+    (counts,) = (line for line in done.stdout.splitlines() if line.startswith("skipped: "))
+    assert "1 not there" in counts
+    assert ["/turtle/absent", "service", "no", "node", "offers", "it"] in lines
 
 
 @both
