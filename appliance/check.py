@@ -200,5 +200,6 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
         text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
         yield Finding("warning", "bridge", text)
     else:
-        called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
-        yield Finding("ok", "bridge", f"ROS 2 found; routes: {len(bridge.topics) + called}")
+        called = (*bridge.services, *bridge.actions, *bridge.parameters)
+        routes = sum(not route.is_exclusion for route in (*bridge.topics, *called))
+        yield Finding("ok", "bridge", f"ROS 2 found; routes: {routes}")

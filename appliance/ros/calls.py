@@ -302,7 +302,7 @@ class Switchboard:
             return
         call = Call(caller, message.payload, topic, reply, encoding)
         if isinstance(said, str) and named is None:
-            call.doubt = f" (it says to be {quote(said)}, and was read as {encoding})"
+            call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
         try:
             self._admit(offer, caller, message)
             if encoding not in offer.encodings:
