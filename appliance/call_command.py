@@ -161,9 +161,9 @@ def call(
 
     Example: appliance call -u alice /arm/grip '{"data": true}'
     """
-    payload = _payload(request)
+    topic, payload = f"{reach.topic(service)}/_call", _payload(request)
     with _caller(reach) as caller:
-        _print(caller.call(f"{reach.topic(service)}/_call", payload, timeout))
+        _print(caller.call(topic, payload, timeout))
 
 
 @_connecting
@@ -188,10 +188,10 @@ def goal(
 
     Example: appliance goal -u alice /walk '{"order": 5}'
     """
-    payload = _payload(fields)
+    topic, payload = reach.topic(action), _payload(fields)
     with _caller(reach) as caller, _stop_signals() as caught:
         outcome = caller.goal(
-            reach.topic(action),
+            topic,
             payload,
             accepted=lambda id_: _print(f"goal {id_}".encode()),
             feedback=(lambda line: _print(b"feedback " + line)) if feedback else None,
@@ -291,6 +291,6 @@ def param_set(
 
     Example: appliance param set -u alice /controller max_speed 0.4
     """
-    payload = _payload(value)
+    topic, payload = f"{reach.topic(node)}/_param/{name}/set", _payload(value)
     with _caller(reach) as caller:
-        caller.call(f"{reach.topic(node)}/_param/{name}/set", payload, timeout)
+        caller.call(topic, payload, timeout)

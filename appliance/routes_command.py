@@ -34,7 +34,8 @@ COUNTED = "of_every_node"
 def routes(
     config: ConfigOption = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One line of JSON an entry; `why` is in what is skipped.")
+        bool,
+        typer.Option("--json", help="A line of JSON an entry; of what is skipped only with --all."),
     ] = False,
     show_all: Annotated[
         bool, typer.Option("--all", help=f"All that is skipped, not the first {SHOWN} only.")
@@ -50,7 +51,8 @@ def routes(
     except ControlError as error:
         raise CommandError(str(error)) from None
     if as_json:
-        typer.echo("".join(f"{json.dumps(entry)}\n" for entry in bridged + skipped), nl=False)
+        entries = bridged + (skipped if show_all else [])
+        typer.echo("".join(f"{json.dumps(entry)}\n" for entry in entries), nl=False)
         return
     if bridged:
         rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
