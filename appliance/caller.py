@@ -7,6 +7,7 @@ of MQTT can and which takes no right to publish anywhere else.
 from __future__ import annotations
 
 import base64
+import contextlib
 import secrets
 import time
 from collections.abc import Callable
@@ -76,7 +77,10 @@ class Caller:
         value = decode(message)
         if isinstance(value, dict) and isinstance(value.get("error"), dict):
             error = value["error"]
-            raise CallFailedError(f"{error.get('code')}: {error.get('message')}")
+            text = f"{error.get('code')}: {error.get('message')}"
+            if error.get("code") == "bad_request" and not self._is_v5:
+                text += "; MQTT 3.1.1 cannot say that this is JSON, where the route takes another"
+            raise CallFailedError(text)
         return encode(value)
 
     def _listen(self, topic_filter: str, rule: str) -> None:
@@ -174,7 +178,7 @@ class Caller:
                 if message.topic == f"{action}/_result/{id_}":
                     result = message
                 elif feedback is not None and message.topic == f"{action}/_feedback/{id_}":
-                    feedback(encode(decode(message)))
+                    feedback(shown(message))
             is_late = deadline is not None and time.monotonic() > deadline
             return result is not None or (not is_cancelled and (is_over() or is_late))
 
@@ -191,6 +195,10 @@ class Caller:
             raise ClientError(f"{error}; the goal may go on, its result is at {where}") from None
         if result is None:
             raise ClientError(f"goal {id_} is being cancelled, and there is no result yet")
+        if content_type(result) == "application/cdr":
+            from appliance.ros.goals import status_of
+
+            return Outcome(status_of(bytes(result.payload)), shown(result))
         value = decode(result)
         if "error" in value:
             raise CallFailedError(f"{value['error']['code']}: {value['error']['message']}")
@@ -215,27 +223,39 @@ class Caller:
             while len(self._received) > seen:
                 seen = len(self._received)
                 self._connection.run(lambda: False, time.monotonic() + QUIET, STEP)
-        return {m.topic: encode(decode(m)) for m in self._received if m.payload}
+        return {m.topic: shown(m) for m in self._received if m.payload}
+
+
+def content_type(message: paho.MQTTMessage) -> str | None:
+    """What the message says to be; None where it does not, as in MQTT 3.1.1."""
+    said = getattr(message.properties, "ContentType", None)
+    return said if isinstance(said, str) else None
 
 
 def decode(message: paho.MQTTMessage) -> Any:
-    """The value of a payload, by its content type; JSON without one. Raises ClientError."""
-    said = getattr(message.properties, "ContentType", "application/json")
-    if said == "application/cbor":
+    """The value of JSON or CBOR. Raises ClientError."""
+    said, payload = content_type(message), bytes(message.payload)
+    if said != "application/cbor":
+        try:
+            return orjson.loads(payload)
+        except orjson.JSONDecodeError:
+            pass
+    if said in (None, "application/cbor"):
         from appliance.ros import cbor
         from appliance.ros.careful import ConversionError
 
-        try:
-            return cbor.loads(bytes(message.payload))
-        except ConversionError as error:
-            raise ClientError(f"{message.topic}: {error}") from None
+        with contextlib.suppress(ConversionError):
+            return cbor.loads(payload)
+    raise ClientError(f"{message.topic} has something else than {said or 'JSON or CBOR'}")
+
+
+def shown(message: paho.MQTTMessage) -> bytes:
+    """The JSON of a message, or, for what has none, what it is."""
     try:
-        return orjson.loads(bytes(message.payload))
-    except orjson.JSONDecodeError:
-        what = "no JSON" if said == "application/json" else said
-        raise ClientError(
-            f"{message.topic} has {what}, which this command cannot show: see encoding in the route"
-        ) from None
+        return encode(decode(message))
+    except ClientError:
+        said = content_type(message) or "of an unknown encoding"
+        return f"({said}, {len(message.payload)} bytes)".encode()
 
 
 def encode(value: Any) -> bytes:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 
 import pytest
+import yaml
 from appliance_process import ApplianceProcess, eventually
 
 pytest.importorskip("rclpy")
@@ -19,6 +20,7 @@ from test_robot import Robot
 
 from appliance import cli
 from appliance.environment import for_other_programs
+from appliance.init import initialise
 
 DEADLINE = 20.0
 BRIDGE = {
@@ -75,6 +77,8 @@ def appliance(domain, robot, tmp_path_factory):
 
 def typed(appliance, command, *arguments, user):
     """The arguments of `appliance`."""
+    if command == "reload":
+        return [command, "-c", str(appliance.config)]
     words = 1 if command == "param" else 0
     where = ["-c", str(appliance.config), "-p", str(appliance.port), "-u", user]
     return [command, *arguments[:words], *where, *arguments[words:]]
@@ -176,6 +180,28 @@ def test_ctrl_c_cancels_the_goal(appliance, robot, number):
     assert told[0] == "walked" and told[1] < 100
 
 
+def test_what_has_no_json_is_named(run, appliance):
+    before = appliance.config.read_text()
+    settings = yaml.safe_load(before)
+    settings["bridge"]["actions"][0]["encoding"] = "cdr"
+    try:
+        for text in (yaml.safe_dump(settings), before):
+            appliance.config.write_text(text)
+            assert run("reload")[0] == 0
+            code, output, errors = run("goal", "/turtle/walk", '{"order": 2}', "-V", "5")
+            assert code == 0, errors
+            _, *between, last = output.splitlines()
+            if text is not before:
+                assert last == "succeeded (application/cdr, 28 bytes)"
+                assert between[0] == "feedback (application/cdr, 20 bytes)"
+            else:
+                assert last == 'succeeded {"sequence":[0,1,1,2]}'
+            code, _, errors = run("goal", "/turtle/walk", '{"order": 2}', "-V", "311")
+            assert code == 1 and "MQTT 3.1.1 cannot say that this is JSON" in errors
+    finally:
+        appliance.config.write_text(before)
+
+
 def test_parameters_are_read_and_set(run):
     assert run("param", "get", "/turtle", "mode") == (0, '"calm"\n', "")
     code, output, _ = run("param", "list", "/turtle")
@@ -219,7 +245,7 @@ async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
         out, errors = await asyncio.wait_for(process.communicate(), DEADLINE)
         return process.returncode, out.decode(), errors.decode()
 
-    assert (await output(await start("init", "--demo", "--dir", "run")))[0] == 0
+    list(initialise(tmp_path / "run", demo=True))
     demo = await start("demo", "-c", "run/appliance.yaml")
     try:
         line = b""

@@ -17,7 +17,7 @@ from call_house import AllTypes, House, action, call_routes, parameters, service
 from appliance.mqtt.codec import Property
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
-from appliance.ros.goals import GOAL_INFO, STATUS, id_of
+from appliance.ros.goals import GOAL_INFO, STATUS, id_of, split_id, with_id
 from appliance.ros.node import Durability, FakeNode, QosProfile
 
 CONVERTERS = Converters(load_description)
@@ -343,6 +343,22 @@ def plain(numbers):
         data = numbers.value
         return [int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4)]
     return numbers
+
+
+@pytest.mark.parametrize("name", ["Fibonacci", "NestedMessage"])
+def test_an_id_goes_before_a_goal_and_feedback_without_converting_them(name):
+    type_name, id_ = f"test_msgs/action/{name}", bytes(range(16))
+    fields = {
+        "Fibonacci": {"order": 7},
+        "NestedMessage": {
+            "nested_field_no_pkg": {"duration_value": {"sec": 1, "nanosec": 2}},
+            "nested_field": {"bool_value": True, "float64_value": 0.5, "int64_value": -1},
+        },
+    }[name]
+    goal = cdr(f"{type_name}_Goal", fields)
+    whole = cdr(f"{type_name}_SendGoal_Request", {"goal_id": {"uuid": id_}, "goal": fields})
+    assert with_id(goal, id_) == whole
+    assert split_id(whole) == (id_, goal)
 
 
 @every_encoding
