@@ -26,9 +26,11 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     PrivateAttr,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_serializer,
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
@@ -667,6 +669,11 @@ class Route(_Section):
     def is_pattern(self) -> bool:
         """Whether the route is for many names."""
         return not self.is_exclusion and (len(self.names) > 1 or "*" in self.names[0])
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        every: dict[str, Any] = serialize(self)
+        return {"ros": every["ros"]} if self.is_exclusion else every
 
     def topic(self, robot: str) -> str:
         """The MQTT topic of this route on that robot; that of many names keeps `{ros}` in it."""
