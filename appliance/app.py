@@ -369,12 +369,19 @@ class App:
             raise ControlError(f"nothing was reloaded: {error}") from None
 
     async def _answer_routes(self) -> list[dict[str, object]]:
+        bridge = self._bridge_that_runs()
+        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
+        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+
+    async def _answer_skipped(self) -> list[dict[str, object]]:
+        return [asdict(skip) for skip in self._bridge_that_runs().skips()]
+
+    def _bridge_that_runs(self) -> Bridge:
         if self.bridge is None:
             raise ControlError("there is no bridge (bridge.bus is none)")
         if self.bridge.problem is not None:
             raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
-        topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
-        return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
+        return self.bridge
 
     async def _answer_status(self) -> dict[str, object]:
         assert self._status is not None
@@ -388,6 +395,7 @@ class App:
             "reload": self._answer_reload,
             "routes": self._answer_routes,
             "status": self._answer_status,
+            "skipped": self._answer_skipped,
         }
         control = Control(settings.control, commands)
         await control.start()

@@ -203,7 +203,6 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
     if not is_available:
         yield Finding("warning", "bridge", f"{reason}; the broker runs without")
     else:
-        called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
-        yield Finding(
-            "ok", "bridge", f"{installation.find()}; routes: {len(bridge.topics) + called}"
-        )
+        called = (*bridge.services, *bridge.actions, *bridge.parameters)
+        routes = sum(not route.is_exclusion for route in (*bridge.topics, *called))
+        yield Finding("ok", "bridge", f"{installation.find()}; routes: {routes}")

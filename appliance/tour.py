@@ -22,6 +22,7 @@ from appliance.config import Bind, Settings
 from appliance.init import PASSWORD_FILE
 from appliance.ros.installation import is_frozen
 
+RESET = "/reset"  # the demo robot's service, which the demo's configuration bridges
 STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -141,6 +142,11 @@ def instructions(settings: Settings, host: str, port: int) -> str:
     options += f" --password-file {_quoted(password)}" if password.exists() else ""
     robot = settings.robot
     twist = '\'{"linear": {"x": 0.5}, "angular": {"z": 0.3}}\''
+    call = ""
+    if any(RESET in route.names for route in settings.bridge.services):
+        call = (
+            f"put it back to its start, by a service of ROS:\n  {command} call {options} {RESET}\n"
+        )
     return f"""
 Ready. In another terminal, in this folder:
 
@@ -152,7 +158,7 @@ drive it:
 the same with this project's own command:
   {command} sub {options} -v '{robot}/odom'
   {command} pub {options} '{robot}/cmd_vel' -m {twist}
-
+{call}
 Ctrl-C here ends everything.
 """
 

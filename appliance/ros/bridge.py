@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from time import thread_time, time_ns
 from typing import Literal, TypeAlias
 
@@ -34,6 +34,7 @@ from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
+from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
 __all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
@@ -88,8 +89,8 @@ class Bridge:
         *,
         diagnostics: float = 0.0,
     ) -> None:
-        """What is bridged is told on `{robot}/_appliance/routes`, and every so many seconds how it
-        goes on `/diagnostics`, not at all for 0.
+        """What is bridged is told on `{robot}/_appliance/routes`, what is not on `…/skipped`, and
+        every so many seconds how it goes on `/diagnostics`, not at all for 0.
         """
         self.problem: str | None = None
         self.peers: int | None = None
@@ -102,6 +103,7 @@ class Bridge:
         self._broker = broker
         self._loop = loop
         self._topic = f"{robot}/_appliance/routes"
+        self._skipped_topic = f"{robot}/_appliance/skipped"
         self._schemas = f"{robot}/_appliance/schema/"
         #: The types whose schemas are told.
         self._told: set[str] = set()
@@ -113,13 +115,15 @@ class Bridge:
         self._metered = 0
         #: What was last told of what is bridged.
         self._announced = b""
+        self._announced_skips = b""
         #: Replaced as one by the loop's thread; the ROS thread follows at its next look.
         self._routes: list[Route] = []
         self._followed: list[Route] | None = None
         #: Topics that have a route by name, which goes before patterns.
         self._named: dict[Direction, set[str]] = {"to_mqtt": set(), "to_ros": set()}
-        #: The topics when patterns were last matched.
+        #: The topics when patterns were last matched, and those that no pattern took.
         self._topics: dict[str, list[str]] | None = None
+        self._refused: list[Skip] = []
         #: By what they carry. These belong to the ROS thread; those to ROS only as far as patterns
         #: found them, of which the loop's thread is told when they can be received for.
         self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
@@ -298,6 +302,7 @@ class Bridge:
         while self._deliver():
             pass
         await self.calls.stop()
+        self._refused = []
         self._announce()
         self._session = None
         self._broker.detach(session)
@@ -314,6 +319,11 @@ class Bridge:
         return [
             topic_status(flow.bridged, flow) for flow in self._flows() if flow.bridged is not None
         ]
+
+    def skips(self) -> list[Skip]:
+        """What routes speak of and is not bridged, and why."""
+        of_flows = [skip for flow in self._flows() for skip in flow.skips()]
+        return ordered([*of_flows, *self._refused, *self.calls.skips()])
 
     @property
     def node_name(self) -> str:
@@ -363,6 +373,11 @@ class Bridge:
             self._announced = payload
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
             self._tell_schemas({topic.type for topic in topics}, self._session)
+            self._broker.flush()
+        payload = orjson.dumps(summary(self.skips()))
+        if self._session is not None and payload != self._announced_skips:
+            self._announced_skips = payload
+            self._broker.publish(Message(self._skipped_topic, payload, 0, True), self._session)
             self._broker.flush()
 
     def _meter(self) -> None:
@@ -491,6 +506,7 @@ class Bridge:
         is bridged has changed."""
         patterns = [route for route in self._routes if route.is_pattern]
         if not patterns:
+            self._refused = []
             return False
         topics = self._node.topics()
         if topics == self._topics:
@@ -501,7 +517,7 @@ class Bridge:
             if flow.is_matched and not flow.route.matches(flow.ros, topics.get(flow.ros, ())):
                 has_changed |= flow.bridged is not None
                 self._end(flow)
-        taken = {
+        taken: dict[Direction, set[str]] = {
             "to_mqtt": self._named["to_mqtt"] | {flow.ros for flow in self._to_mqtt.values()},
             "to_ros": self._named["to_ros"] | {flow.ros for flow in self._found.values()},
         }
@@ -512,7 +528,25 @@ class Bridge:
                     mine.add(ros)
                     add = self._add_to_mqtt if route.direction == "to_mqtt" else self._add_to_ros
                     add(route, ros)
+        refused = self._find_refused(patterns, taken)
+        has_changed |= refused != self._refused
+        self._refused = refused
         return has_changed
+
+    def _find_refused(
+        self, patterns: list[Route], taken: Mapping[Direction, set[str]]
+    ) -> list[Skip]:
+        found: dict[tuple[str, str], Skip] = {}
+        for route in patterns:
+            direction = route.direction
+            for ros, types in (self._topics or {}).items():
+                # Those of actions belong to bridge.actions, which has a say of its own.
+                if ros in taken[direction] or (ros, direction) in found or "/_action/" in ros:
+                    continue
+                refusal = route.refusal(ros, types)
+                if refusal is not None:
+                    found[ros, direction] = Skip(ros, direction, min(types), *refusal)
+        return list(found.values())
 
     def _end(self, flow: Flow) -> None:
         flow.close()
@@ -527,6 +561,7 @@ class Bridge:
         self._is_joined = False
         for flow in (*self._flows(), *self._leaving):
             flow.lost()
+        self._refused = []
         self.calls.lost()
         if self._diagnostics is not None:
             self._diagnostics.lost()

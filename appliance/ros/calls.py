@@ -12,7 +12,8 @@ Response Topic is one that the caller could have published to itself, or one bel
 a way back or because the caller may not use it, is not carried out: the error is on
 `r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
 
-Everything here is for the event loop's thread.
+A call may be JSON, CBOR or CDR, as its content type says, else as the route does; its answer is
+the same. Everything here is for the event loop's thread.
 """
 
 from __future__ import annotations
@@ -25,8 +26,6 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-import orjson
-
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
@@ -35,7 +34,7 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.ros.backlog import Backlog
-from appliance.ros.payloads import too_large
+from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, named_encoding, too_large
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,9 @@ ErrorCode: TypeAlias = Literal[
     "stopping",  # the appliance stops
 ]
 
-JSON = "application/json"
+
+#: Encodings of a call that has other values than ROS messages in it.
+WITHOUT_CDR: tuple[CallEncoding, ...] = ("json", "cbor")
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
@@ -83,11 +84,11 @@ class CallError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to a call: its payload, and the ROS type that this is of, if any."""
+    """The answer to a call: its payload, how that is encoded, and the ROS type of it, if any."""
 
     payload: bytes
+    encoding: CallEncoding
     type: str | None = None
-    content_type: str = JSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +116,16 @@ class Call:
     """One call that can be answered.
 
     `topic` is without the token. `reply` is the answer as far as it is known beforehand: its topic,
-    QoS and Correlation Data.
+    QoS and Correlation Data. `encoding` is the payload's, and will be the answer's; `doubt` says
+    why it may be another.
     """
 
     caller: Session
     payload: bytes
     topic: str
     reply: Message
+    encoding: CallEncoding
+    doubt: str = ""
     is_late: bool = False
     task: asyncio.Task[None] | None = None
 
@@ -133,7 +137,8 @@ Handle: TypeAlias = Callable[[Call], Awaitable[Answer]]
 class Offer:
     """What can be called under a topic: `handle` gives the answer or raises CallError.
 
-    `name` is what the log calls it. `timeout` is in seconds.
+    `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
+    `encodings` are those that it takes.
     """
 
     topic: str
@@ -141,6 +146,8 @@ class Offer:
     timeout: float
     counters: CallCounters
     handle: Handle
+    encoding: CallEncoding = "json"
+    encodings: tuple[CallEncoding, ...] = ("json", "cbor", "cdr")
 
 
 Receive: TypeAlias = Callable[[Session, Message], None]
@@ -301,6 +308,13 @@ class Switchboard:
             if left.fullmatch(topic):
                 self.publish(Message(topic, b"", 0, True))
 
+    def may_publish(self, caller: Session, topic: str) -> bool:
+        """Whether the rules in force let the caller publish there."""
+        try:
+            return self._broker.route(caller, encode_string(topic)).allowed
+        except ProtocolError:
+            return False
+
     def now(self) -> float:
         """Seconds of the broker's clock."""
         return self._broker.now
@@ -312,16 +326,26 @@ class Switchboard:
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
         fallback = Message(own, b"", 1)
+        said = (message.properties or {}).get(Property.CONTENT_TYPE)
+        named = named_encoding(said)
+        encoding = named or offer.encoding
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
-            self._fail(offer, caller, fallback if _is_level(caller.client_id) else None, error)
+            may_tell = _is_level(caller.client_id)
+            self._fail(offer, caller, fallback if may_tell else None, encoding, error)
             return
-        call = Call(caller, message.payload, topic, reply)
+        call = Call(caller, message.payload, topic, reply, encoding)
+        if isinstance(said, str) and named is None:
+            call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
         try:
             self._admit(offer, caller, message)
+            if encoding not in offer.encodings:
+                either = " or ".join(offer.encodings)
+                text = f"a call of {offer.name} may be {either}, not {encoding}"
+                raise CallError("bad_request", text)
         except CallError as error:
-            self._fail(offer, caller, reply, error)
+            self._fail(offer, caller, reply, encoding, error)
             return
         self._under_way[caller] += 1
         offer.counters.under_way += 1
@@ -401,26 +425,29 @@ class Switchboard:
         try:
             answer = await offer.handle(call)
         except CallError as error:
-            self._fail(offer, call.caller, call.reply, error)
+            if error.code == "bad_request" and call.doubt:
+                error = CallError(error.code, f"{error}{call.doubt}")
+            self._fail(offer, call.caller, call.reply, call.encoding, error)
         except asyncio.CancelledError:
             text = f"no answer from {offer.name} within {offer.timeout:g} s"
             end = CallError("timeout", text) if call.is_late else _stopping()
-            self._fail(offer, call.caller, call.reply, end)
+            self._fail(offer, call.caller, call.reply, call.encoding, end)
         except Exception as problem:  # a fault in here must not leave the caller without an answer
             log.exception("a call of %s failed", offer.name)
-            self._fail(offer, call.caller, call.reply, CallError("ros_error", repr(problem)))
+            end = CallError("ros_error", repr(problem))
+            self._fail(offer, call.caller, call.reply, call.encoding, end)
         else:
             offer.counters.answers += 1
             about = [("status", "ok")]
             if answer.type is not None:
                 about.append(("ros-type", answer.type))
-            self._answer(call.reply, answer.payload, answer.content_type, about)
+            self._answer(call.reply, answer.payload, answer.encoding, about)
         finally:
             timer.cancel()
 
     def _forget(self, offer: Offer, call: Call) -> None:
         if call.task is not None and call.task.cancelled():  # before it had begun
-            self._fail(offer, call.caller, call.reply, _stopping())
+            self._fail(offer, call.caller, call.reply, call.encoding, _stopping())
         offer.counters.under_way -= 1
         self._calls.discard(call)
         self._bytes -= len(call.payload)
@@ -428,7 +455,14 @@ class Switchboard:
         if not self._under_way[call.caller]:
             del self._under_way[call.caller]
 
-    def _fail(self, offer: Offer, caller: Session, reply: Message | None, error: CallError) -> None:
+    def _fail(
+        self,
+        offer: Offer,
+        caller: Session,
+        reply: Message | None,
+        encoding: CallEncoding,
+        error: CallError,
+    ) -> None:
         counters = offer.counters
         counters.errors[error.code] += 1
         counters.last_error = f"{error.code}: {error}"
@@ -440,21 +474,27 @@ class Switchboard:
             log.warning(text, offer.name, caller, count, error.code, error)
         if reply is not None:
             # In a turn of its own: the caller's chunk is still being worked on.
-            payload = error_payload(error)
-            self._loop.call_soon(self._answer, reply, payload, JSON, [("status", "error")])
+            about = [("status", "error")]
+            self._loop.call_soon(self._answer, reply, *error_payload(error, encoding), about)
 
     def _answer(
-        self, reply: Message, payload: bytes, content_type: str, about: list[tuple[str, str]]
+        self, reply: Message, payload: bytes, encoding: CallEncoding, about: list[tuple[str, str]]
     ) -> None:
         properties = dict(reply.properties or {})
-        properties[Property.CONTENT_TYPE] = content_type
+        properties[Property.CONTENT_TYPE] = CONTENT_TYPE[encoding]
         properties[Property.USER_PROPERTY] = about
         self.publish(Message(reply.topic, payload, reply.qos, properties=properties))
 
 
-def error_payload(error: CallError) -> bytes:
-    """An error as every answer has it: `{"error": {"code": …, "message": …}}`."""
-    return orjson.dumps({"error": {"code": error.code, "message": str(error)}})
+def error_payload(
+    error: CallError, encoding: CallEncoding, **more: str
+) -> tuple[bytes, CallEncoding]:
+    """An error as every answer has it, `{"error": {"code": …, "message": …}}`, and its encoding.
+
+    CDR has no words for it: that is JSON then, which no CDR begins like.
+    """
+    about = {"code": error.code, "message": str(error)}
+    return dumps({**more, "error": about}, encoding), "json" if encoding == "cdr" else encoding
 
 
 def _is_level(client_id: str) -> bool:

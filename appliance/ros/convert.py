@@ -155,13 +155,16 @@ class Converter:
 
     def to_cbor(self, cdr: bytes) -> bytes:
         """The CBOR of a serialized message, in either byte order."""
+        return cbor.dumps(self.to_cbor_value(cdr))
+
+    def to_cbor_value(self, cdr: bytes) -> dict[str, Any]:
+        """What `to_cbor` writes, as Python values that `cbor.dumps` takes."""
         if self._binary is None:
             self._binary = generate_binary(self.description, self._wanted)
         try:
-            value = self._binary.decode(cdr)
+            return self._binary.decode(cdr)
         except MISFIT:
-            value = self._decode_carefully(cdr, binary=True)
-        return cbor.dumps(value)
+            return self._decode_carefully(cdr, binary=True)
 
     def from_cbor(self, payload: bytes) -> bytes:
         """The serialized message, in little endian, of its CBOR."""

@@ -43,6 +43,7 @@ from appliance.ros.payloads import (
 )
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 from appliance.ros.rules import CommandRules
+from appliance.ros.skips import Skip, Why
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 
@@ -117,6 +118,15 @@ class Route:
         """Whether a topic that carries these types is one of this route's."""
         return ros in self._names and any(map(self.fits, types))
 
+    def refusal(self, ros: str, types: Iterable[str]) -> tuple[Why, str] | None:
+        """Why a topic that the route's pattern speaks of is not one of its; None when it is, or
+        when no pattern speaks of it."""
+        if ros not in self._names:
+            return self._names.refusal(ros)
+        if any(map(self.fits, types)):
+            return None
+        return "other_type", f"the route takes {self.settings.type}"
+
     def fits(self, type_name: str) -> bool:
         """Whether it is what the route says of the type, if it says something."""
         return self._types is None or self._types.fullmatch(type_name) is not None
@@ -177,6 +187,8 @@ class Flow(ABC):
     """One ROS topic carried in one direction; its methods are for the ROS thread."""
 
     direction: ClassVar[Direction]
+    #: Why a topic that a route names may not be carried yet.
+    absence: ClassVar[str]
 
     def __init__(
         self,
@@ -272,6 +284,22 @@ class Flow(ABC):
         self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
         self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 
+    def skips(self) -> list[Skip]:
+        """What of the topic is not carried; from any thread."""
+        problem, count, wanted, bridged = self._problem, self._count, self._wanted, self.bridged
+        if bridged is not None:
+            reason = f"the topic carries {bridged.type} as well, which is bridged"
+            return [
+                Skip(self.ros, self.direction, name, "two_types", reason) for name in self._foreign
+            ]
+        if problem is not None:
+            type_name = wanted[0] if wanted else ""
+            return [Skip(self.ros, self.direction, type_name, "problem", problem)]
+        if self.is_matched or count is None:
+            return []
+        type_name = self.settings.type or ""
+        return [Skip(self.ros, self.direction, type_name, "absent", self.absence)]
+
     def _tell_foreign(self, types: set[str], chosen: str) -> None:
         if types != self._foreign:
             self._foreign = types
@@ -332,6 +360,7 @@ class ToMqtt(Flow):
     """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
 
     direction = "to_mqtt"
+    absence = "no node publishes it"
 
     def __init__(
         self,
@@ -439,6 +468,7 @@ class ToRos(Flow):
     """From MQTT to ROS: a publisher. `receive` and `fail` are for the loop's thread."""
 
     direction = "to_ros"
+    absence = "no node subscribes to it, which would tell its type; the route can name it"
 
     def __init__(
         self,

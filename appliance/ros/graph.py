@@ -20,6 +20,7 @@ from appliance.ros.node import RosNode
 from appliance.ros.parameters import ParameterRoutes, ParameterSettings
 from appliance.ros.requests import Requests
 from appliance.ros.services import ServiceRoutes, ServiceSettings
+from appliance.ros.skips import Skip
 
 __all__ = [
     "ActionSettings",
@@ -134,6 +135,10 @@ class Calls:
             *self._actions.bridged(),
             *self._parameters.bridged(),
         ]
+
+    def skips(self) -> list[Skip]:
+        """What routes speak of and is not bridged, and why."""
+        return [*self._services.skips(), *self._actions.skips(), *self._parameters.skips()]
 
     # The ROS thread
 

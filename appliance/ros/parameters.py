@@ -1,9 +1,10 @@
 """Parameters of other nodes: their values as retained topics, and calls that set them.
 
 `r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
-`/parameter_events`; byte arrays are base64. `…/_param/speed/set` sets it, `…/_param/_set` several
-of the node at once or none of them: `{"speed": 0.5, "mode": "slow"}`. The type is the one that the
-node has declared, so that `1` will do for a double. When the node goes, so do its values.
+`/parameter_events`; byte arrays are base64, or bytes where the encoding is `cbor`.
+`…/_param/speed/set` sets it, `…/_param/_set` several of the node at once or none of them:
+`{"speed": 0.5, "mode": "slow"}`. The type is the one that the node has declared, so that `1` will
+do for a double. When the node goes, so do its values.
 """
 
 from __future__ import annotations
@@ -13,19 +14,29 @@ import logging
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import orjson
 import pybase64
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import (
+    WITHOUT_CDR,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    Offer,
+    Switchboard,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names
+from appliance.ros.patterns import Names, compile_pattern, is_plain
+from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, loads
 from appliance.ros.requests import Requests
+from appliance.ros.skips import Skip
 
 log = logging.getLogger(__name__)
 
@@ -67,16 +78,26 @@ _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 @dataclass(frozen=True, slots=True)
 class ParameterSettings:
-    """Parameters by patterns: of the nodes `node`, those called `name`.
+    """Parameters, by names and patterns such as `/node/parameter`; what begins with `!` is left
+    out.
 
     `mqtt` is the topic above a node's values; a `{node}` in it stands for the node's full name.
-    `timeout` is for setting, in seconds. With `!` before `node` they are left out.
+    `timeout` is for setting, in seconds.
     """
 
-    node: str
-    name: str
+    names: tuple[str, ...]
     mqtt: str
     timeout: float = 5.0
+    encoding: Literal["json", "cbor"] = "json"
+
+    def of(self, node: str) -> Names | None:
+        """Those that are wanted of a node; None for none at all."""
+        mine: list[str] = []
+        for text in self.names:
+            pattern, _, name = text.removeprefix("!").rpartition("/")
+            if compile_pattern(pattern).fullmatch(node):
+                mine.append(f"!{name}" if text.startswith("!") else name)
+        return Names(mine) if any(not name.startswith("!") for name in mine) else None
 
 
 @dataclass(eq=False, slots=True)
@@ -86,12 +107,18 @@ class _Node:
     name: str
     base: str
     route: ParameterSettings
-    wanted: Names
+    wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
     offers: list[Offer] = field(default_factory=list)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
+    #: Why its parameters cannot be read.
+    problem: str | None = None
+
+    def wants(self, parameter: str) -> bool:
+        """Whether it is shown, and may be set."""
+        return any(parameter in names for names in self.wanted)
 
 
 class ParameterRoutes:
@@ -134,11 +161,7 @@ class ParameterRoutes:
         if list(routes) == list(self._routes):
             return
         self._routes = routes
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.node.startswith("!")
-        }
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         for node in list(self._nodes.values()):  # which patterns a value is of has to be asked anew
             self._leave(node)
         self.follow()
@@ -157,33 +180,36 @@ class ParameterRoutes:
             self._join(name)
 
     def _join(self, name: str) -> None:
-        mine = [route for route in self._counters if name in Names([route.node])]
-        if not mine or name == self._node.name:
+        wanted = {route: names for route in self._counters if (names := route.of(name))}
+        if not wanted or name == self._node.name:
             return
-        excluded = [
-            f"!{route.name}"
-            for route in self._routes
-            if route.node.startswith("!") and name in Names([route.node[1:]])
-        ]
-        wanted = Names([*(route.name for route in mine), *excluded])
-        route = mine[0]
-        node = _Node(name, route.mqtt.replace("{node}", name), route, wanted)
+        route = next(iter(wanted))
+        node = _Node(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
         self._nodes[name] = node
 
         async def set_one(call: Call) -> Answer:
             parameter = call.topic.split("/")[-2]
-            return await self._set(node, {parameter: _json(call.payload)}, at_once=False)
+            return await self._set(node, {parameter: _value_of(call)}, call, at_once=False)
 
         async def set_all(call: Call) -> Answer:
-            values = _json(call.payload)
-            if not isinstance(values, dict) or not values:
+            values = _value_of(call)
+            is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
+            if not is_mapping or not values:
                 raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-            return await self._set(node, values, at_once=True)
+            return await self._set(node, values, call, at_once=True)
 
         counters = self._counters[route]
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
             what = f"{name}'s parameters"
-            offer = Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle)
+            offer = Offer(
+                f"{node.base}/{topic}",
+                what,
+                route.timeout,
+                counters,
+                handle,
+                route.encoding,
+                WITHOUT_CDR,
+            )
             node.offers.append(offer)
             self._board.offer(offer)
         self._load(node)
@@ -200,7 +226,7 @@ class ParameterRoutes:
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the nodes that it shows now."""
         return [
-            (route, counters, [name for name in self._nodes if name in Names([route.node])])
+            (route, counters, [name for name in self._nodes if route.of(name)])
             for route, counters in self._counters.items()
         ]
 
@@ -212,9 +238,25 @@ class ParameterRoutes:
                 "mqtt": node.base,
                 "type": "rcl_interfaces/msg/ParameterValue",
                 "direction": "parameters",
-                "encoding": "json",
+                "encoding": node.route.encoding,
             }
             for node in self._nodes.values()
+        ]
+
+    def skips(self) -> list[Skip]:
+        """The nodes that routes name and are not there, or do not tell their parameters."""
+        if self._is_stopped:
+            return []
+        skips = [
+            Skip(node.name, "parameters", "", "problem", node.problem)
+            for node in self._nodes.values()
+            if node.problem is not None
+        ]
+        named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
+        return skips + [
+            Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
+            for node in sorted(named - self._nodes.keys())
+            if is_plain(node)
         ]
 
     async def stop(self) -> None:
@@ -256,12 +298,16 @@ class ParameterRoutes:
             try:
                 values = await asyncio.wait_for(self._get_all(node), PATIENCE)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
+                    return
+                why = str(error) or "no answer"
+                node.problem = f"its parameters cannot be read: {why}"
                 if not has_failed:
-                    why = error if str(error) else "no answer"
                     log.warning("the parameters of %s cannot be read: %s", node.name, why)
                 has_failed = node.is_stale = True
                 await asyncio.sleep(RETRY)
                 continue
+            node.problem = None
             if not node.is_stale and not node.is_gone:
                 for name in node.shown.keys() - values.keys():
                     self._show(node, name, None)
@@ -272,7 +318,7 @@ class ParameterRoutes:
 
     async def _get_all(self, node: _Node) -> dict[str, Any]:
         listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
-        names = [name for name in listed["result"]["names"] if name in node.wanted]
+        names = [name for name in listed["result"]["names"] if node.wants(name)]
         values: dict[str, Any] = {}
         for start in range(0, len(names), CHUNK):
             chunk = names[start : start + CHUNK]
@@ -292,16 +338,17 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or name not in node.wanted:
+        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or not node.wants(name):
             return
-        payload = b"" if value is None else _to_json(value)
+        encoding = node.route.encoding
+        payload = b"" if value is None else _to_payload(value, encoding)
         if payload == node.shown.get(name, b""):
             return
         if payload:
             node.shown[name] = payload
         else:
             del node.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: JSON}
+        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
         self._board.publish(Message(f"{node.base}/{name}", payload, 1, True, properties))
 
     def _take_events(self) -> None:
@@ -331,9 +378,11 @@ class ParameterRoutes:
 
     # Setting
 
-    async def _set(self, node: _Node, values: dict[str, Any], *, at_once: bool) -> Answer:
+    async def _set(
+        self, node: _Node, values: dict[str, Any], call: Call, *, at_once: bool
+    ) -> Answer:
         for name in values:
-            if name not in node.wanted:
+            if not node.wants(name):
                 text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
         names = list(values)
@@ -354,7 +403,8 @@ class ParameterRoutes:
         if not result.get("successful"):
             reason = result.get("reason") or "it gives no reason"
             raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
-        return Answer(orjson.dumps({"successful": True, "reason": result["reason"]}))
+        said = {"successful": True, "reason": result["reason"]}
+        return Answer(dumps(said, call.encoding), call.encoding)
 
     # The ROS thread
 
@@ -385,17 +435,22 @@ class ParameterRoutes:
         self._is_refused = False
 
 
-def _json(payload: bytes) -> Any:
+def _value_of(call: Call) -> Any:
     try:
-        return orjson.loads(payload)
-    except orjson.JSONDecodeError as error:
-        raise CallError("bad_request", f"not JSON: {error}") from None
+        return loads(call.payload, call.encoding)
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
 
 
-def _to_json(value: Mapping[str, Any]) -> bytes:
-    """The JSON of a ParameterValue; empty when the parameter is not set."""
+def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
+    """The payload of a ParameterValue; empty when the parameter is not set."""
     kind = value["type"]
-    return orjson.dumps(value[_FIELDS[kind][0]]) if 0 < kind < len(_FIELDS) else b""
+    if not 0 < kind < len(_FIELDS):
+        return b""
+    plain = value[_FIELDS[kind][0]]
+    if encoding == "cbor" and kind == _BYTES:
+        plain = pybase64.b64decode(plain)
+    return dumps(plain, encoding)
 
 
 def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
@@ -438,7 +493,7 @@ def _to_bytes(name: str, value: Any) -> bytes:
     try:
         if isinstance(value, str):
             return pybase64.b64decode(value, validate=True)
-        if isinstance(value, list):
+        if isinstance(value, (bytes, list)):
             return bytes(value)
     except (TypeError, ValueError):
         pass
@@ -459,5 +514,8 @@ def _unlike(name: str, expected: str, value: Any) -> CallError:
 
 
 def _short(value: Any) -> str:
-    text = orjson.dumps(value).decode()
+    try:
+        text = orjson.dumps(value).decode()
+    except TypeError:  # what only CBOR has
+        text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}…"

@@ -5,14 +5,18 @@ about it in properties.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
+
+import orjson
 
 from appliance.mqtt.codec import Properties, Property
+from appliance.ros import cbor
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import NO_BINARY, Converter, image_format
 from appliance.ros.definitions import UnknownTypeError
 
 Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "binary"]
+CallEncoding: TypeAlias = Literal["json", "cbor", "cdr"]
 Compression: TypeAlias = Literal["none", "zstd"]
 
 CONTENT_TYPE = {
@@ -21,6 +25,12 @@ CONTENT_TYPE = {
     "text": "text/plain",
     "cdr": "application/cdr",
     "binary": "application/octet-stream",
+}
+
+_OF_CONTENT_TYPE: dict[str, CallEncoding] = {
+    "application/json": "json",
+    "application/cbor": "cbor",
+    "application/cdr": "cdr",
 }
 
 #: What a user property is called that names the compression, MQTT having no property for it.
@@ -138,6 +148,29 @@ def unpacker(
 def too_large(size: int, largest: int) -> str:
     """What is wrong with a payload for ROS that would hold up all others for too long."""
     return f"it has {size} bytes, at most {largest} are converted (bridge.limits.payload)"
+
+
+def named_encoding(content_type: object) -> CallEncoding | None:
+    """The encoding of calls that a content type names, with or without parameters behind it."""
+    if not isinstance(content_type, str):
+        return None
+    return _OF_CONTENT_TYPE.get(content_type.partition(";")[0].strip().lower())
+
+
+def dumps(value: object, encoding: CallEncoding) -> bytes:
+    """JSON or CBOR of a value that is no ROS message; JSON where the encoding is `cdr`, which has
+    no words for it."""
+    return cbor.dumps(value) if encoding == "cbor" else orjson.dumps(value)
+
+
+def loads(payload: bytes, encoding: CallEncoding) -> Any:
+    """The value of JSON or CBOR. Raises ConversionError."""
+    if encoding == "cbor":
+        return cbor.loads(payload)
+    try:
+        return orjson.loads(payload)
+    except orjson.JSONDecodeError as error:
+        raise ConversionError("", f"not JSON: {error}") from None
 
 
 def claim(properties: Properties, name: str) -> str | None:

@@ -87,6 +87,11 @@ class Requests:
             if waiting.answer.cancelled():
                 self._soon(partial(self._give_up, key, waiting))
 
+    def problem(self, service: str, type_name: str) -> str | None:
+        """Why a service that is there cannot be asked; from any thread."""
+        problem = self._unusable.get((service, type_name))
+        return problem[1] if problem else None
+
     def keep_ready(self, services: Iterable[Key]) -> None:
         """Have a client ready for each of these while they are on the bus."""
         self._pinned = frozenset(services)

@@ -305,8 +305,10 @@ async def test_the_appliance_tells_how_it_is_on_ros_on_mqtt_and_at_its_door(tmp_
         )
         assert topic["messages"] > 0
         assert topic["latency_ms"]["p50"] > 0
-        heading, row = (await ask()).stdout.splitlines()
+        heading, row, *skipped = (await ask()).stdout.splitlines()
         assert heading.split()[:3] == ["ROS", "MQTT", "TYPE"]
         assert row.split()[:4] == ["/some/text", "→", f"{ROBOT}/some/text", STRING]
+        assert skipped[:2] == ["", "skipped: 1 left out"]
+        assert skipped[2].split() == ["/some/raw", "→", STRING, "left", "out", "by", "!/some/raw"]
     finally:
         appliance.stop()

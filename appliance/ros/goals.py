@@ -1,0 +1,139 @@
+"""What an action's messages are on MQTT: goals, feedback, results, status, and what to cancel.
+
+In JSON and CBOR a goal's id is 32 hex digits and its status a word. In CDR they are what ROS has
+for them: the answers, and what `_cancel` takes, are `action_msgs/msg/GoalInfo` and
+`action_msgs/srv/CancelGoal_Response`, a result is the whole response of `get_result`, and the
+status is `action_msgs/msg/GoalStatusArray`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from typing import Any
+
+from appliance.ros.calls import Answer, CallError
+from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.payloads import CallEncoding, dumps, loads
+
+CANCEL = "action_msgs/srv/CancelGoal"
+GOAL_INFO = "action_msgs/msg/GoalInfo"
+STATUS = "action_msgs/msg/GoalStatusArray"
+
+#: Stands for all goals.
+ALL = bytes(16)
+
+#: By the numbers of action_msgs/msg/GoalStatus.
+_STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
+
+#: Of these, those of a goal that goes on.
+_GOING_ON = (1, 2)
+
+#: In CDR, where the 16 bytes of the id begin that a goal and its feedback follow. They stand at a
+#: multiple of 8, the largest alignment: what follows them is aligned as it is by itself.
+_ID_AT = 4
+
+_WHICH = (
+    'say which goal: {"goal_id": "…"}, the 32 hex digits of its id; {"stamp": {"sec": …, '
+    '"nanosec": …}} for all that were accepted until then; or {"all": true}'
+)
+
+
+def with_id(goal: bytes, id_: bytes) -> bytes:
+    """The CDR of the request of `send_goal`."""
+    return goal[:_ID_AT] + id_ + goal[_ID_AT:]
+
+
+def split_id(cdr: bytes) -> tuple[bytes, bytes]:
+    """The goal's id and the feedback's CDR, of a message with both."""
+    return cdr[_ID_AT : _ID_AT + 16], cdr[:_ID_AT] + cdr[_ID_AT + 16 :]
+
+
+def id_of(uuid: dict[str, str]) -> bytes:
+    """The bytes of a `unique_identifier_msgs/msg/UUID`, as converters give it."""
+    return base64.b64decode(uuid["uuid"])
+
+
+def accepted(
+    converters: Converters, id_: bytes, stamp: dict[str, int], encoding: CallEncoding
+) -> Answer:
+    """The answer to a goal that was accepted."""
+    if encoding == "cdr":
+        info = {"goal_id": {"uuid": id_}, "stamp": stamp}
+        return Answer(converters.get(GOAL_INFO).from_dict(info), "cdr", GOAL_INFO)
+    return Answer(dumps({"goal_id": id_.hex(), "stamp": stamp}, encoding), encoding)
+
+
+def status_of(result: bytes) -> str:
+    """The status in a response of `get_result`."""
+    return _state(result[4] if len(result) > 4 else 0)
+
+
+def result(converters: Converters, action: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of a response of `get_result`. Raises ConversionError."""
+    if encoding == "cdr":
+        return cdr
+    converter = converters.get(f"{action}_GetResult_Response")
+    said = converter.to_cbor_value(cdr) if encoding == "cbor" else converter.to_dict(cdr)
+    return dumps({"status": status_of(cdr), "result": said["result"]}, encoding)
+
+
+def statuses(converters: Converters, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of what a server says of its goals. Raises ConversionError."""
+    if encoding == "cdr":
+        return cdr
+    goals: list[dict[str, Any]] = [
+        {
+            "goal_id": id_of(one["goal_info"]["goal_id"]).hex(),
+            "status": _state(one["status"]),
+            "stamp": one["goal_info"]["stamp"],
+        }
+        for one in converters.get(STATUS).to_dict(cdr)["status_list"]
+    ]
+    return dumps(goals, encoding)
+
+
+def going_on(converters: Converters, cdr: bytes) -> list[bytes]:
+    """The ids of the goals that go on, of what a server says. Raises ConversionError."""
+    return [
+        id_of(one["goal_info"]["goal_id"])
+        for one in converters.get(STATUS).to_dict(cdr)["status_list"]
+        if one["status"] in _GOING_ON
+    ]
+
+
+def which(
+    converters: Converters, payload: bytes, encoding: CallEncoding
+) -> tuple[bytes, dict[str, int]]:
+    """The goals that a call of `_cancel` means, in ROS's words: the id of one; or ALL, of those
+    that were accepted up to a time, and for the time 0 of all there are. Raises CallError.
+
+    With an id and a time ROS cancels that goal and all before it. Here it is that goal alone: who
+    sends back what its goal was answered with means no other.
+    """
+    info = converters.get(GOAL_INFO)
+    try:
+        if encoding == "cdr":
+            said = info.to_dict(payload)
+            id_: object = id_of(said["goal_id"])
+        else:
+            value = loads(payload, encoding)
+            if value == {"all": True}:
+                value = {"stamp": {}}
+            if not isinstance(value, dict) or not value or value.keys() - {"goal_id", "stamp"}:
+                raise CallError("bad_request", _WHICH)
+            id_ = value.get("goal_id", ALL)
+            if isinstance(id_, str):
+                id_ = binascii.unhexlify(id_.replace("-", ""))
+            said = info.to_dict(info.from_dict({"stamp": value.get("stamp", {})}))
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
+    except ValueError:
+        raise CallError("bad_request", f"goal_id: {_WHICH}") from None
+    if not isinstance(id_, bytes) or len(id_) != len(ALL):
+        raise CallError("bad_request", f"goal_id: {_WHICH}")
+    return id_, said["stamp"] if id_ == ALL else {}
+
+
+def _state(number: int) -> str:
+    return _STATES[number] if 0 <= number < len(_STATES) else "unknown"
