@@ -12,7 +12,7 @@ from raw_client import RawClient
 from wall_clock import HOUR, YEAR, WallClock
 
 from appliance.clock import RELEASED, StepWatch, is_unset
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Connack,
     Disconnect,
@@ -35,7 +35,7 @@ def lasting(seconds: int) -> dict[str, Any]:
 
 
 def expiring(payload: bytes, seconds: int, **fields: Any) -> Publish:
-    interval = {Property.MESSAGE_EXPIRY_INTERVAL: seconds}
+    interval: Properties = {Property.MESSAGE_EXPIRY_INTERVAL: seconds}
     return Publish(INBOX, payload, 1, properties=interval, **fields)
 
 

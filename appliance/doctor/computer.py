@@ -25,6 +25,9 @@ BASE_MEMORY = 160 << 20
 LEAST_DISK = 64 << 20
 LEAST_FILES = 100
 
+#: The seconds of DDS have 32 bits.
+FAST_DDS_ENDS = datetime.fromtimestamp((1 << 31) - 1, timezone.utc)
+
 _MIB = 1 << 20
 _UNSYNCHRONISED = 0x40  # STA_UNSYNC, adjtimex(2)
 _IN_MEMORY = ("tmpfs", "ramfs")
@@ -43,6 +46,9 @@ def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
             f"({RELEASED:%Y-%m-%d}): logs have wrong dates, and certificates are not checked "
             "for being too early"
         )
+        yield Finding("problem", "clock", text, advice)
+    elif now > FAST_DDS_ENDS:
+        text = f"it says {now:%Y-%m-%d}: after 2038 Fast DDS, and with it ROS 2, publishes nothing"
         yield Finding("problem", "clock", text, advice)
     elif is_synchronised() is False:
         text = f"{now:%Y-%m-%d %H:%M} UTC, and nothing keeps it right"

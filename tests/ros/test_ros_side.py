@@ -8,12 +8,15 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
 import pytest
 import yaml
 
+from appliance import config
+from appliance.doctor import ros as doctor
 from appliance.environment import for_other_programs
 from appliance.ros import ros2
 from appliance.ros.bridge import Bridge
@@ -115,6 +118,36 @@ async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
     house = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
     await until(lambda: house.bridge.problem, "the problem")
     assert "not a remapping" in house.bridge.problem
+
+
+def test_latency_is_that_of_a_clock_that_was_set_meanwhile(monkeypatch):
+    """What is measured is what has come since the subscription, whatever the clock says now."""
+    wall, counted = 2_000 * 10**9, 500 * 10**9
+    since = counted - 10 * 10**9
+    monkeypatch.setattr(ros2.time, "monotonic_ns", lambda: counted)
+    for jump in (0, 3600, -3600, 10**9, -(10**9)):
+        now = wall + jump * 10**9
+        monkeypatch.setattr(ros2.time, "time_ns", lambda now=now: now)
+        for age, is_timed in ((10**6, True), (9 * 10**9, True), (11 * 10**9, False)):
+            published_at = ros2._published_at({"source_timestamp": now - age}, since)
+            assert published_at == (now - age if is_timed else 0)
+
+
+async def test_the_doctor_sees_who_is_there(start, peer):
+    settings = config.loads("bridge: {topics: []}", Path("appliance.yaml"))
+    found = await asyncio.to_thread(lambda: list(doctor.ros(settings, None)))
+    by_subject = {finding.subject: finding for finding in found}
+    assert by_subject["ROS nodes"].text.startswith("seen: 1 (/peer), with ")
+    assert by_subject["ROS"].level == by_subject["ROS network"].level == "ok"
+    house = start()
+    await until(lambda: house.bridge.peers == 1, "the peer")
+    running = {"ros": {"state": "joined", "node": "/appliance"}}
+    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    assert [finding.text.partition(",")[0] for finding in found] == ["seen: 1 (/peer)"]
+    running["ros"]["node"] = "/elsewhere"
+    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    assert [finding.level for finding in found] == ["problem"]
+    assert "/elsewhere, is not seen" in found[0].text
 
 
 async def test_a_bus_that_is_late_is_joined_when_it_is_there(start, peer, monkeypatch):
