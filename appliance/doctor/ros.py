@@ -19,8 +19,8 @@ from appliance.config import Settings
 from appliance.doctor.finding import Finding
 from appliance.ros.ros2 import Ros2Node, available
 
-#: Seconds in which other nodes are looked for: most answer in a tenth of one, some take two.
-PATIENCE = 3.0
+#: Seconds in which other nodes are looked for: most are seen in a tenth of one, some take three.
+PATIENCE = 5.0
 #: The least, when some have been seen: how many there are is still to be said.
 LEAST_PATIENCE = 1.0
 
@@ -170,7 +170,10 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
     """Be a node for a moment, and see who else is there."""
     bridge = settings.bridge
     node = Ros2Node(NODE, bridge.namespace, bridge.domain_id)
-    seen = _Seen(node)
+    ours = None
+    if running is not None and running["ros"].get("state") == "joined":
+        ours = running["ros"]["node"]
+    seen = _Seen(node, ours)
     node.start(seen.look, seen.failed)
     try:
         seen.wait()
@@ -180,15 +183,12 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
     if seen.problem:
         yield Finding("problem", subject, f"ROS cannot be joined: {seen.problem}")
         return
-    ours = None
-    if running is not None and running["ros"].get("state") == "joined":
-        ours = running["ros"]["node"]
     if ours is not None and ours not in seen.nodes:
         text = f"the running appliance, {ours}, is not seen: nodes do not find each other here"
         advice = "the same RMW_IMPLEMENTATION, ROS_DOMAIN_ID and discovery range for all of them"
         yield Finding("problem", subject, text, advice)
         return
-    others = sorted(name for name in seen.nodes if name != ours)
+    others = sorted(seen.nodes - {ours or ""})
     if not others:
         advice = (
             "start one (ros2 run demo_nodes_cpp talker); if it is running, compare "
@@ -205,17 +205,19 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
 class _Seen:
     """What a node sees; `look` and `failed` are called on its thread."""
 
-    def __init__(self, node: Ros2Node) -> None:
+    def __init__(self, node: Ros2Node, ours: str | None) -> None:
+        """`ours` is the running appliance's node: others are still waited for when it was seen."""
         self.nodes: set[str] = set()
         self.topics: set[str] = set()
         self.problem = ""
         self._node = node
+        self._ours = {node.name, ours}
         self._is_done = threading.Event()
 
     def look(self) -> None:
         self.nodes = {name for name in self._node.nodes() if name != self._node.name}
         self.topics = set(self._node.topics()) - _OF_EVERY_NODE
-        if self.nodes:
+        if self.nodes - self._ours:
             self._is_done.set()
 
     def failed(self, reason: str) -> None:
