@@ -85,7 +85,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
 
         for number, ahead in enumerate((HOUR, -HOUR, 30 * YEAR, -56 * YEAR), 1):
             heard = time.monotonic()
-            silent = join("silent", 5, keep_alive=3)
+            silent = join("silent", 5, keep_alive=2)
             clock.set(ahead)
             while process.log.count(SET) < number:  # it looks once a second
                 assert time.monotonic() - heard < PATIENCE, process.log
@@ -97,7 +97,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         # Who is silent is disconnected, and not before its time.
         told_why = silent.decode(silent.receive())
         assert told_why == Disconnect(ReasonCode.KEEP_ALIVE_TIMEOUT)
-        assert 4.5 <= time.monotonic() - heard < 10
+        assert 3 <= time.monotonic() - heard < 3 + PATIENCE
         eventually(lambda: wills or listen(), "the will")
         assert len(wills) == 1 and 3 <= wills[0] - died < 3 + PATIENCE
         assert "clock was set forward by 1:00:00" in (tmp_path / "house/audit.jsonl").read_text()
