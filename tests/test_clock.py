@@ -7,7 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from appliance_process import ROBOT, ApplianceProcess
+from appliance_process import PATIENCE, ROBOT, ApplianceProcess, eventually
 from raw_client import RawClient
 from wall_clock import HOUR, YEAR, WallClock
 
@@ -24,10 +24,10 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 
 INBOX, WILLS = f"{ROBOT}/inbox", f"{ROBOT}/wills"
-ACL = f"user alice\ntopic readwrite {ROBOT}/#\n"
+#: Nobody has a password: to check one takes longer than all the rest.
+ACL = f"topic readwrite {ROBOT}/#\n"
 
-#: Seconds that the broker is given to look at its clocks, which it does every second.
-LOOK = 1.3
+SET = "the computer's clock was set"
 
 
 def lasting(seconds: int) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def left(publish: Publish) -> int:
 def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
     clock = WallClock(tmp_path / "clock")
     process = ApplianceProcess(
-        tmp_path / "house", acl=ACL, broker={"audit": {"path": "audit.jsonl"}}
+        tmp_path / "house", acl=ACL, broker={"audit": {"path": "audit.jsonl"}, "anonymous": True}
     )
     process.environment = clock.environment
     process.start()
@@ -58,7 +58,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
     def join(client_id: str, version: int = 5, **fields: Any) -> RawClient:
         client = RawClient(process, version)
         clients.append(client)
-        connack = client.decode(client.connect(client_id, **fields))
+        connack = client.decode(client.connect(client_id, None, **fields))
         assert isinstance(connack, Connack) and connack.reason_code == 0
         return client
 
@@ -69,7 +69,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
             sleeper.receive()
             sleeper.send(Disconnect())
         began = time.monotonic()
-        old, new = join("old", 4, keep_alive=2), join("new", 5, keep_alive=2)
+        old, new = join("old", 4, keep_alive=5), join("new", 5, keep_alive=5)
         old.send(Subscribe(1, [Subscription(WILLS, 1)]))
         old.receive()
         new.send(expiring(b"for long", 600, packet_id=1), expiring(b"not for long", 2, packet_id=2))
@@ -80,22 +80,27 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         died = time.monotonic()
 
         wills: list[float] = []
-        for ahead in (HOUR, -HOUR, 30 * YEAR, -56 * YEAR):
-            silent = join("silent", 5, keep_alive=3)
+
+        def listen() -> None:
+            wills.extend(time.monotonic() for got in old.drain() if isinstance(got, Publish))
+
+        for number, ahead in enumerate((HOUR, -HOUR, 30 * YEAR, -56 * YEAR), 1):
             heard = time.monotonic()
+            silent = join("silent", 5, keep_alive=2)
             clock.set(ahead)
-            while time.monotonic() - heard < LOOK:
-                wills += [time.monotonic() for got in old.drain() if isinstance(got, Publish)]
+            while process.log.count(SET) < number:  # it looks once a second
+                assert time.monotonic() - heard < PATIENCE, process.log
+                listen()
                 new.drain()
                 time.sleep(0.1)
-        told = process.wait_for_log("clock was set (forward|back) by ", 4)
+        told = process.wait_for_log(SET, 4)
         assert "forward by 1:00:00" in told[0] and "back by 2:00:00" in told[1]
         # Who is silent is disconnected, and not before its time.
         told_why = silent.decode(silent.receive())
         assert told_why == Disconnect(ReasonCode.KEEP_ALIVE_TIMEOUT)
-        assert 4.4 < time.monotonic() - heard < 8
-        [delivered] = wills
-        assert 3 <= delivered - died < 5
+        assert 3 <= time.monotonic() - heard < 3 + PATIENCE
+        eventually(lambda: wills or listen(), "the will")
+        assert len(wills) == 1 and 3 <= wills[0] - died < 3 + PATIENCE
         assert "clock was set forward by 1:00:00" in (tmp_path / "house/audit.jsonl").read_text()
 
         # And through a restart, by a clock that says something else again.
@@ -103,12 +108,12 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         clock.set(HOUR)
         process.start()
         elapsed = time.monotonic() - began
-        assert elapsed > 4
+        assert elapsed > 4  # the short session's time
         with RawClient(process, 5) as client:
-            connack = client.decode(client.connect("short", **lasting(4)))
+            connack = client.decode(client.connect("short", None, **lasting(4)))
             assert isinstance(connack, Connack) and not connack.session_present
         with RawClient(process, 5) as client:
-            connack = client.decode(client.connect("long", **lasting(1000)))
+            connack = client.decode(client.connect("long", None, **lasting(1000)))
             assert isinstance(connack, Connack) and connack.session_present
             owed = [got for got in client.drain() if isinstance(got, Publish)]
             client.send(Subscribe(1, [Subscription(INBOX, 0)]))
@@ -116,7 +121,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         assert [publish.payload for publish in owed] == [b"for long", b"kept"]
         assert retained.payload == b"kept"
         for publish in (*owed, retained):
-            assert 600 - elapsed - 2 <= left(publish) <= 600 - elapsed + 2
+            assert 598 - (time.monotonic() - began) <= left(publish) <= 602 - elapsed
     finally:
         for client in clients:
             client.socket.close()
