@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import psutil
 
 from appliance.config import Settings
 from appliance.doctor.finding import Finding
+from appliance.ros import installation
 from appliance.ros.ros2 import Ros2Node, available
 
 #: Seconds in which other nodes are looked for: most are seen in a tenth of one, some take three.
@@ -62,23 +61,17 @@ def _has_routes(settings: Settings) -> bool:
 def which_ros(is_needed: bool) -> Finding:
     """Which ROS 2 is used, and from where; without one the broker works alone."""
     is_available, reason = available()
-    spec = find_spec("rclpy")
-    if not is_available or spec is None or spec.origin is None:
+    if not is_available:
         what, _, advice = reason.partition(". ")
         return Finding("problem" if is_needed else "warning", "ROS", what, advice)
-    distribution = os.environ.get("ROS_DISTRO")
-    name = f"ROS 2 {distribution}" if distribution else "ROS 2"
-    python = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    folder = Path(spec.origin).parent
-    text = f"{name} in {folder.parent}, for Python {python}"
-    extensions = [path.name for path in folder.glob("_rclpy_pybind11.*.so")]
-    if extensions and not any(
-        f"-{sys.version_info[0]}{sys.version_info[1]}" in e for e in extensions
-    ):
-        advice = f"install this with the Python that {name} is for: pip install ros-mqtt-appliance"
-        text = f"{name} in {folder.parent} is not for this Python, {python}"
-        return Finding("problem", "ROS", text, advice)
-    return Finding("ok", "ROS", text)
+    found = installation.find()
+    python = ".".join(map(str, found.python))
+    text = (
+        str(found.sourced)
+        if found.source == "sourced"
+        else f"ROS 2 in {found.where}, {found.source} (Python {python})"
+    )
+    return Finding("warning" if found.advice else "ok", "ROS", text, found.advice)
 
 
 def _discovery(settings: Settings) -> Iterator[Finding]:

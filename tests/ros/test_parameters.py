@@ -212,7 +212,7 @@ def test_what_may_have_any_type_takes_it_from_the_value():
 
 
 async def test_names_that_make_no_topic_hide_no_others(house):
-    house.start(parameters("/arm"))
+    house.start(parameters("/arm/*"))
     arm = Declaring(house, **{"speed": 1, "a+b": 1, "x" * 70_000: 1})
     house.node.spin()
     await shown(house, "speed", 1)
