@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import logging
 import os
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -23,16 +25,21 @@ from appliance.ros.node import (
     QosProfile,
     Reliability,
     Respond,
+    RosSubscription,
+    TakeLot,
+)
+from appliance.ros.ros2_loop import (
+    FIRST_TIMED,
+    ONE_TIMED_OF,
+    LoopSubscription,
+    UnavailableError,
+    published_at,
 )
 
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
-
-#: How many messages of a subscription are timed first, and of how many one is then.
-FIRST_TIMED = 100
-ONE_TIMED_OF = 16
 
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -119,8 +126,16 @@ class Ros2Node:
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        self._loop = loop
         is_available, reason = available()
         if not is_available:
             failed(reason)
@@ -197,6 +212,8 @@ class Ros2Node:
                 raise
 
     def _leave(self) -> None:
+        for subscription in list(self._on_loop):
+            subscription.destroy()
         if self._executor is not None:
             self._executor.shutdown()
         if self._node is not None:
@@ -267,8 +284,15 @@ class Ros2Node:
         callback: Callable[..., None],
         *,
         timed: bool = False,
-    ) -> _Subscription:
+        on_loop: TakeLot | None = None,
+    ) -> RosSubscription:
         message_class = import_message(type_name)
+        if on_loop is not None and self._loop is not None:
+            try:
+                return self._subscribe_on_loop(message_class, topic, qos, callback, on_loop)
+            except UnavailableError as reason:
+                log.info("the ROS thread takes all messages: %s", reason)
+                self._loop = None
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
         if timed and not self._is_event_driven:
             callback = _with_time(callback)
@@ -280,6 +304,38 @@ class Ros2Node:
             own.__class__ = _timed_subscription()
             own.since = time.time_ns()
         return _Subscription(self._node, own)
+
+    def _subscribe_on_loop(
+        self,
+        message_class: type[Any],
+        topic: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        on_loop: TakeLot,
+    ) -> LoopSubscription:
+        """Raises BusError, UnavailableError."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+        from rclpy.type_support import check_is_valid_msg_type
+
+        assert self._loop is not None
+        middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
+        if not middleware.startswith("rmw_fastrtps"):
+            raise UnavailableError(f"it has not been tried with {middleware}")
+        check_is_valid_msg_type(message_class)  # it also loads what the type needs
+        with _as_bus_error(ValueError), self._node.handle:
+            # What rclpy would make has to be told to the node, and with it to the executor.
+            handle = rclpy_implementation.Subscription(
+                self._node.handle, message_class, topic, _to_rclpy(qos).get_c_qos_profile()
+            )
+        try:
+            own = LoopSubscription(
+                handle, message_class, self._loop, self.call_soon, callback, on_loop
+            )
+        except UnavailableError:
+            handle.destroy_when_not_in_use()
+            raise
+        self._on_loop.add(own)
+        return own
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
         message_class = import_message(type_name)
@@ -423,10 +479,10 @@ def _errors() -> tuple[type[Exception], ...]:
 
 
 @contextmanager
-def _as_bus_error() -> Iterator[None]:
+def _as_bus_error(*more: type[Exception]) -> Iterator[None]:
     from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
 
-    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException)
+    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException, *more)
     try:
         yield
     except refusals + _errors() as error:
@@ -457,15 +513,9 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
             callback(cdr)
             return
         until_timed = ONE_TIMED_OF
-        callback(cdr, _published_at(info, since))
+        callback(cdr, published_at(info, since))
 
     return timed
-
-
-def _published_at(info: Any, since: int) -> int:
-    """0 for what was published before `since`, and kept for late subscribers."""
-    published_at = int(info["source_timestamp"])
-    return published_at if published_at > since else 0
 
 
 @functools.cache
@@ -497,7 +547,7 @@ def _timed_subscription() -> Any:
             self._until_timed = 1 if self._timed < FIRST_TIMED else ONE_TIMED_OF
             taken = self.handle.take_message(self.msg_type, True)
             if taken is not None:
-                self._callback(taken[0], _published_at(taken[1], self.since))
+                self._callback(taken[0], published_at(taken[1], self.since))
 
     return TimedSubscription
 

@@ -644,7 +644,7 @@ def test_echo_knows_padding_and_forgets(monkeypatch):
 
 
 async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
-    house.node.start = lambda poll, failed: None
+    house.node.start = lambda poll, failed, loop: None
     house.start(to_ros("/cmd_vel", type=TWIST))
     assert house.routes() == []
     house.client.send("r2d2/cmd_vel", b"{}")
@@ -654,7 +654,7 @@ async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
 
 
 async def test_ros_missing_is_one_clear_line(house, caplog):
-    house.node.start = lambda poll, failed: failed("there is no ROS 2 here")
+    house.node.start = lambda poll, failed, loop: failed("there is no ROS 2 here")
     bridge = house.start(to_mqtt("/a"), to_ros("/b"))
     await house.settle()
     assert [r.getMessage() for r in caplog.records] == [
