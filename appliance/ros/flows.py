@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, Property, encode_string
+from appliance.mqtt.codec import Properties, Property, encode_property_list, encode_string
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters, Meter
@@ -357,6 +357,9 @@ class ToMqtt(Flow):
         self._subscription: RosSubscription | None = None
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._topic_wire = encode_string(self.mqtt)
+        #: The properties of the last message, most often those of the next, and their bytes.
+        self._properties: Properties = {}
+        self._properties_wire = b""
         self._qos = 0
         self._retain = False
 
@@ -437,8 +440,17 @@ class ToMqtt(Flow):
             return None
         if self._bytes_per_second:
             self._budget -= len(payload)
+        if properties is not self._properties:
+            self._properties, self._properties_wire = properties, encode_property_list(properties)
         message = Watched(
-            self.mqtt, payload, self._qos, self._retain, properties, None, self._topic_wire
+            self.mqtt,
+            payload,
+            self._qos,
+            self._retain,
+            properties,
+            None,
+            self._topic_wire,
+            self._properties_wire,
         )
         message.watcher = self.counters
         if published_at:
