@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
 
-_PROFILE = Path(__file__).parent.parent / "fastdds.xml"
+_PROFILES = Path(__file__).parent.parent
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
@@ -69,15 +69,20 @@ def available() -> tuple[bool, str]:
 
 def _resources(kind: str) -> Iterator[str]:
     """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
+    for folder in _shares():
+        index = folder / "ament_index" / "resource_index" / kind
+        if index.is_dir():
+            yield from (entry.name for entry in index.iterdir())
+
+
+def _shares() -> Iterator[Path]:
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    for prefix in (*prefixes, sys.prefix):
-        folder = Path(prefix, "share", "ament_index", "resource_index", kind)
-        if folder.is_dir():
-            yield from (entry.name for entry in folder.iterdir())
+    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
 
 
 def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
-    """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
+    """Let Fast DDS read our profile (fastdds.xml: room for images, fewer wake-ups); False when it
+    must not.
 
     The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
     `ROS_LOCALHOST_ONLY`.
@@ -91,8 +96,10 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
     ):
         return False
     # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
-    is_old = "fastrtps" in _resources("packages")
-    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(_PROFILE)
+    is_old = any((share / "fastrtps").is_dir() for share in _shares())
+    name = "fastrtps" if is_old else "fastdds"
+    variable = f"{name.upper()}_DEFAULT_PROFILES_FILE"
+    environment[variable] = str(_PROFILES / f"{name}.xml")
     return True
 
 

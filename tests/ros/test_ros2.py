@@ -281,7 +281,7 @@ async def test_images_pass_through_the_larger_shared_memory(house):
     await until(lambda: house.bridged(), "the node")
     assert max(size for name, size in shared_memory().items() if name not in before) > 32 << 20
     profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
-    assert list(profile.values()) == [str(Path(ros2.__file__).parent.parent / "fastdds.xml")]
+    assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent.parent]
     peer = await Peer().start("camera", **profile)
     try:
         await peer.do("advertise", "/image", BYTES)
