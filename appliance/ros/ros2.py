@@ -85,18 +85,18 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
     must not.
 
     The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
-    `ROS_LOCALHOST_ONLY`.
+    `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
     """
+    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
+    is_old = any((share / "fastrtps").is_dir() for share in _shares())
     if (
         not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
         or "FASTDDS_BUILTIN_TRANSPORTS" in environment
-        or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
+        or (is_old and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
         or any(variable in environment for variable in _PROFILE_VARIABLES)
         or any(Path(file).exists() for file in _PROFILE_FILES)
     ):
         return False
-    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
-    is_old = any((share / "fastrtps").is_dir() for share in _shares())
     name = "fastrtps" if is_old else "fastdds"
     variable = f"{name.upper()}_DEFAULT_PROFILES_FILE"
     environment[variable] = str(_PROFILES / f"{name}.xml")

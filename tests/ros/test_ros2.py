@@ -404,13 +404,23 @@ def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
         {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
         {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
         {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
-        {"ROS_LOCALHOST_ONLY": "1"},
     ],
 )
 def test_the_users_own_settings_of_fast_dds_go_first(environment):
     before = dict(environment)
     assert not ros2.use_fastdds_profile(environment)
     assert environment == before
+
+
+def test_fast_dds_2_has_a_profile_of_its_own_and_goes_nowhere_else(tmp_path, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    (tmp_path / "share" / "fastrtps").mkdir(parents=True)
+    environment = {"ROS_LOCALHOST_ONLY": "1"}
+    assert not ros2.use_fastdds_profile(environment)
+    environment["ROS_LOCALHOST_ONLY"] = "0"
+    assert ros2.use_fastdds_profile(environment)
+    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).name == "fastrtps.xml"
+    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
 def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
