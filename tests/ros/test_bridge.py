@@ -810,3 +810,25 @@ def test_a_closed_loop_is_no_error():
     bridge.start()
     loop.close()
     node.add_publisher("/a", STRING).publish(string("late"))
+
+
+async def test_what_is_taken_on_the_loops_thread_is_on_mqtt_at_once_and_behind_what_waits(house):
+    publisher = house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", keep=10, encoding="text"))
+    publisher.publish(string("in the mailbox"))
+    house.node.takes_on_loop = True
+    publisher.publish(string("behind it"))
+    assert house.client.payloads("r2d2/a") == []
+    await house.settle()
+    publisher.publish(string("at once"))
+    assert house.client.payloads("r2d2/a") == [b"in the mailbox", b"behind it", b"at once"]
+    assert house.status().messages == 3
+
+
+async def test_what_there_was_no_room_for_on_ros_is_counted(house):
+    house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", encoding="text"))
+    (subscription,) = house.node.subscriptions
+    subscription.on_loop([(string("x"), 0)], 3)
+    assert house.status().dropped == 3
+    assert house.client.payloads("r2d2/a") == [b"x"]
