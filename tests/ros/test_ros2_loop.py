@@ -54,6 +54,22 @@ class Taker:
         for cdr, _ in lot:
             self._on_message(cdr)
 
+    async def advertised(self, peer):
+        """Both ends have found each other: the publisher alone knowing it is not enough."""
+        await peer.do("advertise", "/a", self._type)
+        await peer.do("matched", "/a")
+        probe = string("")
+
+        async def arrives():
+            await peer.do("publish", "/a", probe.hex())
+            return self.taken
+
+        while not await arrives():
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(0.1)
+        self.taken.clear()
+        self.lots.clear()
+
 
 @pytest.fixture
 async def taker():
@@ -72,8 +88,7 @@ async def taker():
 
 async def test_small_messages_are_taken_on_the_loops_thread(taker, peer):
     taker = taker()
-    await peer.do("advertise", "/a", STRING)
-    await peer.do("matched", "/a")
+    await taker.advertised(peer)
     for number in range(20):
         await peer.do("publish", "/a", string(f"{number:03d}").hex())
     await until(lambda: len(taker.taken) == 20, "all")
@@ -83,8 +98,7 @@ async def test_small_messages_are_taken_on_the_loops_thread(taker, peer):
 
 async def test_large_ones_are_left_to_the_ros_thread_and_all_stay_in_order(taker, peer):
     taker = taker(BYTES)
-    await peer.do("advertise", "/a", BYTES)
-    await peer.do("matched", "/a")
+    await taker.advertised(peer)
     small, large = 10, LARGE + 1
     sizes = [small] * 3 + [large] + [small] * (ros2_loop.SMALL_IN_A_ROW + 3) + [large, large]
     for number, size in enumerate(sizes):
@@ -103,8 +117,7 @@ async def test_large_ones_are_left_to_the_ros_thread_and_all_stay_in_order(taker
 
 async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_for(taker, peer):
     taker = taker(depth=1000)
-    await peer.do("advertise", "/a", STRING)
-    await peer.do("matched", "/a")
+    await taker.advertised(peer)
     publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 300, 2000))
     await asyncio.sleep(0.02)
     time.sleep(0.3)  # noqa: ASYNC251 - the loop has other things to do
@@ -164,8 +177,7 @@ async def test_the_ros_thread_takes_all_where_it_cannot_be_otherwise(monkeypatch
 
     monkeypatch.setattr(ros2_loop, "Doorbell", refuse)
     taker = taker()
-    await peer.do("advertise", "/a", STRING)
-    await peer.do("matched", "/a")
+    await taker.advertised(peer)
     await peer.do("publish", "/a", string("one").hex())
     await until(lambda: taker.taken, "the message")
     assert taker.taken == [("ros", string("one"))]
