@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
 
-_PROFILES = Path(__file__).parent.parent
+_PROFILE = Path(__file__).parent.parent / "fastdds.xml"
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
@@ -81,8 +81,7 @@ def _shares() -> Iterator[Path]:
 
 
 def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
-    """Let Fast DDS read our profile (fastdds.xml: room for images, fewer wake-ups); False when it
-    must not.
+    """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
 
     The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
     `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
@@ -97,9 +96,7 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
         or any(Path(file).exists() for file in _PROFILE_FILES)
     ):
         return False
-    name = "fastrtps" if is_old else "fastdds"
-    variable = f"{name.upper()}_DEFAULT_PROFILES_FILE"
-    environment[variable] = str(_PROFILES / f"{name}.xml")
+    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(_PROFILE)
     return True
 
 

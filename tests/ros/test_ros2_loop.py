@@ -64,7 +64,9 @@ class Taker:
             await peer.do("publish", "/a", probe.hex())
             return self.taken
 
-        while not await arrives():
+        for _ in range(200):
+            if await arrives():
+                break
             await asyncio.sleep(0.05)
         await asyncio.sleep(0.1)
         self.taken.clear()
