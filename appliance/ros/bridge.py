@@ -4,7 +4,9 @@ Two threads meet here. On the ROS thread the graph is looked at, subscriptions a
 made, and what ROS sends is throttled, converted and left in the mailbox. On the event loop's thread
 the mailbox is emptied into the broker, and what MQTT sends is converted and published on ROS at
 once: a conversion takes microseconds, and rclpy's publish holds the interpreter's lock all the way
-through, so that handing it to another thread would add a wake-up and free nothing.
+through, so that handing it to another thread would add a wake-up and free nothing. For the same
+reason small messages from ROS are taken, converted and published on the loop's thread right away,
+where the node can do that.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from appliance.ros.definitions import UnknownTypeError, describe
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
 from appliance.ros.graph import CallRoutes, Calls
-from appliance.ros.mailbox import Mailbox
+from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
@@ -232,7 +234,7 @@ class Bridge:
             self._broker.unsubscribe(session, topic)
 
     def _add_to_mqtt(self, route: Route, ros: str) -> None:
-        flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox)
+        flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox, self._publish)
         key = flow.ros, flow.mqtt
         if key in self._to_mqtt:
             text = "%s has a route already; the later one is left out"
@@ -272,7 +274,7 @@ class Bridge:
         self._join()
 
     def _join(self) -> None:
-        self._node.start(self._look, self._failed)
+        self._node.start(self._look, self._failed, self._loop)
 
     @property
     def state(self) -> BusState:
@@ -348,10 +350,16 @@ class Bridge:
 
     def _deliver(self) -> bool:
         """Publish what waits in the mailbox, up to a batch; True when there may be more."""
-        session = self._session
-        if session is None:
+        if self._session is None:
             return False
         batch, has_more = self._mailbox.take(BATCH)
+        self._publish(batch)
+        return has_more
+
+    def _publish(self, batch: Iterable[tuple[Lane, Message]]) -> None:
+        session = self._session
+        if session is None:
+            return
         publish = self._broker.publish
         for lane, message in batch:
             counters = lane.counters
@@ -363,7 +371,6 @@ class Bridge:
             counters.bytes += len(message.payload)
             publish(message, session)
         self._broker.flush()
-        return has_more
 
     def _announce(self) -> None:
         """Tell what is bridged, if that or a figure in it has changed."""

@@ -233,7 +233,11 @@ class Converter:
             text = payload.decode()
         except UnicodeDecodeError:
             raise ConversionError("data", "not UTF-8") from None
-        return self.from_dict({"data": _parse(type_, text)})
+        value = {"data": _parse(type_, text)}
+        try:
+            return self._encode(value)
+        except MISFIT:
+            return self.from_dict(value)
 
     def _text_field(self) -> Primitive | String | WideString:
         if self._text_type is None:

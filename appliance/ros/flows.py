@@ -18,7 +18,13 @@ from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, Property, encode_string, quote
+from appliance.mqtt.codec import (
+    Properties,
+    Property,
+    encode_property_list,
+    encode_string,
+    quote,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters, Meter
@@ -369,11 +375,14 @@ class ToMqtt(Flow):
         converters: Converters,
         tell: Tell,
         mailbox: Mailbox,
+        publish: Callable[[Iterable[tuple[Lane, Message]]], None],
     ) -> None:
+        """`publish` is how messages leave that are on the loop's thread already."""
         super().__init__(route, ros, converters, tell)
         settings = route.settings
         self.echo: Echo | None = None
         self._mailbox = mailbox
+        self._publish = publish
         self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
         self._due = 0.0
@@ -383,6 +392,9 @@ class ToMqtt(Flow):
         self._subscription: RosSubscription | None = None
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._topic_wire = encode_string(self.mqtt)
+        #: The properties of the last message, most often those of the next, and their bytes.
+        self._properties: Properties = {}
+        self._properties_wire = b""
         self._qos = 0
         self._retain = False
 
@@ -410,7 +422,7 @@ class ToMqtt(Flow):
         self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
         self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
         self._subscription = node.subscribe_raw(
-            self.ros, type_name, qos, self.on_message, timed=True
+            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
         )
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
@@ -425,28 +437,60 @@ class ToMqtt(Flow):
         self._subscription = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
-        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch.
+        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
+        message = self._convert(cdr, published_at)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
+
+    def on_lot(self, lot: list[tuple[bytes, int]], lost: int) -> None:
+        """The same for messages that the loop's thread has taken itself. Nobody else has them then,
+        and but for those that may still be in the mailbox they go straight to the broker."""
+        self.counters.dropped += lost
+        lane = self._lane
+        batch = []
+        for cdr, published_at in lot:
+            message = self._convert(cdr, published_at)
+            if message is None:
+                continue
+            if lane.waiting:
+                self._mailbox.put(lane, message)
+            else:
+                batch.append((lane, message))
+        if batch:
+            self._publish(batch)
+
+    def _convert(self, cdr: bytes, published_at: int) -> Message | None:
+        """The message for MQTT; None for one that does not go there.
 
         Nothing may be logged by ROS here: it would feed /rosout.
         """
         if self.echo is not None and self.echo.is_own(cdr):
-            return
+            return None
         if (self._interval or self._bytes_per_second) and not self._admit(monotonic()):
-            return
+            return None
         try:
             payload, properties = self._pack(cdr)
         except ConversionError as error:
             self.fail(f"cannot be converted: {error}")
-            return
+            return None
         if self._bytes_per_second:
             self._budget -= len(payload)
+        if properties is not self._properties:
+            self._properties, self._properties_wire = properties, encode_property_list(properties)
         message = Watched(
-            self.mqtt, payload, self._qos, self._retain, properties, None, self._topic_wire
+            self.mqtt,
+            payload,
+            self._qos,
+            self._retain,
+            properties,
+            None,
+            self._topic_wire,
+            self._properties_wire,
         )
         message.watcher = self.counters
         if published_at:
             self._lane.timed = message, published_at
-        self._mailbox.put(self._lane, message)
+        return message
 
     def _admit(self, now: float) -> bool:
         """Whether a message at that time keeps to the rate, as an average over uneven ones, and to

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -70,7 +71,8 @@ class RosSubscription(Protocol):
     """A subscription of this node."""
 
     def destroy(self) -> None:
-        """End it: the callback is not called again. On the ROS thread."""
+        """End it: the callback is not called again, but for what the loop's thread has taken
+        already. On the ROS thread."""
 
 
 class RosPublisher(Protocol):
@@ -100,6 +102,11 @@ class RosClient(Protocol):
         """End it; what is under way is not answered any more."""
 
 
+#: Some messages as CDR, each with the time at which it was published, in nanoseconds since the
+#: epoch, or 0; and how many others were lost, as there was no room for more.
+TakeLot: TypeAlias = Callable[[list[tuple[bytes, int]], int], None]
+
+
 #: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
 Respond: TypeAlias = Callable[[bytes | None], None]
 
@@ -121,12 +128,18 @@ class RosNode(Protocol):
     #: The node's full name, such as `/appliance`.
     name: str
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
         """Join the bus in the background and return at once.
 
         `poll` is called when the node is there and then 5 to 10 times a second: the time to look
         at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
-        node ends by itself; nothing is called after it, until the node is started again.
+        node ends by itself; nothing is called after it, until the node is started again. `loop` is
+        the one whose thread may take messages itself.
         """
 
     def stop(self) -> None:
@@ -171,9 +184,14 @@ class RosNode(Protocol):
         callback: Callable[..., None],
         *,
         timed: bool = False,
+        on_loop: TakeLot | None = None,
     ) -> RosSubscription:
         """Call `callback` with each message, as CDR; when it is `timed`, with a few also with the
         time at which they were published, in nanoseconds since the epoch.
+
+        Where the bus can wake the event loop by itself, `on_loop` is called instead, on the loop's
+        thread, while messages are small: it saves waking the ROS thread for each of them. The two
+        are never called at once, and all messages come in their order.
 
         Raises BusError, UnknownTypeError.
         """
@@ -229,6 +247,14 @@ class FakeSubscription:
     topic: str
     endpoint: Endpoint
     callback: Callable[..., None]
+    on_loop: TakeLot | None = None
+
+    def take(self, cdr: bytes) -> None:
+        """A message has come for it."""
+        if self.bus.takes_on_loop and self.on_loop is not None:
+            self.on_loop([(cdr, 0)], 0)
+        else:
+            self.callback(cdr)
 
     def destroy(self) -> None:
         self.bus.subscriptions.remove(self)
@@ -310,13 +336,15 @@ class FakeNode:
 
     Other nodes' endpoints are added and removed by hand, and each time the bridge gets its look at
     the graph at once. Messages reach subscriptions whose QoS and type match, own ones included, as
-    on a real bus. `types` are the types that can be loaded; None: any, as an empty class.
+    on a real bus. `types` are the types that can be loaded; None: any, as an empty class. With
+    `takes_on_loop` set, the caller's thread is the loop's for those who offered to be called there.
     """
 
     def __init__(self, name: str = "/appliance", types: Mapping[str, type[Any]] | None = None):
         self.name = name
         self.types = types
         self.running = False
+        self.takes_on_loop = False
         self.remote_publishers: list[FakePeer] = []
         self.remote_subscribers: list[FakePeer] = []
         self.subscriptions: list[FakeSubscription] = []
@@ -394,11 +422,16 @@ class FakeNode:
                 peer.received.append(cdr)
         for subscription in list(self.subscriptions):
             if matches(subscription.topic, subscription.endpoint):
-                subscription.callback(cdr)
+                subscription.take(cdr)
 
     # RosNode
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
         self._poll = poll
         self._failed = failed
         self.running = True
@@ -474,9 +507,10 @@ class FakeNode:
         callback: Callable[..., None],
         *,
         timed: bool = False,
+        on_loop: TakeLot | None = None,
     ) -> FakeSubscription:
         self.load(type_name)
-        own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback)
+        own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback, on_loop)
         self.subscriptions.append(own)
         if qos.durability is Durability.TRANSIENT_LOCAL:
             for peer in self.remote_publishers:
@@ -486,7 +520,7 @@ class FakeNode:
                     and peer.endpoint.qos.satisfies(qos)
                 ):
                     for cdr in peer.latched:
-                        callback(cdr)
+                        own.take(cdr)
         return own
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> FakePublisher:

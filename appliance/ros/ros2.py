@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import logging
 import os
@@ -9,6 +10,7 @@ import re
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -24,8 +26,17 @@ from appliance.ros.node import (
     QosProfile,
     Reliability,
     Respond,
+    RosSubscription,
+    TakeLot,
 )
 from appliance.ros.reach import Reach, look_again, reach
+from appliance.ros.ros2_loop import (
+    FIRST_TIMED,
+    ONE_TIMED_OF,
+    LoopSubscription,
+    UnavailableError,
+    published_at,
+)
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +45,6 @@ POLL_INTERVAL = 0.15
 
 #: Seconds between two looks at what networks there are.
 NETWORK_INTERVAL = 2.0
-
-#: How many messages of a subscription are timed first, and of how many one is then.
-FIRST_TIMED = 100
-ONE_TIMED_OF = 16
 
 #: What ROS takes for the name of a topic or service, and no more characters than that. On DDS there
 #: may be others: asking ROS about one raises an error.
@@ -71,29 +78,33 @@ def available() -> tuple[bool, str]:
 
 def _resources(kind: str) -> Iterator[str]:
     """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
+    for folder in _shares():
+        index = folder / "ament_index" / "resource_index" / kind
+        if index.is_dir():
+            yield from (entry.name for entry in index.iterdir())
+
+
+def _shares() -> Iterator[Path]:
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    for prefix in (*prefixes, sys.prefix):
-        folder = Path(prefix, "share", "ament_index", "resource_index", kind)
-        if folder.is_dir():
-            yield from (entry.name for entry in folder.iterdir())
+    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
 
 
 def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
     """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
 
     The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
-    `ROS_LOCALHOST_ONLY`.
+    `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
     """
+    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
+    is_old = any((share / "fastrtps").is_dir() for share in _shares())
     if (
         not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
         or environment.get("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4") != "UDPv4"
-        or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
+        or (is_old and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
         or any(variable in environment for variable in _PROFILE_VARIABLES)
         or any(Path(file).exists() for file in _PROFILE_FILES)
     ):
         return False
-    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
-    is_old = "fastrtps" in _resources("packages")
     profile = _PROFILE
     if "FASTDDS_BUILTIN_TRANSPORTS" in environment:
         if not is_old:
@@ -133,8 +144,16 @@ class Ros2Node:
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        self._loop = loop
         is_available, reason = available()
         if not is_available:
             failed(reason)
@@ -220,6 +239,8 @@ class Ros2Node:
                 raise
 
     def _leave(self) -> None:
+        for subscription in list(self._on_loop):
+            subscription.destroy()
         if self._executor is not None:
             self._executor.shutdown()
         if self._node is not None:
@@ -295,8 +316,15 @@ class Ros2Node:
         callback: Callable[..., None],
         *,
         timed: bool = False,
-    ) -> _Subscription:
+        on_loop: TakeLot | None = None,
+    ) -> RosSubscription:
         message_class = load_message(type_name)
+        if on_loop is not None and self._loop is not None:
+            try:
+                return self._subscribe_on_loop(message_class, topic, qos, callback, on_loop)
+            except UnavailableError as reason:
+                log.info("the ROS thread takes all messages: %s", reason)
+                self._loop = None
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
         if timed and not self._is_event_driven:
             callback = _with_time(callback)
@@ -308,6 +336,38 @@ class Ros2Node:
             own.__class__ = _timed_subscription()
             own.since = time.monotonic_ns()
         return _Subscription(self._node, own)
+
+    def _subscribe_on_loop(
+        self,
+        message_class: type[Any],
+        topic: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        on_loop: TakeLot,
+    ) -> LoopSubscription:
+        """Raises BusError, UnavailableError."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+        from rclpy.type_support import check_is_valid_msg_type
+
+        assert self._loop is not None
+        middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
+        if not middleware.startswith("rmw_fastrtps"):
+            raise UnavailableError(f"it has not been tried with {middleware}")
+        check_is_valid_msg_type(message_class)  # it also loads what the type needs
+        with _as_bus_error(ValueError), self._node.handle:
+            # What rclpy would make has to be told to the node, and with it to the executor.
+            handle = rclpy_implementation.Subscription(
+                self._node.handle, message_class, topic, _to_rclpy(qos).get_c_qos_profile()
+            )
+        try:
+            own = LoopSubscription(
+                handle, message_class, self._loop, self.call_soon, callback, on_loop
+            )
+        except UnavailableError:
+            handle.destroy_when_not_in_use()
+            raise
+        self._on_loop.add(own)
+        return own
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
         message_class = load_message(type_name)
@@ -497,10 +557,10 @@ def _errors() -> tuple[type[Exception], ...]:
 
 
 @contextmanager
-def _as_bus_error() -> Iterator[None]:
+def _as_bus_error(*more: type[Exception]) -> Iterator[None]:
     from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
 
-    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException)
+    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException, *more)
     try:
         yield
     except refusals + _errors() as error:
@@ -531,19 +591,9 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
             callback(cdr)
             return
         until_timed = ONE_TIMED_OF
-        callback(cdr, _published_at(info, since))
+        callback(cdr, published_at(info, since))
 
     return timed
-
-
-def _published_at(info: Any, since: int) -> int:
-    """0 for what was published before `since`, and kept for late subscribers.
-
-    `since` is of the clock that only counts: the other one may have been set meanwhile.
-    """
-    published_at = int(info["source_timestamp"])
-    age = time.time_ns() - published_at
-    return published_at if age < time.monotonic_ns() - since else 0
 
 
 @functools.cache
@@ -575,7 +625,7 @@ def _timed_subscription() -> Any:
             self._until_timed = 1 if self._timed < FIRST_TIMED else ONE_TIMED_OF
             taken = self.handle.take_message(self.msg_type, True)
             if taken is not None:
-                self._callback(taken[0], _published_at(taken[1], self.since))
+                self._callback(taken[0], published_at(taken[1], self.since))
 
     return TimedSubscription
 

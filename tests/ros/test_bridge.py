@@ -646,7 +646,7 @@ def test_echo_knows_padding_and_forgets(monkeypatch):
 
 
 async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
-    house.node.start = lambda poll, failed: None
+    house.node.start = lambda poll, failed, loop: None
     house.start(to_ros("/cmd_vel", type=TWIST))
     assert house.routes() == []
     house.client.send("r2d2/cmd_vel", b"{}")
@@ -659,12 +659,12 @@ async def test_ros_missing_is_one_clear_line_and_tried_again(house, caplog, monk
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.01)
     start, attempts = house.node.start, []
 
-    def fail(poll, failed):
+    def fail(poll, failed, loop):
         attempts.append(asyncio.get_running_loop().time())
         if len(attempts) < 5:
             failed("there is no ROS 2 here")
         else:
-            start(poll, failed)
+            start(poll, failed, loop)
 
     house.node.start = fail
     bridge = house.start(to_mqtt("/a"), to_ros("/b"))
@@ -681,7 +681,7 @@ async def test_ros_missing_is_one_clear_line_and_tried_again(house, caplog, monk
 
 async def test_a_stop_ends_the_attempts(house, monkeypatch):
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.001)
-    house.node.start = lambda poll, failed: failed("there is no ROS 2 here")
+    house.node.start = lambda poll, failed, loop: failed("there is no ROS 2 here")
     await house.start(to_mqtt("/a")).stop()
     house.node.start = None
     await asyncio.sleep(0.01)
@@ -860,3 +860,25 @@ def test_a_closed_loop_is_no_error():
     bridge.start()
     loop.close()
     node.add_publisher("/a", STRING).publish(string("late"))
+
+
+async def test_what_is_taken_on_the_loops_thread_is_on_mqtt_at_once_and_behind_what_waits(house):
+    publisher = house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", keep=10, encoding="text"))
+    publisher.publish(string("in the mailbox"))
+    house.node.takes_on_loop = True
+    publisher.publish(string("behind it"))
+    assert house.client.payloads("r2d2/a") == []
+    await house.settle()
+    publisher.publish(string("at once"))
+    assert house.client.payloads("r2d2/a") == [b"in the mailbox", b"behind it", b"at once"]
+    assert house.status().messages == 3
+
+
+async def test_what_there_was_no_room_for_on_ros_is_counted(house):
+    house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", encoding="text"))
+    (subscription,) = house.node.subscriptions
+    subscription.on_loop([(string("x"), 0)], 3)
+    assert house.status().dropped == 3
+    assert house.client.payloads("r2d2/a") == [b"x"]

@@ -314,7 +314,7 @@ async def test_images_pass_through_the_larger_shared_memory(house):
     await until(lambda: house.bridged(), "the node")
     assert max(size for name, size in shared_memory().items() if name not in before) > 32 << 20
     profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
-    assert list(profile.values()) == [str(Path(ros2.__file__).parent.parent / "fastdds.xml")]
+    assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent.parent]
     peer = await Peer().start("camera", **profile)
     try:
         await peer.do("advertise", "/image", BYTES)
@@ -437,13 +437,22 @@ def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
         {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
         {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
         {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
-        {"ROS_LOCALHOST_ONLY": "1"},
     ],
 )
 def test_the_users_own_settings_of_fast_dds_go_first(environment):
     before = dict(environment)
     assert not ros2.use_fastdds_profile(environment)
     assert environment == before
+
+
+def test_fast_dds_2_has_a_variable_of_its_own_and_goes_nowhere_else(tmp_path, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    (tmp_path / "share" / "fastrtps").mkdir(parents=True)
+    environment = {"ROS_LOCALHOST_ONLY": "1"}
+    assert not ros2.use_fastdds_profile(environment)
+    environment["ROS_LOCALHOST_ONLY"] = "0"
+    assert ros2.use_fastdds_profile(environment)
+    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
 def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
