@@ -29,7 +29,7 @@ def compiled() -> None:
         setup(setup_requires=["mypy[mypyc]>=2.4"])
         return
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
-    modules |= {Path("appliance/tls.py"), Path("appliance/wire.py")}
+    modules |= {Path(f"appliance/{name}.py") for name in ("network", "tls", "wire")}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
     setup(ext_modules=mypycify(sorted(map(str, modules)), group_name="appliance"))
 

@@ -10,15 +10,22 @@ import os
 import signal
 from collections.abc import Coroutine, Sequence
 from dataclasses import asdict
+from datetime import timedelta
 from importlib.metadata import version
 
 import psutil
 import uvloop
 
-from appliance import wiring
-from appliance.access import FileAccess
-from appliance.amqtt_broker import Answers, ApplianceBroker, configuration, plugin_kinds
-from appliance.audit import Audit
+from appliance import status, wiring
+from appliance.access import AccessFileError, FileAccess
+from appliance.amqtt_broker import (
+    Answers,
+    ApplianceBroker,
+    PluginSettingsError,
+    configuration,
+    plugin_kinds,
+)
+from appliance.audit import Audit, AuditError
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
@@ -28,6 +35,7 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
+from appliance.clock import StepWatch
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -35,13 +43,15 @@ from appliance.config import (
     secrets_in,
 )
 from appliance.control import Control, ControlError
+from appliance.crash import CrashReports
 from appliance.listeners import Listeners
+from appliance.notify import Notifier
 from appliance.reload import Parts, Reload, ReloadError
 from appliance.ros.bridge import Bridge
 from appliance.ros.node import RosNode
 from appliance.ros.ros1 import Ros1Node
 from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
-from appliance.store import MemoryStore, SqliteStore
+from appliance.store import MemoryStore, SqliteStore, StoreError
 from appliance.watch import watch
 
 log = logging.getLogger(__name__)
@@ -57,6 +67,16 @@ YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
 
 
+#: What keeps the appliance from starting and a user can mend; each says what and how.
+START_ERRORS = (
+    AccessFileError,
+    AuditError,
+    CertificateError,
+    OSError,
+    PluginSettingsError,
+    StoreError,
+)
+
 #: Seconds between two looks at the server's certificate and this computer's names and addresses,
 #: and after which the log is told again of what has run out or does soon.
 CERTIFICATE_CHECK = 300.0
@@ -66,15 +86,25 @@ CERTIFICATE_WARNING = 86400.0
 class App:
     """The whole appliance, on the running event loop."""
 
-    def __init__(self, settings: Settings, ros_arguments: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        ros_arguments: Sequence[str] = (),
+        notifier: Notifier | None = None,
+        crashes: CrashReports | None = None,
+    ) -> None:
         """Assign only; `start` reads files and opens ports. For the arguments see `run`."""
         self.settings = settings
         self._ros_arguments = ros_arguments
+        self._notifier = notifier or Notifier()
+        self._crashes = crashes
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
+        self._certificates_due = asyncio.Event()
+        self._status: status.Status | None = None
 
     async def start(self) -> None:
         """Start everything, or nothing.
@@ -166,6 +196,18 @@ class App:
         self._reload = Reload(
             Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )
+        self._status = status.Status(
+            status.Parts(
+                version("ros-mqtt-appliance"),
+                broker,
+                listeners,
+                store,
+                self.bridge,
+                self._reload,
+                tls.warnings if tls is not None else list,
+                self._crashes.previous if self._crashes is not None else None,
+            )
+        )
         if tls is not None:
             self._beside(self._keep_certificates(tls))
         if settings.file is not None:
@@ -196,6 +238,7 @@ class App:
     async def _keep_certificates(self, tls: TlsContexts) -> None:
         """Renew the server's certificate when that is due, and tell of what has run out."""
         told: dict[str, float] = {}
+        due = self._certificates_due
         loop = asyncio.get_running_loop()
         reason = ""
         while True:
@@ -214,7 +257,9 @@ class App:
                 if text not in told:
                     told[text] = now
                     log.warning("%s", text)
-            await asyncio.sleep(CERTIFICATE_CHECK)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
+            due.clear()
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""
@@ -252,11 +297,17 @@ class App:
         interval = self.settings.broker.sys_interval
         next_sys = loop.time() + min(interval, TICK)
         timer: asyncio.TimerHandle
+        steps = StepWatch(loop.time())
 
         def tick() -> None:
             nonlocal timer, next_sys
             now = loop.time()
+            step = steps.look(now)
+            if step:
+                self._clock_was_set(step)
             due = self.broker.tick(now)
+            if self._status is not None:
+                self._status.tick(now)
             if interval and now >= next_sys:
                 next_sys = now + interval
                 for topic, payload in sys_topics.update():
@@ -265,6 +316,16 @@ class App:
 
         timer = loop.call_later(TICK, tick)
         self._stack.callback(lambda: timer.cancel())
+
+    def _clock_was_set(self, step: float) -> None:
+        """The wall clock says something else; only dates depend on it."""
+        text = f"the computer's clock was set {'forward' if step > 0 else 'back'} by "
+        text += f"{timedelta(seconds=round(abs(step)))}"
+        log.warning("%s, or the computer slept: nothing expires by that", text)
+        if self.audit is not None:
+            self.audit.changed(text)
+        self._certificates_due.set()
+        self._listeners.network.in_background(self._listeners.check_certificates())
 
     def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         self.broker.publish(Message(topic, payload, 0, retain), self._inside)
@@ -279,44 +340,67 @@ class App:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)
+        if self._crashes is not None:
+            self._crashes.watch(loop)
         await self.start()
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
+        # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
+        assert self._status is not None
+        self._notifier.start(loop, self._status.line)
         try:
             await self._stopping.wait()
             log.info("stopping")
+            self._notifier.stopping()
         finally:
             await self.stop()
 
     async def reload(self) -> list[str]:
         """Take over all files as they are now; see `Reload.run`."""
-        return await self._reload.run()
+        with self._notifier.reloading():
+            return await self._reload.run()
 
     async def _try_reload(self) -> None:
         with contextlib.suppress(ReloadError):  # the log was told
-            await self._reload.run()
+            await self.reload()
 
     def _on_hangup(self) -> None:
         self._listeners.network.in_background(self._try_reload())
 
     async def _answer_reload(self) -> list[str]:
         try:
-            return await self._reload.run()
+            return await self.reload()
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
 
     async def _answer_routes(self) -> list[dict[str, object]]:
+        bridge = self._bridge_that_runs()
+        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
+        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+
+    async def _answer_skipped(self) -> list[dict[str, object]]:
+        return [asdict(skip) for skip in self._bridge_that_runs().skips()]
+
+    def _bridge_that_runs(self) -> Bridge:
         if self.bridge is None:
             raise ControlError("there is no bridge (bridge.bus is none)")
         if self.bridge.problem is not None:
             raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
-        topics: list[dict[str, object]] = [asdict(topic) for topic in self.bridge.topics()]
-        return topics + [dict(entry) for entry in self.bridge.calls.bridged()]
+        return self.bridge
+
+    async def _answer_status(self) -> dict[str, object]:
+        assert self._status is not None
+        return await self._status.tell()
 
     async def _open_to_commands(self) -> None:
         """Answer commands of this computer, and follow the files."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        commands = {"reload": self._answer_reload, "routes": self._answer_routes}
+        commands = {
+            "reload": self._answer_reload,
+            "routes": self._answer_routes,
+            "status": self._answer_status,
+            "skipped": self._answer_skipped,
+        }
         control = Control(settings.control, commands)
         await control.start()
         self._stack.push_async_callback(control.stop)
@@ -334,7 +418,19 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
     `ros_arguments` are those that stood behind `--ros-args`; they come after the configuration's.
     """
     _spare_the_old()
-    uvloop.run(_main(settings, ros_arguments))
+    notifier = Notifier.from_environment(os.environ)
+    crashes = CrashReports(settings.crash_reports, settings)
+    crashes.start()
+    try:
+        uvloop.run(App(settings, ros_arguments, notifier, crashes).run())
+    except START_ERRORS:
+        raise
+    except Exception as error:
+        crashes.crash(error)
+        raise
+    finally:
+        crashes.stop()
+        notifier.close()
     return 0
 
 
@@ -348,7 +444,3 @@ def _spare_the_old() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(YOUNG_OBJECTS, 10, NEVER)
-
-
-async def _main(settings: Settings, ros_arguments: Sequence[str]) -> None:
-    await App(settings, ros_arguments).run()

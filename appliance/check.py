@@ -17,6 +17,7 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
+from appliance.ros import installation, ros1, ros2
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
 
@@ -196,14 +197,13 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
     bridge = settings.bridge
     if bridge.bus == "none":
         yield Finding("ok", "bridge", "off: a broker alone")
-    elif importlib.util.find_spec("rospy" if bridge.bus == "ros1" else "rclpy") is None:
-        text = "no ROS 2 here: source one, or install the extra `ros`; the broker runs without"
-        if bridge.bus == "ros1":
-            text = (
-                "no ROS 1 here: source one, or apt install python3-rospy; the broker runs without"
-            )
-        yield Finding("warning", "bridge", text)
+        return
+    is_ros1 = bridge.bus == "ros1"
+    is_available, reason = (ros1.available if is_ros1 else ros2.available)()
+    if not is_available:
+        yield Finding("warning", "bridge", f"{reason}; the broker runs without")
     else:
-        called = len(bridge.services) + len(bridge.actions) + len(bridge.parameters)
-        found = f"ROS {bridge.bus[-1]} found; routes: {len(bridge.topics) + called}"
-        yield Finding("ok", "bridge", found)
+        called = (*bridge.services, *bridge.actions, *bridge.parameters)
+        routes = sum(not route.is_exclusion for route in (*bridge.topics, *called))
+        found = ros1.found() if is_ros1 else installation.find()
+        yield Finding("ok", "bridge", f"{found}; routes: {routes}")

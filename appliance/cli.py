@@ -15,21 +15,35 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
+from appliance.call_command import call, goal, param_app
 from appliance.cert_command import cert_app
 from appliance.console import (
+    CaOption,
+    CertOption,
+    ClientIdOption,
+    ClientPasswordOption,
     CommandError,
     ConfigOption,
     GenerateOption,
+    HostOption,
+    InsecureOption,
+    KeyOption,
     PasswordFileOption,
+    PortOption,
+    UserOption,
+    VersionOption,
+    connect_to,
     new_password,
 )
 from appliance.console import load as _load
-from appliance.console import read_password as _read_password
 from appliance.console import shown as _shown
+from appliance.doctor.command import doctor
+from appliance.install_command import install, uninstall
+from appliance.routes_command import routes
+from appliance.status_command import status
 
 if TYPE_CHECKING:
     from appliance.access import Passwords
-    from appliance.client import Target
     from appliance.config import Settings
 
 app = typer.Typer(
@@ -45,6 +59,9 @@ app.add_typer(store_app, name="store")
 app.add_typer(user_app, name="user")
 app.add_typer(acl_app, name="acl")
 app.add_typer(cert_app, name="cert")
+app.command()(status)
+app.command()(doctor)
+app.add_typer(param_app, name="param")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -144,21 +161,13 @@ def run(
 @contextmanager
 def _start_errors() -> Iterator[None]:
     """What keeps the appliance from starting and a user can mend, as a CommandError."""
-    from appliance.access import AccessFileError
-    from appliance.amqtt_broker import PluginSettingsError
-    from appliance.audit import AuditError
-    from appliance.certs import CertificateError
-    from appliance.store import StoreError
+    from appliance.app import START_ERRORS
 
     try:
         yield
-    except (
-        AccessFileError,
-        AuditError,
-        CertificateError,
-        PluginSettingsError,
-        StoreError,
-    ) as error:
+    except OSError:  # told by main
+        raise
+    except START_ERRORS as error:
         raise CommandError(str(error)) from None
 
 
@@ -175,55 +184,7 @@ def reload(config: ConfigOption = None) -> None:
     typer.echo("\n".join(changed) if changed else "nothing has changed")
 
 
-@app.command()
-def routes(
-    config: ConfigOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON an entry.")] = False,
-) -> None:
-    """Show what the running appliance carries between ROS and MQTT now."""
-    settings = _load(config)
-    import json
-
-    from appliance.control import ControlError, ask
-
-    try:
-        bridged = ask(settings.control, "routes")
-    except ControlError as error:
-        raise CommandError(str(error)) from None
-    if as_json:
-        typer.echo("".join(f"{json.dumps(entry)}\n" for entry in bridged), nl=False)
-        return
-    if not bridged:
-        typer.echo("nothing is bridged now")
-        return
-    rows = [("ROS", "", "MQTT", "TYPE", "AS", "HZ", "BYTES", "LOST", "ERRORS", "MS")]
-    arrows = {"to_mqtt": "→", "to_ros": "←"}
-    for entry in sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])):
-        way = entry["direction"]
-        figures = [""] * 5  # services, actions and parameters have none
-        if way in arrows:
-            latency = entry["latency_ms"]
-            figures = [
-                f"{entry['rate']:g}",
-                str(entry["size"]),
-                str(entry["dropped"]),
-                str(entry["errors"]),
-                f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
-            ]
-        rows.append(
-            (
-                entry["ros"],
-                arrows.get(way, way),
-                entry["mqtt"],
-                entry["type"],
-                entry["encoding"],
-                *figures,
-            )
-        )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        typer.echo(line.rstrip())
+app.command()(routes)
 
 
 @app.command()
@@ -282,6 +243,10 @@ def bench(
 
     cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
     raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))
+
+
+app.command()(install)
+app.command()(uninstall)
 
 
 # What is stored
@@ -538,43 +503,6 @@ def acl_explain(
 
 # Client
 
-HostOption = Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")]
-PortOption = Annotated[
-    int | None, typer.Option("--port", "-p", help="Else the TLS listener's of the configuration.")
-]
-CaOption = Annotated[
-    Path | None,
-    typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
-]
-CertOption = Annotated[
-    Path | None,
-    typer.Option("--cert", metavar="FILE", help="A client certificate, with its key in it or in:"),
-]
-KeyOption = Annotated[
-    Path | None, typer.Option("--key", metavar="FILE", help="The key of the client certificate.")
-]
-UserOption = Annotated[
-    str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
-]
-ClientPasswordOption = Annotated[
-    str | None,
-    typer.Option(
-        "--password-file",
-        metavar="FILE",
-        help="Its first line is the password; else APPLIANCE_PASSWORD; else it is asked for.",
-    ),
-]
-VersionOption = Annotated[
-    Literal["5", "311"], typer.Option("--mqtt-version", "-V", help="MQTT 5 or 3.1.1.")
-]
-InsecureOption = Annotated[
-    bool,
-    typer.Option("--insecure", help="Do not check who the broker is. Never with a real password."),
-]
-ClientIdOption = Annotated[
-    str, typer.Option("--id", "-i", help="The client id; else a random one.")
-]
-
 
 @app.command()
 def pub(
@@ -614,7 +542,7 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
-    target = _target(
+    target = connect_to(
         config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
     )
     from appliance import client
@@ -652,7 +580,7 @@ def sub(
     config: ConfigOption = None,
 ) -> None:
     """Subscribe, and print what comes, a message a line."""
-    target = _target(
+    target = connect_to(
         config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
     )
     from appliance import client
@@ -673,44 +601,8 @@ def sub(
         raise CommandError(f"{received} of {count} messages came within {timeout:g} s")
 
 
-def _target(
-    config: Path | None,
-    host: str,
-    port: int | None,
-    ca: Path | None,
-    user: str | None,
-    password_file: str | None,
-    client_id: str,
-    version: Literal["5", "311"],
-    insecure: bool,
-    cert: Path | None = None,
-    key: Path | None = None,
-) -> Target:
-    """Where to connect and as whom; what no option says is taken from the configuration, if any."""
-    from paho.mqtt.enums import MQTTProtocolVersion
-
-    from appliance.client import Target
-    from appliance.config import SEARCH_PATH
-
-    # Without a configuration it is a client on some other computer: the options say everything.
-    if config or (port is None and ca is None and any(path.is_file() for path in SEARCH_PATH)):
-        broker = _load(config).broker
-        ports = [listener.bind.port for listener in broker.listeners if listener.is_mqtts]
-        port = port or (ports[0] if ports else None)
-        ca = ca or broker.tls.ca
-    if user is None:
-        password = None
-    elif password_file:
-        password = _read_password(password_file)
-    elif "APPLIANCE_PASSWORD" in os.environ:
-        password = os.environ["APPLIANCE_PASSWORD"]
-    elif sys.stdin.isatty():
-        password = typer.prompt(f"Password of {user}", hide_input=True)
-    else:
-        raise CommandError("no password; use --password-file or APPLIANCE_PASSWORD")
-    protocol = MQTTProtocolVersion.MQTTv5 if version == "5" else MQTTProtocolVersion.MQTTv311
-    address = (host, port or 8883)
-    return Target(*address, ca, user, password, client_id, protocol, insecure, cert, key)
+app.command()(call)
+app.command()(goal)
 
 
 def _version(wanted: bool) -> None:

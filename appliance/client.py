@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
@@ -23,6 +24,10 @@ NOT_LINE_ENDS = {code: text for code, text in VISIBLE.items() if code not in (0x
 
 class ClientError(Exception):
     """The broker could not be reached, or refused; the message says what and why."""
+
+
+class RefusedError(ClientError):
+    """The broker did not allow it; the message says what."""
 
 
 @dataclass(frozen=True)
@@ -74,18 +79,16 @@ def subscribe(
     until interrupted. Raises ClientError, also when the broker ends the connection.
     """
     received = 0
-    safe = output.isatty()
 
     def show(message: paho.MQTTMessage) -> None:
         nonlocal received
         if count is not None and received >= count:
             return
         received += 1
-        line = message.topic.encode() + b" " + message.payload if verbose else message.payload
-        if safe:  # a payload must not send commands to the terminal
-            line = line.decode(errors="backslashreplace").translate(NOT_LINE_ENDS).encode()
-        output.write(line + b"\n")
-        output.flush()
+        line = (
+            message.topic.encode() + b" " + message.payload if verbose else bytes(message.payload)
+        )
+        write_line(output, line)
 
     connection = Connection(target, show)
     try:
@@ -97,6 +100,14 @@ def subscribe(
     return received
 
 
+def write_line(output: BinaryIO, line: bytes) -> None:
+    """Writes it as it is, or so that a payload cannot send commands to a terminal."""
+    if output.isatty():
+        line = line.decode(errors="backslashreplace").translate(NOT_LINE_ENDS).encode()
+    output.write(line + b"\n")
+    output.flush()
+
+
 class Connection:
     """One connection, driven by the caller's thread; every failure is a ClientError."""
 
@@ -105,7 +116,7 @@ class Connection:
     ) -> None:
         self._target = target
         self._answer: ReasonCode | None = None
-        self._granted: list[ReasonCode] | None = None
+        self._granted: dict[int | None, list[ReasonCode]] = {}
         self._published: dict[int, ReasonCode] = {}
         self._ended: ReasonCode | None = None
         self._client = client = paho.Client(
@@ -114,7 +125,7 @@ class Connection:
         client.username_pw_set(target.username, target.password)
         client.on_connect = lambda c, u, flags, reason, p: setattr(self, "_answer", reason)
         client.on_disconnect = lambda c, u, flags, reason, p: setattr(self, "_ended", reason)
-        client.on_subscribe = lambda c, u, mid, reasons, p: setattr(self, "_granted", reasons)
+        client.on_subscribe = lambda c, u, mid, reasons, p: self._granted.update({mid: reasons})
         client.on_publish = lambda c, u, mid, reason, p: self._published.update({mid: reason})
         client.on_message = lambda c, u, message: on_message(message)
         context = _tls(target)
@@ -148,40 +159,58 @@ class Connection:
             who = f"user {target.username!r}" if target.username else "a client without user name"
             raise ClientError(f"{target.address} refused {who}: {self._answer}")
 
-    def publish(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:
-        """Publishes, and returns when the broker has taken it (QoS 0: when it was sent)."""
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        qos: int,
+        retain: bool,
+        properties: Properties | None = None,
+    ) -> ReasonCode:
+        """Publishes, and returns what the broker said of it when it has taken it (QoS 0: when it
+        was sent). Raises RefusedError."""
         try:
-            message = self._client.publish(topic, payload, qos, retain)
+            message = self._client.publish(topic, payload, qos, retain, properties)
         except ValueError as error:
             raise ClientError(f"{topic!r} cannot be published: {error}") from None
         self._wait(lambda: message.mid in self._published, "a message")
-        reason = self._published.pop(message.mid)
+        reason: ReasonCode = self._published.pop(message.mid)
         if reason.is_failure:
-            raise ClientError(f"{topic!r} was refused: {reason}")
+            raise RefusedError(f"{topic!r} was refused: {reason}")
+        return reason
 
-    def subscribe(self, filters: list[str], qos: int) -> None:
-        """Subscribes to all of the filters. Raises ClientError that names those refused."""
-        options = [(name, SubscribeOptions(qos=qos)) for name in filters]
+    def subscribe(self, filters: list[str], qos: int, *, retained: bool = True) -> None:
+        """Subscribes to all of the filters; with MQTT 5 also without what is retained there.
+
+        Raises RefusedError that names those refused.
+        """
+        handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+        if not retained:
+            handling = SubscribeOptions.RETAIN_DO_NOT_SEND
+        options = [(name, SubscribeOptions(qos, retainHandling=handling)) for name in filters]
         try:
             if self._target.version == MQTTProtocolVersion.MQTTv5:
-                self._client.subscribe(options)
+                _, mid = self._client.subscribe(options)
             else:
-                self._client.subscribe([(name, qos) for name in filters])
+                _, mid = self._client.subscribe([(name, qos) for name in filters])
         except ValueError as error:
             raise ClientError(f"{', '.join(filters)}: {error}") from None
-        self._wait(lambda: self._granted is not None, "the subscription")
+        self._wait(lambda: mid in self._granted, "the subscription")
         refused = [
             f"{name!r} was refused: {reason}"
-            for name, reason in zip(filters, self._granted or [], strict=False)
+            for name, reason in zip(filters, self._granted[mid], strict=False)
             if reason.is_failure
         ]
         if refused:
-            raise ClientError("; ".join(refused))
+            raise RefusedError("; ".join(refused))
 
-    def run(self, done: Callable[[], bool], deadline: float | None = None) -> bool:
-        """Works until `done()` or the deadline (monotonic clock); returns `done()`."""
+    def run(
+        self, done: Callable[[], bool], deadline: float | None = None, step: float = 1.0
+    ) -> bool:
+        """Works until `done()` or the deadline (monotonic clock); returns `done()`, which is asked
+        when something has come, and every `step` seconds."""
         while not done():
-            left = 1.0 if deadline is None else min(1.0, deadline - time.monotonic())
+            left = step if deadline is None else min(step, deadline - time.monotonic())
             if left <= 0:
                 return False
             code = self._client.loop(left)

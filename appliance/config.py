@@ -13,7 +13,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -26,11 +26,13 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     PrivateAttr,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_serializer,
 )
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from appliance.document import Document, KeyPath, Problem
 
@@ -245,26 +247,36 @@ def _check_ros_pattern(value: str) -> str:
     return value
 
 
-def _parse_ros_names(value: object) -> str | tuple[str, ...]:
-    """A name or pattern, or a list of them in which `!` leaves some out."""
-    if isinstance(value, str) and not value.startswith("!"):
-        return _check_ros_pattern(value)
-    if isinstance(value, str) or (
-        isinstance(value, (list, tuple))
-        and value
-        and all(isinstance(name, str) and name.startswith("!") for name in value)
-    ):
-        raise ValueError("only leaves topics out: put before it, in a list, those that are wanted")
-    if not isinstance(value, (list, tuple)) or not value:
+class _InListError(ValueError):
+    """What is wrong with one entry of a list, and which."""
+
+    def __init__(self, position: int, what: str) -> None:
+        super().__init__(what)
+        self.position = position
+
+
+def _parse_ros_names(
+    value: object, check: Callable[[str], object] = _check_ros_pattern
+) -> str | tuple[str, ...]:
+    """A name or pattern, or a list of them; what begins with `!` is left out."""
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, (list, tuple)) or not names:
         raise ValueError("must be a ROS name, a pattern, or a list of them")
-    for name in value:
-        if not isinstance(name, str):
-            raise ValueError(f"{name!r} must be a ROS name or a pattern")
+    for position, name in enumerate(names):
         try:
-            _check_ros_pattern(name.removeprefix("!"))
+            if not isinstance(name, str):
+                raise ValueError("must be a ROS name or a pattern")
+            check(name.removeprefix("!"))
         except ValueError as error:
-            raise ValueError(f"{name!r} {error}") from None
-    return str(value[0]) if len(value) == 1 else tuple(value)
+            if isinstance(value, str):
+                raise
+            raise _InListError(position, str(error)) from None
+    return str(names[0]) if len(names) == 1 else tuple(names)
+
+
+def _parse_parameters(value: object) -> str | tuple[str, ...]:
+    """Parameters as `_check_parameter` has them, or a list of them, as `_parse_ros_names`."""
+    return _parse_ros_names(value, _check_parameter)
 
 
 def _check_ros_arguments(value: list[str]) -> list[str]:
@@ -309,11 +321,6 @@ def _check_node_topic(value: str) -> str:
     return _check_topic_template(value, "{node}")
 
 
-def _check_called(value: str) -> str:
-    """A ROS name or a pattern; with `!` before it, what is left out."""
-    return _excluded(value) + _check_ros_pattern(value.removeprefix("!"))
-
-
 #: How a parameter is named.
 OF_NODE = (
     "must be a node's full name, '/', and a parameter's: /arm/speed, /arm/* for all of /arm, /**/* "
@@ -321,17 +328,13 @@ OF_NODE = (
 )
 
 
-def _check_parameters(value: str) -> str:
+def _check_parameter(value: str) -> None:
     """The full name of a node, `/`, and the name of a parameter; all may be patterns."""
-    node, _, name = value.removeprefix("!").rpartition("/")
-    # Of ROS 1, /speed is a parameter that is no node's.
-    if not re.fullmatch(r"[\w.*-]+", name) or not value.removeprefix("!").startswith("/"):
+    node, slash, name = value.rpartition("/")
+    if not slash or not re.fullmatch(r"[\w.*-]+", name):
         raise ValueError(OF_NODE)
-    return f"{_excluded(value)}{_check_ros_pattern(node) if node else ''}/{name}"
-
-
-def _excluded(value: str) -> str:
-    return "!" if value.startswith("!") else ""
+    if node:  # of ROS 1, /speed is a parameter that is no node's
+        _check_ros_pattern(node)
 
 
 def _check_called_type(value: str, kind: str, example: str) -> str:
@@ -356,8 +359,23 @@ def _check_response(value: object) -> object:
     return value
 
 
-def _from_name(value: object) -> object:
-    return {"ros": value} if isinstance(value, str) else value
+def _from_names(value: object) -> object:
+    """A route of which only the names are said."""
+    return {"ros": value} if isinstance(value, (str, list, tuple)) else value
+
+
+def _check_direction(value: object, info: ValidationInfo) -> object:
+    names = info.data.get("ros")  # None when they are wrong themselves
+    if value is not None:
+        return value
+    if names is not None and not _leaves_out(names):
+        raise PydanticCustomError("missing", "is needed")
+    return "mqtt"
+
+
+def _leaves_out(names: str | tuple[str, ...]) -> bool:
+    """Whether nothing is wanted, only left out."""
+    return all(name.startswith("!") for name in ([names] if isinstance(names, str) else names))
 
 
 def _check_response_information(value: str) -> str:
@@ -448,13 +466,12 @@ ClientCertificates = Annotated[
 ]
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]
 Count = Annotated[int, Field(ge=1)]
-RosNames = Annotated[
-    str | tuple[str, ...],
-    PlainValidator(_parse_ros_names),
-    PlainSerializer(lambda names: names if isinstance(names, str) else list(names)),
-]
+_LISTED = PlainSerializer(lambda names: names if isinstance(names, str) else list(names))
+RosNames = Annotated[str | tuple[str, ...], PlainValidator(_parse_ros_names), _LISTED]
+ParameterNames = Annotated[str | tuple[str, ...], PlainValidator(_parse_parameters), _LISTED]
 FieldPath = Annotated[str, AfterValidator(_check_field)]
 Encoding = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
+CallEncoding = Literal["json", "cbor", "cdr", "ros1"]
 Direction = Literal["mqtt", "ros", "both"]
 QueueFull = Literal["refuse", "drop-oldest", "disconnect"]
 Level = Literal["debug", "info", "warning", "error"]
@@ -628,16 +645,50 @@ class OnSilence(_Section):
     disconnect: bool = True
 
 
-class TopicRoute(RouteDefaults):
-    """One ROS topic that is carried to MQTT, from MQTT, or both ways.
+class Route(_Section):
+    """What is bridged, by its name on ROS, and where it is on MQTT.
+
+    `ros` is a name, a pattern, or a list of these in which `!` leaves some out again. A route of
+    which nothing else is said but what is left out holds for all patterns of its section.
+    """
+
+    ros: RosNames
+    mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """`ros`, as many as there are."""
+        return (self.ros,) if isinstance(self.ros, str) else self.ros
+
+    @property
+    def is_exclusion(self) -> bool:
+        """Whether it only says what the other routes of its section leave out."""
+        return _leaves_out(self.ros)
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the route is for many names."""
+        return not self.is_exclusion and (len(self.names) > 1 or "*" in self.names[0])
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        every: dict[str, Any] = serialize(self)
+        return {"ros": every["ros"]} if self.is_exclusion else every
+
+    def topic(self, robot: str) -> str:
+        """The MQTT topic of this route on that robot; that of many names keeps `{ros}` in it."""
+        topic = self.mqtt.replace("{robot}", robot)
+        return topic if self.is_pattern else topic.replace("{ros}", self.names[0])
+
+
+class TopicRoute(RouteDefaults, Route):
+    """One ROS topic that is carried to MQTT, from MQTT, or both ways; or many of them.
 
     What is under COMMAND_KEYS holds for what goes to ROS; times in seconds.
     """
 
-    ros: RosNames
-    to: Direction
+    to: Annotated[Direction, BeforeValidator(_check_direction)] = Field(None, validate_default=True)
     type: Annotated[str, AfterValidator(_check_ros_type)] | None = None
-    mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
     fields: list[FieldPath] = []
     expire: Annotated[Duration, Field(gt=0)] | None = None
     take_retained: bool = False
@@ -655,39 +706,11 @@ class TopicRoute(RouteDefaults):
         fields = TopicRoute.model_fields
         return [key for key in COMMAND_KEYS if getattr(self, key) != fields[key].default]
 
-    @property
-    def is_pattern(self) -> bool:
-        """Whether `ros` names many topics."""
-        return not isinstance(self.ros, str) or "*" in self.ros
 
-    def topic(self, robot: str) -> str:
-        """The MQTT topic of this route on that robot; a pattern keeps `{ros}` in it."""
-        topic = self.mqtt.replace("{robot}", robot)
-        return (
-            topic.replace("{ros}", self.ros)
-            if isinstance(self.ros, str) and not self.is_pattern
-            else topic
-        )
+class _CalledRoute(Route):
+    """What every route has that is called; `timeout` in seconds."""
 
-
-class _CalledRoute(_Section):
-    """What every route has that is called; `timeout` in seconds.
-
-    `ros` may be a pattern or, with `!` before it, what patterns are not to take.
-    """
-
-    ros: Annotated[str, AfterValidator(_check_called)]
-    mqtt: Annotated[str, AfterValidator(_check_topic_template)] = "{robot}{ros}"
     timeout: Annotated[Duration, Field(gt=0)] = 5.0
-
-    @property
-    def is_pattern(self) -> bool:
-        """Whether the route is for many names."""
-        return "*" in self.ros
-
-    def topic(self, robot: str) -> str:
-        """The MQTT topic on that robot; the ROS name is still to be filled in."""
-        return self.mqtt.replace("{robot}", robot)
 
 
 class ServiceRoute(_CalledRoute):
@@ -695,7 +718,7 @@ class ServiceRoute(_CalledRoute):
 
     to: Literal["ros", "mqtt"] = "ros"
     type: Annotated[str, AfterValidator(_check_service_type)] | None = None
-    encoding: Literal["json", "cdr", "ros1"] = "json"
+    encoding: CallEncoding = "json"
     on_error: Annotated[dict[str, Any], BeforeValidator(_check_response)] | None = None
 
 
@@ -703,37 +726,37 @@ class ActionRoute(_CalledRoute):
     """ROS actions for MQTT clients; `keep_result` in seconds."""
 
     type: Annotated[str, AfterValidator(_check_action_type)] | None = None
+    encoding: CallEncoding = "json"
     keep_result: Annotated[Duration, Field(ge=0)] = 60.0
+    cancel: Literal["own", "any"] = "own"
     cancel_on_disconnect: bool = False
 
 
 class ParameterRoute(_CalledRoute):
-    """Parameters of ROS nodes, for MQTT clients to read and set."""
+    """Parameters of ROS nodes, for MQTT clients to read and set: `/node/parameter`."""
 
-    ros: Annotated[str, AfterValidator(_check_parameters)]
+    ros: ParameterNames
     mqtt: Annotated[str, AfterValidator(_check_node_topic)] = "{robot}{node}/_param"
+    encoding: Literal["json", "cbor"] = "json"
 
     @property
     def is_pattern(self) -> bool:
         """Whether the route is for many nodes."""
-        return "*" in self.node
+        nodes = {name.rpartition("/")[0] for name in self.names if not name.startswith("!")}
+        return len(nodes) > 1 or any("*" in node for node in nodes)
 
-    @property
-    def node(self) -> str:
-        """The name, or the pattern, of the nodes; with `!` before it when they are left out."""
-        return self.ros.rpartition("/")[0]
-
-    @property
-    def name(self) -> str:
-        """The name, or the pattern, of their parameters."""
-        return self.ros.rpartition("/")[2]
+    def topic(self, robot: str) -> str:
+        """The MQTT topic on that robot; the node's name is still to be filled in."""
+        return self.mqtt.replace("{robot}", robot)
 
 
 class BridgeLimits(_Section):
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and what one message for ROS
+    may have, in bytes."""
 
     calls: Count = 500
     calls_per_client: Count = 20
+    payload: Annotated[Size, Field(gt=0)] = 1 << 20
 
 
 class Bridge(_Section):
@@ -747,10 +770,10 @@ class Bridge(_Section):
     use_sim_time: bool = False
     diagnostics: Annotated[Duration, Field(ge=0)] = 1.0
     defaults: RouteDefaults = _section()
-    topics: list[TopicRoute] = []
-    services: list[Annotated[ServiceRoute, BeforeValidator(_from_name)]] = []
-    actions: list[Annotated[ActionRoute, BeforeValidator(_from_name)]] = []
-    parameters: list[Annotated[ParameterRoute, BeforeValidator(_from_name)]] = []
+    topics: list[Annotated[TopicRoute, BeforeValidator(_from_names)]] = []
+    services: list[Annotated[ServiceRoute, BeforeValidator(_from_names)]] = []
+    actions: list[Annotated[ActionRoute, BeforeValidator(_from_names)]] = []
+    parameters: list[Annotated[ParameterRoute, BeforeValidator(_from_names)]] = []
     limits: BridgeLimits = _section()
 
     @field_validator("topics")
@@ -761,7 +784,9 @@ class Bridge(_Section):
             return topics
         shared = {name: getattr(defaults, name) for name in RouteDefaults.model_fields}
         return [
-            route.model_copy(
+            route
+            if route.is_exclusion
+            else route.model_copy(
                 update={k: v for k, v in shared.items() if k not in route.model_fields_set}
             )
             for route in topics
@@ -785,6 +810,7 @@ class Settings(_Section):
     log: Log = _section()
     control: FilePath = Path("state/control.sock")
     reload_on_change: bool = True
+    crash_reports: OptionalPath = Field(Path("state/crashes"), validate_default=True)
     _file: Path | None = PrivateAttr(default=None)
 
     @property
@@ -828,7 +854,7 @@ def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -
     except ValidationError as error:
         for detail in error.errors(include_url=False):
             if detail["loc"] not in document.faulty:
-                path = detail["loc"]
+                path = _place(detail)
                 problems.append(document.problem(path, _explain(detail, document.written(path))))
     else:
         problems += [document.problem(path, what) for path, what in _cross_check(settings)]
@@ -857,12 +883,12 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     ):
         problem = "needs a listener with tls: true that asks for client certificates"
         yield ("broker", "tls", "username_from"), problem
-    routes: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
+    yield from _cross_check_routes(settings.bridge)
+    ways: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
-        first = routes.setdefault(_way(route, settings.robot), number)
-        if route.is_pattern and "{ros}" not in route.mqtt:
-            problem = "needs {ros} in it, or all topics of the pattern would be one"
-            yield ("bridge", "topics", number, "mqtt"), problem
+        if route.is_exclusion:
+            continue
+        first = ways.setdefault(_way(route, settings.robot), number)
         if route.to == "mqtt":
             for key in route.command_keys:
                 yield ("bridge", "topics", number, key), "is for routes to ROS only"
@@ -878,17 +904,18 @@ def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
     """What ROS 1 and ROS 2 do not have in common."""
     is_ros1 = bridge.bus == "ros1"
     foreign, own = ("cdr", "ros1") if is_ros1 else ("ros1", "cdr")
-    sections: tuple[tuple[str, Sequence[TopicRoute | ServiceRoute]], ...] = (
+    sections: tuple[tuple[str, Sequence[TopicRoute | ServiceRoute | ActionRoute]], ...] = (
         ("topics", bridge.topics),
         ("services", bridge.services),
+        ("actions", bridge.actions),
     )
     for section, routes in sections:
         for number, route in enumerate(routes):
-            if route.encoding == foreign:
+            if route.encoding == foreign and not route.is_exclusion:
                 text = f"must be {own}: that is what ROS's own bytes are with bus: {bridge.bus}"
                 yield ("bridge", section, number, "encoding"), text
     for number, parameter in enumerate(bridge.parameters):
-        if not is_ros1 and not parameter.node.removeprefix("!"):
+        if not is_ros1 and any(name.rpartition("/")[0] in ("", "!") for name in parameter.names):
             yield ("bridge", "parameters", number, "ros"), OF_NODE
     ros2_only = {"domain_id": bridge.domain_id is not None, "use_sim_time": bridge.use_sim_time}
     for key, is_set in ros2_only.items():
@@ -897,35 +924,73 @@ def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
             yield ("bridge", key), f"is for ROS 2 only; in ROS 1 it is {instead}"
 
 
-def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
-    sections: dict[str, tuple[str, Sequence[ServiceRoute | ActionRoute | ParameterRoute]]] = {
-        "services": ("{ros}", bridge.services),
-        "actions": ("{ros}", bridge.actions),
-        "parameters": ("{node}", bridge.parameters),
+def _cross_check_routes(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    """What holds for the routes of every section."""
+    sections: dict[str, Sequence[Route]] = {
+        "topics": bridge.topics,
+        "services": bridge.services,
+        "actions": bridge.actions,
+        "parameters": bridge.parameters,
     }
-    for section, (placeholder, routes) in sections.items():
-        seen: dict[str, int] = {}
+    for section, routes in sections.items():
+        placeholder = "{node}" if section == "parameters" else "{ros}"
+        has_pattern = any("*" in name for route in routes for name in route.names if name[0] != "!")
         for number, route in enumerate(routes):
             path: KeyPath = ("bridge", section, number)
-            first = seen.setdefault(route.ros, number)
-            if first != number:
-                yield (*path, "ros"), f"is the same as bridge.{section}[{first}]"
-            if route.ros.startswith("!"):
-                for key in sorted(route.model_fields_set - {"ros"}):
+            if route.is_exclusion:
+                more = sorted(route.model_fields_set - {"ros"})
+                for key in more:
                     yield (*path, key), "has no meaning for what is left out"
+                if not (more or has_pattern):
+                    problem = f"leaves nothing out: there is no pattern in bridge.{section}"
+                    yield (*path, "ros"), problem
             elif route.is_pattern and placeholder not in route.mqtt:
-                problem = f"needs {placeholder} in it, or all of the pattern would be one"
+                problem = f"needs {placeholder} in it, or all that the route is for would be one"
                 yield (*path, "mqtt"), problem
+
+
+def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    sections: dict[str, Sequence[ServiceRoute | ActionRoute | ParameterRoute]] = {
+        "services": bridge.services,
+        "actions": bridge.actions,
+        "parameters": bridge.parameters,
+    }
+    for section, routes in sections.items():
+        seen: dict[str, int] = {}
+        topics: dict[str, tuple[str, int]] = {}
+        for number, route in enumerate(routes):
+            path: KeyPath = ("bridge", section, number)
+            for name in route.names:
+                base = name.rpartition("/")[0] if section == "parameters" else name
+                if name.startswith("!") or "*" in base:
+                    continue
+                topic = route.mqtt.replace("{node}", base).replace("{ros}", base)
+                other, taken = topics.setdefault(topic, (base, number))
+                if other != base:
+                    yield (*path, "mqtt"), f"is the topic of bridge.{section}[{taken}]"
+            for position, name in enumerate(route.names):
+                if name.startswith("!") and not route.is_exclusion:
+                    continue
+                first = seen.setdefault(name, number)
+                if first != number:
+                    where: KeyPath = () if isinstance(route.ros, str) else (position,)
+                    yield (*path, "ros", *where), f"is the same as in bridge.{section}[{first}]"
             kind = None if isinstance(route, ParameterRoute) else route.type
             if kind is not None and "*" in kind and not route.is_pattern:
                 yield (*path, "type"), "can be a pattern only when ros is one"
             if isinstance(route, ServiceRoute) and route.to == "mqtt":
                 if route.is_pattern:
-                    yield (*path, "to"), "must be ros when ros is a pattern"
-                elif route.type is None:
+                    yield (*path, "to"), "must be ros when ros is a pattern or a list"
+                elif route.type is None and not route.is_exclusion:
                     yield (*path, "type"), "is needed when to is mqtt"
             elif isinstance(route, ServiceRoute) and route.on_error is not None:
                 yield (*path, "on_error"), "is for services that MQTT answers: to: mqtt"
+
+
+def _place(detail: ErrorDetails) -> KeyPath:
+    """The path of what is wrong, down to the entry of a list that was checked as a whole."""
+    error = detail.get("ctx", {}).get("error")
+    return (*detail["loc"], error.position) if isinstance(error, _InListError) else detail["loc"]
 
 
 _PLAIN = {

@@ -2,7 +2,8 @@
 
 It drives as `/cmd_vel` says and stops by itself when it has not been told anything for a second. It
 publishes `/odom`, `/battery`, `/scan`, `/chatter` and, once and kept for late comers,
-`/robot_description`. Units as in REP 103: m, rad, s, V. SIGTERM and SIGINT stop it.
+`/robot_description`. The service `/reset` (std_srvs/srv/Trigger) puts it back to its start. Units
+as in REP 103: m, rad, s, V. SIGTERM and SIGINT stop it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -106,12 +108,20 @@ class DemoRobot:
         self._description = node.create_publisher(string, "/robot_description", latched)
         self._description.publish(string(data=DESCRIPTION))
         node.create_subscription(twist, "/cmd_vel", self._on_command, 10)
+        trigger = import_module("std_srvs.srv").Trigger
+        node.create_service(trigger, "/reset", self._on_reset)
         node.create_timer(1 / ODOMETRY_RATE, self._publish_odometry)
         node.create_timer(1 / SCAN_RATE, self._publish_scan)
         node.create_timer(1.0, self._publish_battery_and_chatter)
 
     def _on_command(self, twist: Any) -> None:
         self._drive.command(twist.linear.x, twist.angular.z, monotonic())
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        response.success = True
+        response.message = f"was {math.hypot(self._drive.x, self._drive.y):.1f} m from its start"
+        self._drive = Drive()
+        return response
 
     def _new(self, type_name: str, frame: str) -> Any:
         message: Any = self._types[type_name]()

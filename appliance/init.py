@@ -7,7 +7,7 @@ import re
 import secrets
 import socket
 import string
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,7 @@ robot: {robot}          # the first level of all its MQTT topics
 
 bridge:
   topics: []
-  # A route each, for example:
+  # A route each, for example (and services, actions, parameters likewise: services: [/reset]):
   #  - {{ros: /odom, to: mqtt, rate: 10}}
   #  - ros: /cmd_vel
   #    to: ros
@@ -51,6 +51,7 @@ bridge:
     - {{ros: /scan, to: mqtt, rate: 2}}
     - {{ros: /chatter, to: mqtt}}
     - {{ros: /cmd_vel, to: ros, type: geometry_msgs/msg/Twist}}
+  services: [/reset]
 """
 
 ACCESS = """\
@@ -61,7 +62,19 @@ user {user}
 topic read {{robot}}/#
 topic read $SYS/#
 topic write {{robot}}/cmd_vel
+{calls}"""
+
+NO_CALLS = """\
+# To call what is bridged takes lines such as these, one for each:
+#topic write {robot}/reset/_call/#
+#topic write {robot}/navigate_to_pose/_goal/#
+#topic write {robot}/navigate_to_pose/_cancel/#
+#topic write {robot}/controller/_param/+/set/#
 """
+
+#: Parts of a name that `**` in a pattern stands for in the access rules, which have nothing like it
+#: but `#`, and that would allow what is no call.
+_DEPTH = 3
 
 
 class InitError(Exception):
@@ -98,9 +111,16 @@ def generate_password() -> str:
 
 
 def initialise(
-    directory: Path, *, robot: str | None = None, user: str = "operator", demo: bool = False
+    directory: Path,
+    *,
+    robot: str | None = None,
+    user: str = "operator",
+    demo: bool = False,
+    configuration: str = CONFIGURATION,
 ) -> Iterator[Step | Credentials]:
     """Makes what is missing in `directory`, telling each step as it is done.
+
+    `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
     made until then is good and stays.
@@ -112,17 +132,60 @@ def initialise(
     directory.mkdir(parents=True, exist_ok=True)
     file = directory / "appliance.yaml"
     name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
-    text = (DEMO_CONFIGURATION if demo else CONFIGURATION).format(robot=name)
+    text = (DEMO_CONFIGURATION if demo else configuration).format(robot=name)
     made = _write_new(file, text)
     settings = config.load(file)
     if robot and not made and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")
     yield Step(file, made, f"configuration of robot {settings.robot!r}")
     yield from _certificates(settings)
-    made = _write_new(settings.broker.acl, ACCESS.format(user=user))
+    calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
+    made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
     yield Step(settings.broker.acl, made, "access rules")
     # Last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
+
+
+def call_topics(bridge: config.Bridge) -> list[str]:
+    """The filters, in an ACL file's words, of all that is called on what is bridged, and of nothing
+    else: one's own goals are cancelled, and answers are read with the rest of the robot."""
+    found: list[str] = []
+    for service in bridge.services:
+        if service.to == "ros":
+            found += _below(service.mqtt, _filters(service.names), "_call")
+    for action in bridge.actions:
+        found += _below(action.mqtt, _filters(action.names), "_goal", "_cancel")
+    for route in bridge.parameters:
+        for name in route.names:
+            node, _, parameter = name.rpartition("/")
+            if not name.startswith("!"):
+                calls = (f"{_filter(parameter)}/set", "_set")
+                found += _below(route.mqtt, _filters([node]), *calls)
+    return list(dict.fromkeys(found))
+
+
+def _below(template: str, filters: list[str], *calls: str) -> list[str]:
+    """Each of the calls of each, with the token behind it that 3.1.1 has."""
+    bases = [template.replace("{ros}", one).replace("{node}", one) for one in filters]
+    return [f"{base}/{call}/#" for base in bases for call in calls]
+
+
+def _filters(names: Iterable[str]) -> list[str]:
+    """What of ROS names and patterns may be called, as filters: a part with a `*` is a `+`."""
+    found: list[str] = []
+    for name in names:
+        if name.startswith("!"):
+            continue
+        before, deep, after = name.partition("**")
+        depths = range(1, _DEPTH + 1) if deep else [0]
+        # "/arm/**" is all below /arm; before and after may have the beginning and end of a part.
+        middles = ["*" + "/*" * (depth - 1) if depth else "" for depth in depths]
+        found += ["/".join(map(_filter, f"{before}{m}{after}".split("/"))) for m in middles]
+    return found
+
+
+def _filter(part: str) -> str:
+    return "+" if "*" in part else part
 
 
 def _certificates(settings: config.Settings) -> Iterator[Step]:

@@ -17,8 +17,9 @@ from appliance.addresses import network
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
+from appliance.network import FAREWELLS, Authenticate, Certificates, Member, Network
 from appliance.sockets import allow_files, listen, listen_on_path
-from appliance.wire import FAREWELLS, Authenticate, Certificates, ClientProtocol, Network
+from appliance.wire import ClientProtocol
 
 log = logging.getLogger(__name__)
 
@@ -116,6 +117,10 @@ class Listeners:
     def addresses(self) -> list[tuple[str, int]]:
         """Where is listened, with the port that the system chose where it was 0."""
         return [door.address for door in self._doors]
+
+    def doors(self) -> list[tuple[str, ListenerSettings]]:
+        """Each listener's address, as the log has it, and its settings."""
+        return [(str(door), door.settings) for door in self._doors]
 
     def prepare(self, settings: list[ListenerSettings]) -> list[_Door]:
         """Get ready to listen there, for `take`; where is listened already nothing changes yet.
@@ -221,9 +226,9 @@ class Listeners:
             if self._stall is not None:
                 self._open_doors()
 
-    def _ended(self, protocol: ClientProtocol) -> None:
-        if protocol.host:
-            self._addresses.leave(protocol.host)
+    def _ended(self, member: Member) -> None:
+        if member.host:
+            self._addresses.leave(member.host)
 
     @property
     def crowded(self) -> bool:
@@ -249,8 +254,8 @@ class Listeners:
 
     async def check_certificates(self) -> None:
         """End the connections whose client's certificate is not, or no longer, accepted."""
-        for number, protocol in enumerate(list(self.network.open)):
-            protocol.check_certificate()
+        for number, member in enumerate(list(self.network.open)):
+            member.check_certificate()
             if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
                 await asyncio.sleep(0)
 

@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Literal, TextIO
@@ -21,6 +22,10 @@ _RESET = "\x1b[0m"
 VISIBLE = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
 VISIBLE |= {0x2028: "\\u2028", 0x2029: "\\u2029"}
 
+#: The last lines that were logged, for a crash's report.
+recent: deque[str] = deque(maxlen=100)
+_LONGEST_RECENT = 2000
+
 
 def setup(
     level: Level = "info",
@@ -34,7 +39,7 @@ def setup(
     single loggers, whoever's they are: `{"appliance.ros": "debug", "amqtt": "info"}`.
     """
     stream = stream or sys.stderr
-    handler = logging.StreamHandler(stream)
+    handler = _Handler(stream)
     colour = stream.isatty() and "NO_COLOR" not in os.environ
     handler.setFormatter(JsonFormatter() if form == "json" else HumanFormatter(colour=colour))
     root = logging.getLogger()
@@ -42,6 +47,13 @@ def setup(
     root.setLevel(logging.WARNING)
     for name, own in {"appliance": level, **(levels or {})}.items():
         logging.getLogger(name).setLevel(own.upper())
+
+
+class _Handler(logging.StreamHandler[TextIO]):
+    def format(self, record: logging.LogRecord) -> str:
+        line = super().format(record)
+        recent.append(line[:_LONGEST_RECENT])
+        return line
 
 
 class HumanFormatter(logging.Formatter):

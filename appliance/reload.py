@@ -29,6 +29,7 @@ NEEDS_RESTART: Final = (
     "robot",
     "control",
     "reload_on_change",
+    "crash_reports",
     "broker.store",
     "broker.plugins",
     "broker.plugin_answers",
@@ -64,6 +65,15 @@ class Parts:
 
 
 @dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a reload went: when by the loop's clock, whether it was done, and what was said of it."""
+
+    at: float
+    done: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class _Read:
     """What all files say now, checked, and not in force yet."""
 
@@ -78,6 +88,8 @@ class Reload:
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
         self._turn = asyncio.Lock()
+        #: Of the last one; None when there was none.
+        self.outcome: Outcome | None = None
 
     @property
     def settings(self) -> Settings:
@@ -106,12 +118,18 @@ class Reload:
             try:
                 changed = await self._run()
             except ReloadError as error:
+                self._ended(False, str(error))
                 log.error("not reloaded, what was in force stays so: %s", error)
                 if self._parts.audit is not None:
                     self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
                 raise
-            log.info("reloaded: %s", ", ".join(changed) or "nothing has changed")
+            text = ", ".join(changed) or "nothing has changed"
+            self._ended(True, text)
+            log.info("reloaded: %s", text)
             return changed
+
+    def _ended(self, done: bool, text: str) -> None:
+        self.outcome = Outcome(asyncio.get_running_loop().time(), done, text)
 
     async def renewed(self) -> None:
         """Take over the server's certificate, which is a new one.

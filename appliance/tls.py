@@ -11,8 +11,8 @@ import asyncio
 import contextlib
 import socket
 import ssl
-from collections.abc import Callable, Iterable
-from typing import Final, TypeAlias, cast
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, TypeAlias, cast
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -86,6 +86,7 @@ class TlsTransport:
         self._tcp: asyncio.Transport
         self._connected = False  # the protocol has heard of the connection
         self._open = False  # connected, and not closing
+        self._reading = True
         self._writable = True
         self._ended = False  # nothing more is to be read
         self._cut = True  # OpenSSL may have the beginning of a record
@@ -158,12 +159,14 @@ class TlsTransport:
             # Whoever makes OpenSSL answer again and again must read the answers.
             self.abort()
             return
-        if self._ended and self._error is None:
-            self._protocol.eof_received()
-        if self._ended:
-            self.close()
-        else:
+        if not self._ended:
             self._flush()
+            return
+        if self._error is None:
+            if not self._reading:  # what was said before it is still worked on
+                return
+            self._protocol.eof_received()
+        self.close()
 
     def _handshake_received(self, data: bytes) -> None:
         for start in range(0, len(data), PIECE):
@@ -270,11 +273,15 @@ class TlsTransport:
 
     def pause_reading(self) -> None:
         """Hand on nothing more."""
+        self._reading = False
         self._tcp.pause_reading()
 
     def resume_reading(self) -> None:
-        """Hand on what arrives."""
+        """Hand on what arrives, be it the end."""
+        self._reading = True
         self._tcp.resume_reading()
+        if self._ended:
+            self._loop.call_soon(self._react)
 
     def is_reading(self) -> bool:
         """Whether what arrives is handed on."""
@@ -309,3 +316,30 @@ class TlsTransport:
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
         """Tell another one what happens from now on."""
         self._protocol = cast(asyncio.Protocol, protocol)
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong in a handshake, in words for the person who reads the log."""
+    said = getattr(error, "reason", None) or str(error) or type(error).__name__
+    text = str(said).replace("_", " ").lower()
+    if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
+        return f"the client does not trust our certificate; does it have ca.crt? ({text})"
+    if "http request" in text or "wrong version number" in text:
+        return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
+    if "certificate verify failed" in text:
+        why = getattr(error, "verify_message", "")
+        return f"the client's certificate is not accepted: {why or text} (broker.tls.ca)"
+    if "peer did not return a certificate" in text:
+        return f"it has no client certificate, and one is required ({text})"
+    return text
+
+
+def name_in(certificate: Mapping[str, Any] | None) -> str:
+    """The common name of a certificate's subject, or else its first alternative name."""
+    if not certificate:
+        return ""
+    for part in certificate.get("subject", ()):
+        for key, value in part:
+            if key == "commonName":
+                return str(value)
+    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")

@@ -19,9 +19,10 @@ import uvloop
 from appliance.access import Passwords
 from appliance.app import App
 from appliance.config import Bind, Settings
-from appliance.environment import for_other_programs
 from appliance.init import PASSWORD_FILE
+from appliance.ros.installation import is_frozen
 
+RESET = "/reset"  # the demo robot's service, which the demo's configuration bridges
 STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -103,7 +104,6 @@ async def _start_robot(settings: Settings) -> Process | None:
         sys.executable,
         "-m",
         "appliance.demo",
-        env=for_other_programs(),
         # The robot must not drive on when this process is killed.
         preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
     )
@@ -134,13 +134,19 @@ def instructions(settings: Settings, host: str, port: int) -> str:
         f"-h {host} -p {port} --cafile {_quoted(settings.broker.tls.ca)} "
         f"-u {shlex.quote(user)} -P {shown}"
     )
-    command = _quoted(Path(sys.executable).parent / "appliance")
+    python = Path(sys.executable)
+    command = _quoted(python if is_frozen() else python.parent / "appliance")
     options = f"-c {_quoted(settings.file or Path('appliance.yaml'))} -u {shlex.quote(user)}"
     if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
         options += f" -p {port}"
     options += f" --password-file {_quoted(password)}" if password.exists() else ""
     robot = settings.robot
     twist = '\'{"linear": {"x": 0.5}, "angular": {"z": 0.3}}\''
+    call = ""
+    if any(RESET in route.names for route in settings.bridge.services):
+        call = (
+            f"put it back to its start, by a service of ROS:\n  {command} call {options} {RESET}\n"
+        )
     return f"""
 Ready. In another terminal, in this folder:
 
@@ -152,7 +158,7 @@ drive it:
 the same with this project's own command:
   {command} sub {options} -v '{robot}/odom'
   {command} pub {options} '{robot}/cmd_vel' -m {twist}
-
+{call}
 Ctrl-C here ends everything.
 """
 

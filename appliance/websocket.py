@@ -120,7 +120,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     def _take_on(self) -> None:
         self._take()
-        if not self._held and self._reading and not self._transport.is_closing():
+        if not self._reading or self._transport.is_closing():
+            return
+        if self._frames.close_rcvd is not None:
+            self._transport.close()
+        elif not self._held:
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:
@@ -200,7 +204,8 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._fail(CloseCode.MESSAGE_TOO_BIG, f"a frame that is too large ({error})")
         elif error is not None:
             self._fail(CloseCode.PROTOCOL_ERROR, str(error))
-        elif frames.close_rcvd is not None:
+        elif frames.close_rcvd is not None and self._reading:
+            # Else what is above has not read all that came before: a CONNECT, it may be.
             self._transport.close()
 
     def _answer(self, writes: list[bytes]) -> None:
@@ -274,7 +279,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def resume_reading(self) -> None:
         """Go on with what was received meanwhile."""
         self._reading = True
-        if self._held:
+        if self._held or self._frames.close_rcvd is not None:
             self._loop.call_soon(self._take_on)
         else:
             self._transport.resume_reading()

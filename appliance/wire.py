@@ -8,33 +8,16 @@ import os
 import socket
 import ssl
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from typing import Any, Protocol, TypeAlias, cast
+from typing import cast
 
-from appliance import tls
-from appliance.broker.broker import Broker
+from appliance import farewell, tls
 from appliance.broker.client import Client
-from appliance.broker.ports import Exchange, Identity, Refusal, Secured
+from appliance.broker.ports import Exchange, Refusal, Secured
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.network import PUBLISH_BURST, Network
 from appliance.websocket import WebSocket
-
-#: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
-Authenticate: TypeAlias = Callable[
-    [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
-]
-
-
-class Certificates(Protocol):
-    """What is to be known of a client's certificate, of a connection with TLS."""
-
-    def refusal(self, tls: ssl.SSLObject) -> str:
-        """Why the client is not, or no longer, let in with it; empty when it is."""
-
-    def username(self, tls: ssl.SSLObject) -> str | None:
-        """The user that it names; None when that is not asked for. ValueError: it names none."""
-
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
 #: read them: what a healthy one takes in one round of the event loop, with room to spare.
@@ -51,28 +34,17 @@ SYSTEM_OUTPUT = 128 * 1024
 #: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
 WRITE_PORTION = 512 * 1024
 
-#: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
-LARGEST_PORTION = 256 * 1024
-
 #: A chunk this large means that more is waiting. The loop would read on without writing out, up to
 #: 32 chunks in one go; reading is paused for the rest of the round, so that the receivers get
 #: theirs before they count as slow.
 LARGE_CHUNK = 128 * 1024
 
-#: Bytes of a chunk that are little, and messages that are few: after more than these it is checked
-#: whether who sends them has to wait.
+#: Bytes of a chunk that are little: after more than these it is checked whether who sends them has
+#: to wait.
 LITTLE = 16 * 1024
-FEW_MESSAGES = 64
-
-#: What all clients that send much may cause in one round of the event loop, see
-#: `Counters.effort`: some five milliseconds.
-EFFORT_A_ROUND = 5000
 
 #: Turns that a client takes, without a second's rest, until the log is told.
 MANY_TURNS = 200
-
-#: Seconds that a client may publish ahead of `limits.publish_rate`.
-PUBLISH_BURST = 1.0
 
 #: Seconds that a publisher is not read, after each check, while memory is short.
 SHORT_OF_MEMORY_PAUSE = 0.05
@@ -85,162 +57,6 @@ CLOSE_TIMEOUT = 10.0
 
 #: Seconds that one gets whose certificate was revoked.
 REVOKED_TIMEOUT = 1.0
-
-#: Seconds that a closed connection is listened to, the bytes that may come, and how many
-#: connections this is done for at a time.
-FAREWELL_TIMEOUT = 2.0
-FAREWELL_BYTES = 64 * 1024 * 1024
-FAREWELLS = 256
-
-
-class Network:
-    """All connections, and what they share; `ended` is told of each that ends, once.
-
-    `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
-    """
-
-    def __init__(
-        self,
-        broker: Broker,
-        authenticate: Authenticate,
-        exchange: Callable[[str, str | None], Exchange | None],
-        ended: Callable[[ClientProtocol], None],
-        *,
-        connect_timeout: float,
-        publish_rate: float,
-        certificates: Certificates | None = None,
-    ) -> None:
-        self.broker = broker
-        self.certificates = certificates
-        self.authenticate = authenticate
-        self.exchange = exchange
-        self.use(connect_timeout, publish_rate)
-        self.open: set[ClientProtocol] = set()
-        #: What runs in the background for a connection: TLS handshakes and logins.
-        self.tasks: set[asyncio.Task[None]] = set()
-        #: Bytes in the output of all clients, as far as they are counted.
-        self.output = 0
-        self._ended = ended
-        #: For how many clients a large chunk waits, by its id.
-        self._shared: dict[int, int] = {}
-        #: Who has more to do than there was time for; in turn, with all others in between.
-        self._turns: deque[ClientProtocol] = deque()
-        self._effort_begun = 0
-        self._counting = False
-        self._farewells: set[_Farewell] = set()
-        self._all_closed: asyncio.Event | None = None
-
-    def use(self, connect_timeout: float, publish_rate: float) -> None:
-        """Let these limits hold from now on, and those that the broker has now."""
-        self.connect_timeout = connect_timeout
-        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
-        #: Messages of a client after which it is checked.
-        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
-        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
-        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
-        #: `Ledger.queued_bytes` from which on publishers are slowed.
-        self.short_of_memory = self.broker.limits.memory * 3 // 4
-        #: Bytes in the output of all clients from which on less is allowed to each of them.
-        self.much_output = self.broker.limits.memory // 4
-
-    def is_busy(self) -> bool:
-        """Whether as much was done in this round of the event loop as one round is for.
-
-        Who sends much then waits. Who sends little does not, whatever the others do.
-        """
-        if not self._counting:
-            self._counting = True
-            self._effort_begun = self.broker.counters.effort
-            asyncio.get_running_loop().call_soon(self._new_round)
-        effort = self.broker.counters.effort - self._effort_begun
-        return effort > EFFORT_A_ROUND or bool(self._turns)
-
-    def _new_round(self) -> None:
-        self._counting = False
-
-    def queue_turn(self, protocol: ClientProtocol) -> None:
-        """Call `take_turn` when it is the protocol's."""
-        self._turns.append(protocol)
-        if len(self._turns) == 1:
-            asyncio.get_running_loop().call_soon(self._run_turns)
-
-    def _run_turns(self) -> None:
-        end = self.broker.counters.effort + EFFORT_A_ROUND
-        left = len(self._turns)
-        while left:
-            left -= 1
-            # Taken out after its turn, so that no entry meanwhile is the first, to be scheduled.
-            self._turns[0].take_turn()
-            self._turns.popleft()
-            if self.broker.counters.effort > end:
-                break
-        if self._turns:
-            asyncio.get_running_loop().call_soon(self._run_turns)
-
-    def in_background(self, work: Coroutine[object, object, None]) -> None:
-        """Run a connection's handshake or login beside everything else."""
-        task = asyncio.get_running_loop().create_task(work)
-        self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
-
-    def count_output(self, size: int) -> None:
-        """So many bytes more, or less, wait to be read by a client."""
-        self.output += size
-        self.broker.ledger.queued_bytes += size
-
-    def share(self, chunk: bytes) -> None:
-        """Count a large chunk that waits for a client: once, for however many it waits."""
-        clients = self._shared.get(id(chunk), 0)
-        if not clients:
-            self.count_output(len(chunk))
-        self._shared[id(chunk)] = clients + 1
-
-    def unshare(self, chunk: bytes) -> None:
-        """It waits for one client less."""
-        clients = self._shared.pop(id(chunk)) - 1
-        if clients:
-            self._shared[id(chunk)] = clients
-        else:
-            self.count_output(-len(chunk))
-
-    def closed(self, protocol: ClientProtocol) -> None:
-        """A connection ended."""
-        if protocol in self.open:
-            self.open.discard(protocol)
-            self._ended(protocol)
-        self._tell_when_all_closed()
-
-    def part(self, connection: socket.socket) -> None:
-        """Close a connection whose last bytes are on their way, see `_Farewell`."""
-        if len(self._farewells) < FAREWELLS:
-            farewell = _Farewell(connection, self._parted)
-            self._farewells.add(farewell)
-            farewell.listen()
-        else:
-            connection.close()
-
-    def _parted(self, farewell: _Farewell) -> None:
-        self._farewells.discard(farewell)
-        self._tell_when_all_closed()
-
-    def _tell_when_all_closed(self) -> None:
-        if self._all_closed is not None and not self.open and not self._farewells:
-            self._all_closed.set()
-
-    async def close(self, timeout: float) -> None:
-        """Close everything; who does not read the last bytes in so many seconds is cut off."""
-        for protocol in list(self.open):
-            protocol.close()
-        for task in list(self.tasks):
-            task.cancel()
-        if self.open or self._farewells:
-            self._all_closed = asyncio.Event()
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._all_closed.wait(), timeout)
-        for protocol in list(self.open):
-            protocol.abort()
-        for farewell in list(self._farewells):
-            farewell.end()
 
 
 class ClientProtocol:
@@ -313,7 +129,7 @@ class ClientProtocol:
             else:
                 await tls.accept(connection, context, protocol, self._network.connect_timeout)
         except (OSError, asyncio.TimeoutError) as error:
-            self.complain(f"no {'TLS ' if context else ''}connection", _tls_reason(error))
+            self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
             self._forget()
 
@@ -346,7 +162,7 @@ class ClientProtocol:
             return
         if self._client.session is None:
             self.complain("no TLS connection", reason)
-            self._client.abandon()
+            self._client.output.abandon()
         else:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
         self._broker.flush()
@@ -399,7 +215,7 @@ class ClientProtocol:
             self._broker.flush()
             # The client and its wire know each other: this lets both, and the TLS connection with
             # them, go now, and not when all that lives here is searched for garbage.
-            self._client.wire = _Gone(self.address)
+            self._client.let_go(_Gone(self.address))
 
     def _forget(self) -> None:
         self._network.closed(self)
@@ -596,7 +412,7 @@ class ClientProtocol:
         limit = OUTPUT_LOW_WATER if much else OUTPUT_HIGH_WATER
         size = self._output_size()
         if size > limit and self._slow is None:
-            self._client.writable = False
+            self._client.output.writable = False
             # From here on its output grows by what it is answered only, and by no more than this.
             self._output_limit = size + limit
             self._slow = self._loop.call_later(SLOW_AFTER, self._tell_slow)
@@ -626,14 +442,14 @@ class ClientProtocol:
         if self._slow is None:
             if self._has_told_behind:
                 self._has_told_behind = False
-                self._client.caught_up()
+                self._client.output.caught_up()
                 self._broker.flush()
             return
         self._slow.cancel()
         self._slow = None
         self._has_told_behind = False
         self._choked = False
-        self._client.resume_writing()
+        self._client.output.resume_writing()
         self._broker.flush()
         self._read_on()
 
@@ -683,7 +499,7 @@ class ClientProtocol:
         peer = self._transport.get_extra_info("ssl_object") if self._transport else None
         if peer is None:
             return Secured()
-        return Secured(peer.version() or "", _name_in(peer.getpeercert()))
+        return Secured(peer.version() or "", tls.name_in(peer.getpeercert()))
 
     def later(self) -> None:
         """Let the others have their turn, then let the client go on; it is not read before that."""
@@ -763,7 +579,7 @@ class ClientProtocol:
         assert self._transport is not None
         if not self._transport.get_write_buffer_size():
             self._timeout.cancel()
-            self._timeout = self._loop.call_later(FAREWELL_TIMEOUT, self._transport.abort)
+            self._timeout = self._loop.call_later(farewell.TIMEOUT, self._transport.abort)
         if self._connection is None and not self._transport.is_closing():
             # A transport closes its socket as soon as it has written: of that only a copy is left.
             with contextlib.suppress(OSError):
@@ -809,76 +625,3 @@ class _Gone:
 
     def close(self) -> None:
         """It is closed."""
-
-
-class _Farewell:
-    """A connection after its last byte was written, until the other side has closed it as well.
-
-    To close a socket that has unread input is to reset the connection, and that may take from the
-    other side what it has not read yet: the reason why it was disconnected. So this side says that
-    nothing more will come, and what still comes in is thrown away, for a while.
-    """
-
-    def __init__(self, connection: socket.socket, ended: Callable[[_Farewell], None]) -> None:
-        self._socket = connection
-        self._ended = ended
-        self._left = FAREWELL_BYTES
-        self._loop = asyncio.get_running_loop()
-        self._timeout = self._loop.call_later(FAREWELL_TIMEOUT, self.end)
-
-    def listen(self) -> None:
-        """Begin; it ends by itself."""
-        try:
-            self._socket.shutdown(socket.SHUT_WR)
-            self._loop.add_reader(self._socket, self._discard)
-        except OSError:  # the other side was quicker
-            self.end()
-
-    def _discard(self) -> None:
-        try:
-            size = self._socket.recv_into(_SCRATCH)
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError:
-            size = 0
-        self._left -= size
-        if not size or self._left < 0:
-            self.end()
-
-    def end(self) -> None:
-        """Close it; may be called twice."""
-        self._timeout.cancel()
-        if self._socket.fileno() >= 0:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-        self._ended(self)
-
-
-_SCRATCH = bytearray(256 * 1024)
-
-
-def _name_in(certificate: Mapping[str, Any] | None) -> str:
-    """The common name of a certificate's subject, or else its first alternative name."""
-    if not certificate:
-        return ""
-    for part in certificate.get("subject", ()):
-        for key, value in part:
-            if key == "commonName":
-                return str(value)
-    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")
-
-
-def _tls_reason(error: BaseException) -> str:
-    """What went wrong in a handshake, in words for the person who reads the log."""
-    reason = getattr(error, "reason", None) or str(error) or type(error).__name__
-    text = str(reason).replace("_", " ").lower()
-    if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
-        return f"the client does not trust our certificate; does it have ca.crt? ({text})"
-    if "http request" in text or "wrong version number" in text:
-        return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
-    if "certificate verify failed" in text:
-        why = getattr(error, "verify_message", "")
-        return f"the client's certificate is not accepted: {why or text} (broker.tls.ca)"
-    if "peer did not return a certificate" in text:
-        return f"it has no client certificate, and one is required ({text})"
-    return text

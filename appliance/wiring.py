@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from appliance.amqtt_broker import plugin_kinds
 from appliance.broker.ports import Features, Limits
 from appliance.certs import TlsContexts
 from appliance.certs.settings import listener_name, tls_files, tls_policies
-from appliance.config import Settings, TopicRoute
+from appliance.config import Route, Settings, TopicRoute
 from appliance.listeners import Admission, ListenerSettings
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.graph import (
@@ -20,6 +22,8 @@ from appliance.ros.graph import (
     ServiceSettings,
 )
 from appliance.ros.rules import CommandRules, OnSilence
+
+RouteT = TypeVar("RouteT", bound=Route)
 
 
 def access_files(settings: Settings) -> tuple[Path | None, Path | None]:
@@ -109,7 +113,7 @@ def routes(settings: Settings) -> list[RouteSettings]:
     """The ways between ROS and MQTT."""
     return [
         RouteSettings(
-            ros=route.ros,
+            ros=route.names[0] if len(names) == 1 else names,
             to=route.to,
             mqtt=route.topic(settings.robot),
             type=route.type,
@@ -121,10 +125,10 @@ def routes(settings: Settings) -> list[RouteSettings]:
             compression=route.compression,
             fields=tuple(route.fields),
             bytes_per_second=route.bytes_per_second,
-            largest=settings.broker.limits.packet_size,
+            largest=_largest(route, settings),
             rules=_command_rules(route) if route.command_keys else None,
         )
-        for route in settings.bridge.topics
+        for route, names in _named(settings.bridge.topics)
     ]
 
 
@@ -134,7 +138,7 @@ def call_routes(settings: Settings) -> CallRoutes:
     return CallRoutes(
         services=tuple(
             ServiceSettings(
-                ros=route.ros,
+                names=names,
                 mqtt=route.topic(robot),
                 to=route.to,
                 type=route.type,
@@ -142,30 +146,50 @@ def call_routes(settings: Settings) -> CallRoutes:
                 encoding=route.encoding,
                 on_error=None if route.on_error is None else json.dumps(route.on_error),
             )
-            for route in bridge.services
+            for route, names in _named(bridge.services)
         ),
         actions=tuple(
             ActionSettings(
-                ros=route.ros,
+                names=names,
                 mqtt=route.topic(robot),
                 type=route.type,
                 timeout=route.timeout,
+                encoding=route.encoding,
                 keep_result=route.keep_result,
+                cancel=route.cancel,
                 cancel_on_disconnect=route.cancel_on_disconnect,
             )
-            for route in bridge.actions
+            for route, names in _named(bridge.actions)
         ),
         parameters=tuple(
             ParameterSettings(
-                node=route.node,
-                name=route.name,
+                names=names,
                 mqtt=route.topic(robot),
                 timeout=route.timeout,
+                encoding=route.encoding,
             )
-            for route in bridge.parameters
+            for route, names in _named(bridge.parameters)
         ),
-        limits=CallLimits(bridge.limits.calls_per_client, bridge.limits.calls),
+        limits=CallLimits(
+            bridge.limits.calls_per_client, bridge.limits.calls, bridge.limits.payload
+        ),
     )
+
+
+def _largest(route: TopicRoute, settings: Settings) -> int:
+    """Bytes of a payload for ROS: `binary` is not converted, and takes no time."""
+    packet_size = settings.broker.limits.packet_size
+    payload = packet_size if route.encoding == "binary" else settings.bridge.limits.payload
+    return min(packet_size, payload)
+
+
+def _named(routes: Sequence[RouteT]) -> Iterator[tuple[RouteT, tuple[str, ...]]]:
+    """The routes that want something, and their names; with what the section leaves out."""
+    left_out = [name for route in routes if route.is_exclusion for name in route.names]
+    for route in routes:
+        if not route.is_exclusion:
+            has_pattern = any("*" in name for name in route.names)
+            yield route, (*route.names, *left_out) if has_pattern else route.names
 
 
 def _command_rules(route: TopicRoute) -> CommandRules:

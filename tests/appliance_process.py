@@ -62,6 +62,8 @@ class BrokerProcess:
         self.directory = directory
         self.ca = directory / "certs/ca.crt"
         self.passwords: dict[str, str] = {}
+        #: What its environment has beside this process's.
+        self.environment: dict[str, str] = {}
         self.port = 0
         self.plain_port = 0
         self._process: subprocess.Popen[str] | None = None

@@ -16,8 +16,9 @@ from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode
+from appliance.network import Network
 from appliance.store import MemoryStore
-from appliance.wire import ClientProtocol, Network
+from appliance.wire import ClientProtocol
 
 PATIENCE = 10.0  # seconds for what takes milliseconds
 

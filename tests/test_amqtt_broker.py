@@ -618,7 +618,7 @@ async def test_an_answer_in_the_background_that_turns_to_no(
 ) -> None:
     async with running({own(Gate): {}}) as rig:
         decide, asked = rig.frame._access.decide, rig.frame._access._asked
-        me, epoch = Identity("bob", "b1"), rig.broker.epoch
+        me, epoch = Identity("bob", "b1"), rig.broker.router.epoch
 
         async def answered() -> Decision:
             await until(lambda: asked == {})
@@ -628,7 +628,7 @@ async def test_an_answer_in_the_background_that_turns_to_no(
         assert not decide(me, Action.PUBLISH, "a")
         assert len(asked) == 1  # one question, however often it comes up
         assert await answered()
-        assert rig.broker.epoch > epoch
+        assert rig.broker.router.epoch > epoch
         assert len(Gate.asked) == 1
         monkeypatch.setattr(Answers, "of_topic", lambda self, allowed: 0.0)
         Gate.answers["a"] = None

@@ -226,8 +226,12 @@ def a_pipe(path: Path) -> Path:
     return path
 
 
+def in_no_folder(path: Path) -> Path:
+    return path / "absent/audit.log"
+
+
 @pytest.mark.parametrize(
-    "make", [a_directory, a_pipe, lambda path: path / "absent/audit.log"], ids=str
+    "make", [a_directory, a_pipe, in_no_folder], ids=lambda make: make.__name__
 )
 def test_a_path_that_cannot_be(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     with pytest.raises(AuditError, match=r"broker\.audit\.path"):

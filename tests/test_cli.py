@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance import cli
+from appliance import cli, console
 from appliance.access import Passwords
 from appliance.store import database
 
@@ -269,7 +269,7 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
 
     def target(**options: str | int | Path | None) -> object:
         given = {"config": None, "port": None, "ca": None, "user": "alice"} | options
-        return cli._target(
+        return console.connect_to(
             **given, host="h", password_file=None, client_id="", version="5", insecure=False
         )
 

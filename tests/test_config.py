@@ -83,8 +83,10 @@ def test_the_example_routes_of_the_reference_load() -> None:
         ("/odom", "mqtt"),
         ("/cmd_vel", "ros"),
         (("/camera/**", "!/camera/*/raw"), "mqtt"),
+        ("!/secret/**", "mqtt"),
         ("/**", "mqtt"),
     ]
+    assert [route.is_exclusion for route in routes] == [False, False, False, True, False]
     assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
     assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
     for called, model in (
@@ -144,8 +146,8 @@ log: {level: warn}
         "17: bridge.topics[0].ros: must be a full ROS name",
         "17: bridge.topics[0].to: must be mqtt, ros or both; did you mean 'mqtt'?",
         "18: bridge.topics[1].ros: is needed",
-        "18: bridge.topics[1].type: must be package/msg/Type",
         "18: bridge.topics[1].mqtt: knows the placeholders",
+        "18: bridge.topics[1].type: must be package/msg/Type",
         "19: bridge.topics[2].expires: unknown key; did you mean 'expire'?",
         "22: bridge.topics[3].clamp: linear.x must have its least before its most",
         "23: bridge.topics[3].on_silence.after: must be a duration such as",
@@ -364,12 +366,12 @@ def test_lists_of_names_and_patterns() -> None:
     loads(twice + "{ros: '/**', to: mqtt, type: b/msg/*}]}")
     assert any("same way" in p for p in problems(twice + "{ros: '/**', to: mqtt, type: a/msg/*}]}"))
     for wrong, what in {
-        "'!/a'": "only leaves topics out",
-        "['!/a', '!/b']": "only leaves topics out",
+        "'!/a'": "to: has no meaning for what is left out",
+        "['!/a', '!/b']": "to: has no meaning for what is left out",
         "[]": "must be a ROS name",
-        "[/a, 7]": "7 must be a ROS name",
-        "[/a, camera]": "'camera' must be a full ROS name",
-        "['/a', '!/b c']": "'!/b c' is not a ROS name",
+        "[/a, 7]": "ros[1]: must be a ROS name",
+        "[/a, camera]": "ros[1]: must be a full ROS name",
+        "['/a', '!/b c']": "ros[1]: is not a ROS name",
     }.items():
         assert any(what in p for p in problems(f"bridge: {{topics: [{{ros: {wrong}, to: mqtt}}]}}"))
     text = config.describe(loads("bridge: {topics: [{ros: ['/a/*', '!/a/b'], to: mqtt}]}"))
@@ -425,20 +427,22 @@ def test_what_is_called_can_be_named_or_described() -> None:
         "  services: [/reset, {ros: '/arm/**', type: 'std_srvs/srv/*'}, '!/arm/off']\n"
         "  actions: [{ros: /walk, keep_result: 1 min, cancel_on_disconnect: true}]\n"
         "  parameters: [/arm/*, '/**/use_*', '!/arm/key']\n"
-        "  limits: {calls: 9, calls_per_client: 3}"
+        "  limits: {calls: 9, calls_per_client: 3, payload: 2 MiB}"
     ).bridge
-    assert [(r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services] == [
-        ("/reset", False, "r2{ros}"),
+    assert [
+        (r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services if not r.is_exclusion
+    ] == [
+        ("/reset", False, "r2/reset"),
         ("/arm/**", True, "r2{ros}"),
-        ("!/arm/off", False, "r2{ros}"),
     ]
+    assert [r.is_exclusion for r in bridge.services] == [False, False, True]
     assert bridge.actions[0].keep_result == 60
-    assert [(r.node, r.name, r.is_pattern) for r in bridge.parameters] == [
-        ("/arm", "*", False),
-        ("/**", "use_*", True),
-        ("!/arm", "key", False),
+    assert [(r.ros, r.is_pattern, r.is_exclusion) for r in bridge.parameters] == [
+        ("/arm/*", False, False),
+        ("/**/use_*", True, False),
+        ("!/arm/key", False, True),
     ]
-    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3)
+    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3, payload=2 << 20)
 
 
 @pytest.mark.parametrize(
@@ -478,7 +482,8 @@ bridge:
   - {{ros: /a, to: mqtt, encoding: cdr}}
   - {{ros: /b, to: mqtt, encoding: ros1}}
   services: [{{ros: /c, encoding: cdr}}, {{ros: /d, encoding: ros1}}]
-  parameters: [/e, "!/f", /g/h]
+  actions: [{{ros: /e, encoding: ros1}}]
+  parameters: [/e, "!/f", /g/*]
 """
     text = "must be {}: that is what ROS's own bytes are with bus: {}"
     assert problems(bridge.format(bus="ros1")) == [
@@ -488,17 +493,78 @@ bridge:
         f"8: bridge.services[0].encoding: {text.format('ros1', 'ros1')}",
     ]
     found = problems(bridge.format(bus="ros2"))
-    assert found[:2] == [
+    assert found[:3] == [
         f"7: bridge.topics[1].encoding: {text.format('cdr', 'ros2')}",
         f"8: bridge.services[1].encoding: {text.format('cdr', 'ros2')}",
+        f"9: bridge.actions[0].encoding: {text.format('cdr', 'ros2')}",
     ]
-    assert [line.partition(" must be")[0] for line in found[2:]] == [
-        "9: bridge.parameters[0].ros:",
-        "9: bridge.parameters[1].ros:",
+    assert [line.partition(" must be")[0] for line in found[3:]] == [
+        "10: bridge.parameters[0].ros:",
+        "10: bridge.parameters[1].ros:",
     ]
 
 
 def test_what_is_called_twice_is_told() -> None:
     assert problems("bridge: {actions: [/a, {ros: /a, timeout: 1 s}]}") == [
-        "1: bridge.actions[1].ros: is the same as bridge.actions[0]"
+        "1: bridge.actions[1].ros: is the same as in bridge.actions[0]"
     ]
+
+
+def test_what_would_be_called_at_one_topic_is_told() -> None:
+    assert problems("bridge: {services: [{ros: /a, mqtt: x}, {ros: /b, mqtt: x}]}") == [
+        "1: bridge.services[1].mqtt: is the topic of bridge.services[0]"
+    ]
+    assert problems("bridge: {parameters: [/a/b, /a/c, {ros: /c/b, mqtt: '{robot}/a/_param'}]}")
+
+
+SECTIONS = {"topics": ", to: mqtt", "services": "", "actions": "", "parameters": ""}
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_all_routes_are_listed_in_the_same_words(section: str) -> None:
+    more = SECTIONS[section]
+    lists = loads(
+        f"bridge:\n  {section}:\n"
+        f"  - {{ros: /odom/x{more}}}\n"
+        f"  - {{ros: ['/arm/**', /leg/x, '!/arm/off/x']{more}}}\n"
+        "  - '!/arm/raw/*'\n"
+        "  - ros: ['!/a/b', '!/a/c']\n"
+    )
+    first, many, *left_out = getattr(lists.bridge, section)
+    assert first.names == ("/odom/x",) and not first.is_pattern and not first.is_exclusion
+    assert many.names == ("/arm/**", "/leg/x", "!/arm/off/x") and many.is_pattern
+    assert [one.names for one in left_out] == [("!/arm/raw/*",), ("!/a/b", "!/a/c")]
+    assert all(one.is_exclusion and not one.is_pattern for one in left_out)
+    again = config.loads(yaml.safe_dump(config.describe(lists)), HERE)
+    assert [one.names for one in getattr(again.bridge, section)] == [
+        one.names for one in getattr(lists.bridge, section)
+    ]
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_mistakes_in_a_list_are_told_with_their_line(section: str) -> None:
+    more = SECTIONS[section].replace(", ", "\n    ")
+    found = problems(
+        f"bridge:\n  {section}:\n  - ros:\n    - /arm/**\n    - '!/arm off/x'{more}\n"
+        "  - '!/a/b'\n  - leg\n"
+    )
+    assert len(found) == 2, found
+    assert found[0].startswith(f"5: bridge.{section}[0].ros[1]: is not a ROS name"), found
+    line = 7 + bool(more)
+    assert found[1].startswith(f"{line}: bridge.{section}[2].ros: must be a"), found
+    (found_here,) = problems(f"bridge:\n  {section}: ['!/a/b']")
+    assert found_here == (
+        f"2: bridge.{section}[0].ros: leaves nothing out: there is no pattern in bridge.{section}"
+    )
+
+
+def test_what_is_said_beside_names() -> None:
+    assert problems("bridge: {topics: [/odom]}") == ["1: bridge.topics[0].to: is needed"]
+    short = loads("bridge: {services: [[/a, /b]], parameters: [[/a/x, '/b/*', '!/b/y']]}").bridge
+    assert short.services[0].names == ("/a", "/b") and short.services[0].topic("r") == "r{ros}"
+    assert short.parameters[0].is_pattern
+    assert problems("bridge: {actions: [/a, [/b, /a]]}") == [
+        "1: bridge.actions[1].ros[1]: is the same as in bridge.actions[0]"
+    ]
+    (found,) = problems("bridge: {services: [{ros: [/a, /b], to: mqtt, type: a/srv/B}]}")
+    assert "to: must be ros when ros is a pattern or a list" in found

@@ -71,6 +71,76 @@ def test_the_first_user_reads_all_of_the_robot_and_writes_what_is_listed(tmp_pat
         assert not any(acl.decide(nobody, *key).allowed for key in expected)
 
 
+CALLS = """\
+robot: r2
+bridge:
+  services:
+    - /reset
+    - ["/arm/**", "!/arm/off"]
+    - {ros: "/gripper/*", mqtt: "{robot}/hand{ros}"}
+    - {ros: /ask, to: mqtt, type: std_srvs/srv/SetBool}
+  actions: [/navigate]
+  parameters: [/controller/max_speed, "/**/use_*", "!/secret/use_key"]
+"""
+
+
+def test_the_first_user_may_call_what_is_bridged_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "appliance.yaml").write_text(CALLS)
+    list(initialise(tmp_path, user="alice"))
+    lines = (tmp_path / "acl.conf").read_text().splitlines()
+    assert [line for line in lines if line.startswith("topic write")] == [
+        "topic write {robot}/cmd_vel",
+        "topic write {robot}/reset/_call/#",
+        "topic write {robot}/arm/+/_call/#",
+        "topic write {robot}/arm/+/+/_call/#",
+        "topic write {robot}/arm/+/+/+/_call/#",
+        "topic write {robot}/hand/gripper/+/_call/#",
+        "topic write {robot}/navigate/_goal/#",
+        "topic write {robot}/navigate/_cancel/#",
+        "topic write {robot}/controller/_param/max_speed/set/#",
+        "topic write {robot}/controller/_param/_set/#",
+        "topic write {robot}/+/_param/+/set/#",
+        "topic write {robot}/+/_param/_set/#",
+        "topic write {robot}/+/+/_param/+/set/#",
+        "topic write {robot}/+/+/_param/_set/#",
+        "topic write {robot}/+/+/+/_param/+/set/#",
+        "topic write {robot}/+/+/+/_param/_set/#",
+    ]
+    acl = Acl.load(tmp_path / "acl.conf", "r2")
+    alice = Identity("alice", "tablet")
+    for topic, may in {
+        "r2/reset/_call": True,
+        "r2/reset/_call/42": True,
+        "r2/arm/left/grip/_call": True,
+        "r2/navigate/_goal": True,
+        "r2/navigate/_cancel/1": True,
+        "r2/node/_param/use_sim_time/set": True,
+        "r2/controller/_param/max_speed": False,
+        "r2/navigate/_cancel_any": False,
+        "r2/navigate/_result/1": False,
+        "r2/stop/_call": False,
+        "r2/ask/_response/1": False,
+        "r2/arm/joint": False,
+        "r2/reset": False,
+    }.items():
+        assert acl.decide(alice, Action.PUBLISH, topic).allowed is may, topic
+    assert acl.decide(alice, Action.RECEIVE, "r2/reset/_reply/tablet/42").allowed
+    assert [f for f in check(config.load(tmp_path / "appliance.yaml")) if f.level == "error"] == []
+
+
+def test_where_nothing_is_called_yet_the_lines_are_shown(tmp_path: Path) -> None:
+    list(initialise(tmp_path, robot="r2", user="alice"))
+    text = (tmp_path / "acl.conf").read_text()
+    assert (
+        not Acl.load(tmp_path / "acl.conf", "r2")
+        .decide(Identity("alice", "tablet"), Action.PUBLISH, "r2/reset/_call")
+        .allowed
+    )
+    (tmp_path / "acl.conf").write_text(text.replace("\n#topic", "\ntopic"))
+    acl = Acl.load(tmp_path / "acl.conf", "r2")
+    assert acl.decide(Identity("alice", "tablet"), Action.PUBLISH, "r2/reset/_call").allowed
+
+
 def test_a_second_time_everything_is_kept(tmp_path: Path) -> None:
     list(initialise(tmp_path))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -123,6 +193,8 @@ def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
         ("/chatter", "mqtt"),
         ("/cmd_vel", "ros"),
     }
+    assert [route.ros for route in settings.bridge.services] == ["/reset"]
+    assert "topic write {robot}/reset/_call/#\n" in (tmp_path / "acl.conf").read_text()
 
 
 def test_what_cannot_be(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ import uvloop
 import yaml
 from house import PATIENCE, Caller, House, make_contexts, until
 
-from appliance import config, listeners, sockets, wire, wiring
+from appliance import config, farewell, listeners, network, sockets, wire, wiring
 from appliance.broker.ports import Limits
 from appliance.listeners import Admission, ListenerSettings
 from appliance.mqtt.packets import (
@@ -372,7 +372,7 @@ async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeyp
     publisher = await house.join("pub")
     for _ in range(10):
         await publisher.say(Publish("a", bytes(MIB)))
-    await until(lambda: not house.protocol("deaf")._client.writable)
+    await until(lambda: not house.protocol("deaf")._client.output.writable)
     await caller.say(b"\0\0")
     await until(lambda: len(house.network.open) == 1)
 
@@ -389,7 +389,7 @@ async def test_stop_with_open_clients(house: House, tls):
         await callers[0].say(Publish("a", bytes(MIB)))
     await callers[0].say(Pingreq())  # all of it has been read, or a reset would be the answer
     assert isinstance(await callers[0].hear(), Pingresp)
-    assert not house.protocol("deaf")._client.writable
+    assert not house.protocol("deaf")._client.output.writable
     await asyncio.wait_for(house.listeners.stop(), PATIENCE)
     for caller in callers:
         assert await caller.hear() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
@@ -468,8 +468,8 @@ async def test_the_reason_reaches_who_is_still_sending(house: House, tls):
 
 async def test_a_farewell_is_bounded(house: House, monkeypatch):
     """Who neither closes its end nor stops sending is not listened to for long."""
-    monkeypatch.setattr(wire, "FAREWELL_TIMEOUT", 0.2)
-    monkeypatch.setattr(wire, "FAREWELLS", 2)
+    monkeypatch.setattr(farewell, "TIMEOUT", 0.2)
+    monkeypatch.setattr(network, "FAREWELLS", 2)
     await house.start()
     callers = [await house.join(f"c{n}") for n in range(4)]
     for caller in callers:
@@ -478,8 +478,8 @@ async def test_a_farewell_is_bounded(house: House, monkeypatch):
     await until(lambda: not house.network.open)
     assert len(house.network._farewells) <= 2
     await until(lambda: not house.network._farewells)
-    monkeypatch.setattr(wire, "FAREWELL_TIMEOUT", PATIENCE)
-    monkeypatch.setattr(wire, "FAREWELL_BYTES", MIB)
+    monkeypatch.setattr(farewell, "TIMEOUT", PATIENCE)
+    monkeypatch.setattr(farewell, "BYTES", MIB)
     caller = await house.join("loud")
     await caller.say(Connect("again"))
     with pytest.raises(ConnectionError):
@@ -803,7 +803,7 @@ async def test_a_rate_holds_for_the_smallest_messages(house: House):
 
 
 async def test_what_is_cut_in_portions_stays_in_order(house: House, monkeypatch):
-    monkeypatch.setattr(wire, "LARGEST_PORTION", 16)
+    monkeypatch.setattr(network, "LARGEST_PORTION", 16)
     await house.start()
     caller = await house.join("self")
     await caller.say(Subscribe(1, [Subscription("#")]))
@@ -916,7 +916,7 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: House, c
     ledger.queued_bytes += 7 * MIB
     try:
         assert await publish(10, 20_000) > 9 * wire.SHORT_OF_MEMORY_PAUSE
-        assert await publish(5 * wire.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
+        assert await publish(5 * network.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
         assert "is slowed" in caplog.text and "broker.limits.memory" in caplog.text
         reader = await house.join("reader")
         began = loop.time()

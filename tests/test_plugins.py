@@ -183,7 +183,7 @@ async def test_so_many_at_once_and_no_more(
     backend: Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(logins_module, "LOGINS", 3)
-    async with running(backend.plugins(), plugin_timeout=0.5) as rig:
+    async with running(backend.plugins(), plugin_timeout=1.5) as rig:
         asks = [
             rig.frame.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
             for n in range(10)

@@ -569,6 +569,20 @@ async def test_the_client_says_goodbye(house: House):
     assert await caller.hear_raw_end() == b""
 
 
+async def test_who_has_paused_reading_hears_of_the_goodbye_later(house: House):
+    """As over TCP: what was said before it may take time to answer, a login for one."""
+    caller, served = await house.join(lambda served, data: served.transport.pause_reading())
+    await caller.put(caller.seal(b"last words") + caller.seal_end())
+    await until(lambda: served.data)
+    await turns(20)
+    assert served.heard == ["made", "data"] and not served.transport.is_closing()
+    served.transport.write(b"heard")
+    served.transport.resume_reading()
+    await served.ended()
+    assert served.heard == ["made", "data", "eof", "lost"] and served.error is None
+    assert await caller.hear_the_end() == b"heard"
+
+
 @pytest.mark.parametrize("part", [0.0, 0.5])
 async def test_a_connection_that_is_closed_without_goodbye(house: House, part):
     """At the end of a record or in its middle: whole records count, and are still answered."""

@@ -60,6 +60,7 @@ async def test_what_is_printed_can_be_typed(demo: Path) -> None:
         printed = [line.strip() for line in await lines_until(process, "Ctrl-C")]
         see = next(line for line in printed if line.startswith("mosquitto_sub"))
         drive = next(line for line in printed if line.startswith("mosquitto_pub"))
+        assert any(line.endswith("user.password /reset") for line in printed)
         ours = next(line for line in printed if "appliance sub" in line)
 
         state = "demo/_appliance/state"

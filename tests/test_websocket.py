@@ -369,14 +369,16 @@ async def test_a_text_frame_ends_the_connection(house: House, caplog):  # [MQTT-
 @pytest.mark.parametrize(
     ("data", "code"),
     [
-        (Frame(Opcode.BINARY, b"\xc0\0").serialize(mask=False), 1002),
-        (b"\xc2" + frame(b"\xc0\0")[1:], 1002),  # a reserved bit
-        (b"\x83" + frame(b"\xc0\0")[1:], 1002),  # an unknown kind
-        (frame(b"\xc0\0", Opcode.CONT), 1002),  # of nothing
-        (frame(b"\xc0", fin=False) + frame(b"\0"), 1002),  # a message inside a message
-        (b"\x09\x80\0\0\0\0", 1002),  # a part of a ping
-        (b"\x89\xfe\x00\x7e" + bytes(4 + 126), 1002),  # a ping that is too long
-        (b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009),
+        pytest.param(Frame(Opcode.BINARY, b"\xc0\0").serialize(mask=False), 1002, id="not masked"),
+        pytest.param(b"\xc2" + frame(b"\xc0\0")[1:], 1002, id="a reserved bit"),
+        pytest.param(b"\x83" + frame(b"\xc0\0")[1:], 1002, id="an unknown kind"),
+        pytest.param(frame(b"\xc0\0", Opcode.CONT), 1002, id="more of nothing"),
+        pytest.param(
+            frame(b"\xc0", fin=False) + frame(b"\0"), 1002, id="a message inside a message"
+        ),
+        pytest.param(b"\x09\x80\0\0\0\0", 1002, id="a part of a ping"),
+        pytest.param(b"\x89\xfe\x00\x7e" + bytes(4 + 126), 1002, id="a ping that is too long"),
+        pytest.param(b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009, id="too long"),
     ],
 )
 async def test_wrong_frames_end_the_connection(house: House, data, code, caplog):
@@ -576,6 +578,37 @@ async def test_what_was_said_before_the_close_frame_is_done(house: House):
     await until(lambda: not house.network.open)
     assert house.broker.counters.publish_received == 2000
     assert not house.broker.sessions
+
+
+@pytest.mark.parametrize("ends", [True, False], ids=["with DISCONNECT", "with its will"])
+async def test_what_was_said_before_the_login_and_the_close_frame_is_done(house: House, ends):
+    """As over TCP: that it is gone already keeps a client neither out nor from being heard."""
+    house.gate.clear()
+    await house.start()
+    watcher = await shake_hands(house)
+    caller = await shake_hands(house)
+    data = Connect("brief", will=Will("w", b"gone")).encode(5)
+    data += Publish("a", b"kept", retain=True).encode(5) * 3
+    data += Disconnect().encode(5) if ends else b""
+    await caller.say(frame(data) + frame(b"", Opcode.CLOSE))
+    await until(lambda: house.network.tasks)
+    assert len(house.network.open) == 2 and not house.broker.sessions
+    house.gate.set()
+    await until(lambda: len(house.network.open) == 1)
+    assert house.broker.counters.publish_received == 3
+    assert house.broker.counters.connects == 1 and not house.broker.sessions
+    await watcher.say(frame(Connect("watcher").encode(5)))
+    assert (await hear_frame(watcher))[0] == BINARY
+
+
+async def test_who_closes_before_the_login_is_not_waited_for_longer_than_others(house: House):
+    house.gate.clear()
+    await house.start(connect_timeout=0.3)
+    caller = await shake_hands(house)
+    await caller.say(frame(Connect("brief").encode(5)) + frame(b"", Opcode.CLOSE))
+    await until(lambda: not house.network.open)
+    house.gate.set()
+    assert house.broker.counters.connects == 0
 
 
 async def test_stop_with_open_clients(house: House):

@@ -98,7 +98,7 @@ class PluginAccess:
     def changed(self) -> None:
         """Let what was decided be decided again."""
         self._epoch += 1
-        self._broker.epoch += 1
+        self._broker.router.changed()
 
     def close(self) -> None:
         """Ask no more."""

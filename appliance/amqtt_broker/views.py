@@ -12,6 +12,7 @@ from amqtt.session import Session as AmqttSession
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
+from appliance.broker.output import Output
 from appliance.broker.ports import Identity
 from appliance.broker.session import Session
 from appliance.mqtt.codec import V5, Property
@@ -61,7 +62,7 @@ def _shown(session: Session) -> AmqttSession:
     shown.username = session.identity.username if session.identity else None
     shown.is_anonymous = shown.username is None
     shown.clean_session = not session.persistent
-    if isinstance(session.link, Client):
+    if isinstance(session.link, Output):
         shown.remote_address, shown.remote_port = _split(session.link.wire.address)
     if session.will is not None:
         will = session.will.message
@@ -122,7 +123,7 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
     def _claim_login(self, session: Session) -> AmqttSession | None:
         """What plugins saw of the login behind the session's connection, once."""
         link, identity = session.link, session.identity
-        login = self._logins.pop(link.wire.address, None) if isinstance(link, Client) else None
+        login = self._logins.pop(link.wire.address, None) if isinstance(link, Output) else None
         # An address can be used again; who it is cannot be mistaken.
         if (
             login is None

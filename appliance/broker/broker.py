@@ -11,18 +11,16 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
-from appliance.broker.kept import Kept, Owed
+from appliance.broker.ledger import Ledger
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
     Access,
     Action,
-    Decision,
     Features,
-    Guard,
     Identity,
     Journal,
     Limits,
@@ -30,56 +28,36 @@ from appliance.broker.ports import (
     Observer,
     Store,
 )
-from appliance.broker.session import (
-    LEVEL_SIZE,
-    Delivery,
-    Held,
-    Ledger,
-    PendingWill,
-    Session,
-    subscription_size,
-)
+from appliance.broker.retained import Retained
+from appliance.broker.routing import Route, Router
+from appliance.broker.session import Delivery, Held, PendingWill, Session, subscription_size
 from appliance.broker.shared import Share, Target
-from appliance.mqtt.codec import Property, decode_string, quote
+from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import (
-    SubscriptionTree,
-    TopicTree,
-    check_filter,
-    check_topic,
-    parse_shared,
-)
+from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
-
-#: Topics a session's routes are cached for; a client that publishes to more starts over, so that
-#: a stranger's invented topics cannot grow the cache.
-CACHED_ROUTES = 1024
-
-#: And the longest of these topics, in bytes.
-CACHED_TOPIC = 512
-
-#: Entries and targets in the caches of all sessions together, some 80 bytes each.
-CACHED_IN_ALL = 500_000
 
 #: Seconds that a QoS 2 exchange may take before its message counts as late.
 LATE = 0.1
 
-#: The effort to find a route, see `Counters.effort`; each match comes on top.
-ROUTE_EFFORT = 20
-
-#: Retained messages that one tick lets expire.
-EXPIRED_A_TURN = 1024
-
 #: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
 
-_ALLOWED = Decision(True, "the appliance itself")
-
 
 class Ticking(Protocol):
-    """A network client, as the broker's clock sees it."""
+    """A network client, as the broker's clock and its store see it."""
+
+    def tick(self, now: float) -> bool:
+        """Check its keep alive; True when that ended the connection."""
+
+    def resume(self) -> None:
+        """The store keeps again what is to be kept."""
+
+
+class Flushing(Protocol):
+    """What a network client is sent, as the flush and the commits see it."""
 
     def flush(self) -> None:
         """Write what was sent to it."""
@@ -90,38 +68,12 @@ class Ticking(Protocol):
     def release(self, committed: int) -> bool:
         """Write what does not depend on a later batch; True when some does."""
 
-    def resume(self) -> None:
-        """The store keeps again what is to be kept."""
-
     def abandon(self) -> None:
         """Close it without writing what was sent to it."""
-
-    def tick(self, now: float) -> bool:
-        """Check its keep alive; True when that ended the connection."""
-
-
-@dataclass(slots=True)
-class Route:
-    """What is known about one topic for one publishing session, until the epoch changes."""
-
-    topic: str
-    allowed: bool
-    #: The rule that decided.
-    reason: str
-    targets: list[Target]
-    #: Shared subscriptions, and those of their members that may receive the topic.
-    shares: list[tuple[Share, list[Target]]]
-    #: Whether there is any subscription to the topic, be it of a client that gets nothing.
-    subscribed: bool
 
 
 #: Who a message may be owed to: a session, or one of a group.
 Receiver: TypeAlias = "Session | Share"
-
-
-def retained_size(message: Message) -> int:
-    """Bytes that are counted for a retained message: it, and its topic's levels in the tree."""
-    return message.size + LEVEL_SIZE * message.topic.count("/")
 
 
 class Broker:
@@ -134,44 +86,33 @@ class Broker:
         limits: Limits | None = None,
         features: Features | None = None,
     ) -> None:
-        self.access = access
         self.store = store
         self.limits = limits or Limits()
         self.features = features or Features()
         self.complaints = Complaints()
-        self.ledger = Ledger(self.limits, store, may_keep=self._may_keep)
+        self.ledger = Ledger(self.limits, store)
         #: What the broker counts.
         self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
-        self.retained: TopicTree[Message] = TopicTree()
-        self.retained_bytes = 0
+        self.router = Router(access, self.ledger, self.sessions)
+        self.ledger.may_keep = self.router.may_keep
+        self.retained = Retained(self.ledger, self.complaints, self._retained_changed)
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
-        self.guards: dict[str, list[Guard]] = {}
+        self.guards = self.router.guards
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
         self.journal: Journal | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
-        #: Network clients with bytes to write.
-        self.unflushed: list[Ticking] = []
-        #: Network clients with bytes that wait for a commit, in the order in which they do.
-        self._waiting: dict[Ticking, None] = {}
+        #: The outputs of network clients with bytes to write.
+        self.unflushed: list[Flushing] = []
+        #: Those with bytes that wait for a commit, in the order in which they do.
+        self._waiting: dict[Flushing, None] = {}
         store.listen(self._committed)
-        #: Grows whenever a cached route may be wrong.
-        self.epoch = 0
-        self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
-            SubscriptionTree()
-        )
-        #: Shared subscriptions by their whole filter.
-        self._shares: dict[str, Share] = {}
         self._deadlines: list[tuple[float, int, Session]] = []
         self._order = itertools.count()
-        #: When retained messages expire, soonest first.
-        self._expiring: list[tuple[float, int, Message]] = []
-        #: Entries and targets that went into the sessions' caches since these were last cleared.
-        self._cached = 0
 
     @property
     def now(self) -> float:
@@ -181,12 +122,12 @@ class Broker:
     @property
     def subscription_count(self) -> int:
         """Subscriptions of all sessions; a shared one counts once."""
-        return len(self._subscriptions)
+        return len(self.router)
 
     @property
     def shared_subscription_count(self) -> int:
         """Shared subscriptions, whatever the number of their members."""
-        return len(self._shares)
+        return len(self.router.shares)
 
     # --- sessions ------------------------------------------------------------------------------
 
@@ -243,7 +184,7 @@ class Broker:
         session.identity = identity
         self.store.session_saved(session)
         session.readable.clear()
-        self.epoch += 1
+        self.router.changed()
 
     def connected(self, session: Session) -> None:
         """The CONNACK was sent: observers may know, and what waits may go."""
@@ -295,13 +236,11 @@ class Broker:
             self._end(session)
             return
         session.ends_at = self.now + session.expiry
-        self._schedule(session.ends_at, session)
-        if will is not None:
-            if will.delay:
-                session.will_at = self.now + will.delay
-                self._schedule(session.will_at, session)
-            else:
-                self._publish_will(session)
+        if will is not None and will.delay:
+            session.will_at = self.now + will.delay
+        self.schedule(session)
+        if will is not None and not will.delay:
+            self._publish_will(session)
         self.store.session_saved(session)
 
     def _tell_departure(self, session: Session) -> None:
@@ -315,30 +254,16 @@ class Broker:
         self._publish_will(session)
         session.ends_at = None
         for topic_filter in session.subscriptions:
-            self._leave(session, topic_filter)
-        if session.subscriptions:
-            self.epoch += 1
+            self.router.leave(session, topic_filter)
         session.hand_over(None, self._giver(absent_too=True), sent=True)
         session.clear()
         self.store.session_removed(session)
-
-    def _leave(self, session: Session, topic_filter: str) -> None:
-        """Take a subscription out of the tree, or a member out of its group."""
-        share = self._shares.get(topic_filter)
-        if share is None:
-            self._subscriptions.remove(topic_filter, session)
-            return
-        share.members.pop(session, None)
-        if not share.members:
-            del self._shares[topic_filter]
-            _, inner = parse_shared(topic_filter) or ("", "")
-            self._subscriptions.remove(inner, topic_filter)
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
         give = self._giver(absent_too=False)
         for topic_filter in session.subscriptions:
-            share = self._shares.get(topic_filter)
+            share = self.router.shares.get(topic_filter)
             if share is not None and any(member.link is not None for member in share.members):
                 session.hand_over(share, give, sent=True)
 
@@ -353,7 +278,7 @@ class Broker:
                 return True
             members = known.get((share, message.topic))
             if members is None:
-                members = self._members(share, message.topic)
+                members = self.router.members(share, message.topic)
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
                 known[share, message.topic] = members
@@ -377,192 +302,47 @@ class Broker:
     def _is_alive(self, session: Session) -> bool:
         return session.ends_at is None or session.ends_at > self.now
 
-    # --- what the store kept -------------------------------------------------------------------
+    # --- limits and rules ----------------------------------------------------------------------
 
-    def restore(self, kept: list[Kept], retained: list[Message]) -> None:
-        """Take up the sessions and retained messages of the last run, before anybody connects.
+    @property
+    def access(self) -> Access:
+        """The access rules in force."""
+        return self.router.access
 
-        A client that was connected when that ended counts as gone since now: so do the time that
-        its session is kept, and the delay of its will. A session that was not to outlive its
-        connection is there for its will alone, which the next tick publishes (3.1.1 section
-        3.1.2.5, 5.0 section 3.1.2.5).
-        """
-        for entry in kept:
-            session = Session(entry.identity.client_id, entry.identity, self.ledger)
-            entry.session = self.sessions[session.client_id] = session
-            session.expiry = entry.expiry
-            session.set_will(entry.will)
-            session.ends_at = entry.ends_at
-            session.will_at = entry.will_at
-            if session.ends_at is None:
-                session.ends_at = self.now + session.expiry
-                if entry.will is not None:
-                    session.will_at = self.now + min(entry.will.delay, session.expiry)
-            self._schedule(session.ends_at, session)
-            if session.will_at is not None:
-                self._schedule(session.will_at, session)
-            for subscription in entry.subscriptions:
-                session.subscribe(subscription)
-                self._join(session, subscription)
-        for entry in kept:  # what is owed names sessions and groups, all of which are there now
-            self._restore_owed(entry)
-        for message in retained:
-            self.retained.set(message.topic, message)
-            self.retained_bytes += retained_size(message)
-            if message.expires_at is not None:
-                self._schedule_expiry(message)
-        self.epoch += 1
-
-    def _restore_owed(self, entry: Kept) -> None:
-        def delivery(owed: Owed) -> Delivery:
-            share = self._shares.get(owed.share) if owed.share is not None else None
-            return Delivery(owed.message, owed.qos, owed.retain, owed.subscription_ids, share)
-
-        assert entry.session is not None
-        entry.session.restore(
-            {
-                packet_id: delivery(owed) if owed is not None else None
-                for packet_id, owed in entry.inflight.items()
-            },
-            [delivery(owed) for owed in entry.queue],
-            {
-                packet_id: Held(
-                    message,
-                    frozenset(
-                        receiver
-                        for receiver in (
-                            *(self.sessions.get(name) for name in sessions),
-                            *(self._shares.get(name) for name in shares),
-                        )
-                        if receiver is not None
-                    ),
-                )
-                for packet_id, (message, sessions, shares) in entry.received.items()
-            },
-        )
-
-    # --- publishing ----------------------------------------------------------------------------
-
-    def route(self, session: Session, topic_wire: bytes) -> Route:
-        """Where messages of the session to the topic go, looked up once an epoch.
-
-        Raises:
-            ProtocolError: the topic is not valid; the connection has to end.
-        """
-        if session.epoch != self.epoch or len(session.routes) >= CACHED_ROUTES:
-            session.routes.clear()
-            session.epoch = self.epoch
-        route = session.routes.get(topic_wire)
-        if route is None:
-            route = self._find_route(session, topic_wire)
-            if len(topic_wire) <= CACHED_TOPIC:
-                session.routes[topic_wire] = route
-                self._cached += 1 + len(route.targets)
-                if self._cached > CACHED_IN_ALL:
-                    self._clear_caches()
-        return route
-
-    def _clear_caches(self) -> None:
-        self._cached = 0
-        for session in self.sessions.values():
-            session.routes.clear()
-            session.readable.clear()
-
-    def _find_route(self, session: Session, topic_wire: bytes) -> Route:
-        topic, _ = decode_string(topic_wire, 0)
-        try:
-            check_topic(topic)
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        decision = self._may_publish(session, topic)
-        if decision and topic in self.guards:
-            verdicts = [guard.decide(session) for guard in self.guards[topic]]
-            decision = next((verdict for verdict in verdicts if not verdict), decision)
-        matches = self._subscriptions.match(topic) if decision else []
-        self.counters.effort += ROUTE_EFFORT + len(matches)
-        targets, shares = self._targets(session, topic, matches)
-        return Route(topic, decision.allowed, decision.reason, targets, shares, bool(matches))
-
-    def _may_publish(self, session: Session, topic: str) -> Decision:
-        if session.identity is None:
-            return _ALLOWED
-        excess = self.excess(topic)
-        if excess:  # [MQTT-4.13.1-1]; as mosquitto does
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic with {excess}")
-        if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
-            reason = "topics that begin with $ are the broker's own"
-            return Decision(False, reason)
-        return self.access.decide(session.identity, Action.PUBLISH, topic)
-
-    def excess(self, topic: str) -> str:
-        """What the topic or filter has too much of, if anything."""
-        limits = self.limits
-        if topic.count("/") >= limits.topic_levels:
-            return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
-        if len(topic) > limits.topic_length // 4 and len(topic.encode()) > limits.topic_length:
-            return f"more than {limits.topic_length} bytes (broker.limits.topic_length)"
-        return ""
-
-    def _targets(
-        self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
-    ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
-        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1].
-
-        Shared subscriptions come on top: a session gets a message once more for each that chooses
-        it (5.0 section 4.8.2).
-        """
-        merged: dict[str, Target] = {}
-        shares: list[tuple[Share, list[Target]]] = []
-        for match in matches:
-            if isinstance(match, Share):
-                shares.append((match, self._members(match, topic)))
-                continue
-            session, subscription = match
-            if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
-                continue
-            known = merged.get(session.client_id)
-            receiver, qos, as_published, ids = known or (session.hearing(origin), 0, False, None)
-            if subscription.identifier:  # [MQTT-3.3.4-4]
-                ids = [*(ids or []), subscription.identifier]
-            merged[session.client_id] = (
-                receiver,
-                max(qos, subscription.qos),
-                as_published or subscription.retain_as_published,
-                ids,
-            )
-        targets = [target for target in merged.values() if self.may_receive(target[0], topic)]
-        return targets, shares
-
-    def _members(self, share: Share, topic: str) -> list[Target]:
-        return [
-            (
-                session,
-                subscription.qos,
-                subscription.retain_as_published,
-                [subscription.identifier] if subscription.identifier else None,
-            )
-            for session, subscription in share.members.items()
-            if self.may_receive(session, topic)
-        ]
+    @access.setter
+    def access(self, access: Access) -> None:
+        self.router.access = access
 
     def may_receive(self, session: Session, topic: str) -> bool:
         """Whether the rules in force let the session receive the topic's messages."""
-        if session.identity is None:
-            return True
-        # Kept beside the routes: those are made anew with every subscription of anybody, which
-        # would ask the rules about all receivers of a topic again.
-        readable = session.readable
-        if session.readable_epoch != self.access.epoch or len(readable) >= CACHED_ROUTES:
-            readable.clear()
-            session.readable_epoch = self.access.epoch
-        allowed = readable.get(topic)
-        if allowed is None:
-            decision = self.access.decide(session.identity, Action.RECEIVE, topic)
-            allowed = decision.allowed
-            if len(topic) <= CACHED_TOPIC and not decision.pending:
-                readable[topic] = allowed
-                self._cached += 1
-        return allowed
+        return self.router.may_receive(session, topic)
+
+    def route(self, session: Session, topic_wire: bytes) -> Route:
+        """See `Router.route`."""
+        return self.router.route(session, topic_wire)
+
+    def use(self, limits: Limits, features: Features) -> None:
+        """Let other limits and features hold from now on.
+
+        Who holds more than they allow keeps it. What a client was told in its CONNACK stays true
+        while it is connected.
+        """
+        self.limits = limits
+        self.features = features
+        self.ledger.use(limits)
+        self.router.changed()  # topics that were too long may not be so any more
+
+    def guards_changed(self) -> None:
+        """Guards were set, or would decide otherwise now."""
+        self.router.changed()
+
+    def rules_changed(self) -> None:
+        """The access rules changed: nothing cached holds, and what waits is checked again."""
+        self.router.changed()
+        for session in self.sessions.values():
+            session.unchecked = True  # message by message, as they are sent
+
+    # --- publishing ----------------------------------------------------------------------------
 
     def publish(self, message: Message, origin: Session) -> ReasonCode:
         """Deliver the message to every session that subscribed to its topic.
@@ -573,7 +353,7 @@ class Broker:
         Raises:
             ProtocolError: the topic is not valid.
         """
-        route = self.route(origin, message.topic_wire)
+        route = self.router.route(origin, message.topic_wire)
         if not self.ledger.refusing:
             return self.publish_to(route.targets, route, message, origin)
         # Who cannot be told would take it for kept: so it is, in memory, until the store can.
@@ -593,7 +373,9 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
-        kept = not retain or self._retain(message)  # no room to keep it: who is there still gets it
+        kept = not retain or self.retained.keep(
+            message
+        )  # no room to keep it: who is there still gets it
         published_qos = message.qos
         self.counters.effort += 1 + len(targets)
         taken = full = False
@@ -678,7 +460,7 @@ class Broker:
             message = Late(message, age)
         if self.ledger.has_expired(message):
             return
-        route = self.route(origin, message.topic_wire)
+        route = self.router.route(origin, message.topic_wire)
         targets: list[Target] = []
         for target in route.targets:
             session, qos, as_published, ids = target
@@ -727,60 +509,10 @@ class Broker:
             session.bytes,
         )
 
-    def _retain(self, message: Message) -> bool:
-        if self.ledger.refusing and message.qos:
-            return False
-        old = self.retained.get(message.topic)
-        if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
-            if old is None:
-                return True
-            self.retained_bytes -= retained_size(old)
-            self.retained.delete(message.topic)
-        else:
-            message.settle()
-            grown = self.retained_bytes + retained_size(message)
-            grown -= retained_size(old) if old is not None else 0
-            limits = self.limits
-            if grown > limits.retained_bytes or (
-                old is None and len(self.retained) >= limits.retained_messages
-            ):
-                self.counters.publish_dropped += 1
-                self.complaints.tell(
-                    self.now,
-                    "retained",
-                    "no room to retain %s: %d messages and %d bytes are retained "
-                    "(broker.limits.retained_messages, broker.limits.retained_bytes)",
-                    quote(message.topic),
-                    len(self.retained),
-                    self.retained_bytes,
-                )
-                return False
-            self.retained_bytes = grown
-            self.retained.set(message.topic, message)
-            if message.expires_at is not None:
-                self._schedule_expiry(message)
+    def _retained_changed(self, message: Message) -> None:
         self.store.retained(message)
         if self.observer is not None:
             self.observer.retained(message)
-        return True
-
-    def _schedule_expiry(self, message: Message) -> None:
-        assert message.expires_at is not None
-        heapq.heappush(self._expiring, (message.expires_at, next(self._order), message))
-        # Those that were replaced are not kept until their time comes.
-        if len(self._expiring) > 2 * len(self.retained) + 64:
-            self._expiring = [
-                entry for entry in self._expiring if self.retained.get(entry[2].topic) is entry[2]
-            ]
-            heapq.heapify(self._expiring)
-
-    def _expire_retained(self) -> None:
-        left = EXPIRED_A_TURN
-        while left and self._expiring and self._expiring[0][0] <= self.now:
-            left -= 1
-            _, _, message = heapq.heappop(self._expiring)
-            if self.retained.get(message.topic) is message:
-                self._retain(Message(message.topic, b"", retain=True))
 
     # --- subscribing ---------------------------------------------------------------------------
 
@@ -795,26 +527,12 @@ class Broker:
             return code
         if session.subscriptions.get(subscription.filter) != subscription:
             session.subscribe(subscription)
-            self._join(session, subscription)
-            self.epoch += 1
+            self.router.join(session, subscription)
         if session.persistent:
             self.store.subscribed(session, subscription)
         if self.observer is not None:
             self.observer.subscribed(session, subscription.filter, subscription.qos)
         return ReasonCode(subscription.qos)
-
-    def _join(self, session: Session, subscription: Subscription) -> None:
-        """Put a subscription into the tree, or a member into its group."""
-        topic_filter = subscription.filter
-        shared = parse_shared(topic_filter)
-        if shared is None:
-            self._subscriptions.add(topic_filter, session, (session, subscription))
-            return
-        share = self._shares.get(topic_filter)
-        if share is None:
-            share = self._shares[topic_filter] = Share(topic_filter)
-            self._subscriptions.add(shared[1], topic_filter, share)
-        share.members[session] = subscription
 
     def _check_subscription(
         self, session: Session, subscription: Subscription
@@ -835,13 +553,18 @@ class Broker:
             if not session.fits(subscription_size(topic_filter)):
                 reason = "no memory for it (broker.limits.queue_bytes, broker.limits.memory)"
                 return ReasonCode.QUOTA_EXCEEDED, reason
-        decision = self.access.decide(session.identity, Action.SUBSCRIBE, topic_filter)
+        decision = self.router.access.decide(session.identity, Action.SUBSCRIBE, topic_filter)
         if not decision:
             return ReasonCode.NOT_AUTHORIZED, decision.reason
         return None
 
     def send_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
-        """Let `Session.pump` send the retained messages that a subscription asks for."""
+        """Send the retained messages that a subscription asks for."""
+        self.replay_retained(session, subscription, is_new)
+        session.pump()
+
+    def replay_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
+        """Let the next `Session.pump` send the retained messages that a subscription asks for."""
         if parse_shared(subscription.filter) is not None:
             return  # the group's members have not asked for them (5.0 section 4.8.2)
         handling = subscription.retain_handling
@@ -860,9 +583,9 @@ class Broker:
                 continue
             topic, message = found
             if message.expires_at is not None and message.expires_at <= self.now:
-                self._retain(Message(topic, b"", retain=True))
+                self.retained.delete(topic)
                 yield None
-            elif not self.may_receive(session, topic):
+            elif not self.router.may_receive(session, topic):
                 yield None
             else:
                 subscription = session.subscriptions[topic_filter]
@@ -873,9 +596,8 @@ class Broker:
         """Unsubscribe; returns 0x00, or 0x11 when there was no such subscription."""
         if not session.unsubscribe(topic_filter):
             return ReasonCode.NO_SUBSCRIPTION_EXISTED
-        share = self._shares.get(topic_filter)
-        self._leave(session, topic_filter)
-        self.epoch += 1
+        share = self.router.shares.get(topic_filter)
+        self.router.leave(session, topic_filter)
         if share is not None:
             session.hand_over(share, self._giver(absent_too=True), sent=False)
         if session.persistent:
@@ -884,40 +606,13 @@ class Broker:
             self.observer.unsubscribed(session, topic_filter)
         return ReasonCode.SUCCESS
 
-    # --- time and rules ------------------------------------------------------------------------
+    # --- time ----------------------------------------------------------------------------------
 
-    def use(self, limits: Limits, features: Features) -> None:
-        """Let other limits and features hold from now on.
-
-        Who holds more than they allow keeps it. What a client was told in its CONNACK stays true
-        while it is connected.
-        """
-        self.limits = limits
-        self.features = features
-        self.ledger.use(limits)
-        self.epoch += 1  # topics that were too long may not be so any more
-
-    def guards_changed(self) -> None:
-        """Guards were set, or would decide otherwise now."""
-        self.epoch += 1
-
-    def rules_changed(self) -> None:
-        """The access rules changed: nothing cached holds, and what waits is checked again."""
-        self.epoch += 1
-        for session in self.sessions.values():
-            session.unchecked = True  # message by message, as they are sent
-
-    def _may_keep(self, session: Session, topic: str) -> bool:
-        """Whether a message that waits may still be sent.
-
-        It was allowed when it came: while plugins make up their minds anew it stays so.
-        """
-        if session.identity is None or self.may_receive(session, topic):
-            return True
-        return self.access.decide(session.identity, Action.RECEIVE, topic).pending
-
-    def _schedule(self, when: float, session: Session) -> None:
-        heapq.heappush(self._deadlines, (when, next(self._order), session))
+    def schedule(self, session: Session) -> None:
+        """Let `tick` publish an absent client's will, and end its session, when these are due."""
+        for when in (session.ends_at, session.will_at):
+            if when is not None:
+                heapq.heappush(self._deadlines, (when, next(self._order), session))
         # Those of clients that came back in time hold no more: they are not kept for their days.
         if len(self._deadlines) > 4 * len(self.sessions) + 64:
             hold = {
@@ -938,7 +633,7 @@ class Broker:
         """
         self.ledger.now = now
         self.complaints.tick(now)
-        self._expire_retained()
+        self.retained.expire(now)
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
             left -= client.tick(now)
@@ -961,6 +656,8 @@ class Broker:
         self.flush()
         return self._deadlines[0][0] if self._deadlines else math.inf
 
+    # --- bytes out, and the commits that they wait for -----------------------------------------
+
     def flush(self) -> None:
         """Write to every network client what it was sent since the last flush.
 
@@ -972,23 +669,23 @@ class Broker:
                 ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
             )
         while self.unflushed:  # what was written makes room for what waited
-            clients = self.unflushed
+            outputs = self.unflushed
             self.unflushed = []
             if self.store.staged:
-                clients = self._hold_back(clients)
-            for client in clients:
-                client.flush()
+                outputs = self._hold_back(outputs)
+            for output in outputs:
+                output.flush()
 
-    def _hold_back(self, clients: list[Ticking]) -> list[Ticking]:
+    def _hold_back(self, outputs: list[Flushing]) -> list[Flushing]:
         """Let those wait whose bytes depend on what is not committed; returns the others."""
         self.store.fresh = False
         committed = self.store.committed
-        free: list[Ticking] = []
-        for client in clients:
-            if client.wait(committed):
-                self._waiting[client] = None
+        free: list[Flushing] = []
+        for output in outputs:
+            if output.wait(committed):
+                self._waiting[output] = None
             else:
-                free.append(client)
+                free.append(output)
         if self._waiting:
             self.store.hurry()
         return free
@@ -997,7 +694,7 @@ class Broker:
         waiting, self._waiting = self._waiting, {}
         if kept:
             committed = self.store.committed
-            self._waiting = {client: None for client in waiting if client.release(committed)}
+            self._waiting = {output: None for output in waiting if output.release(committed)}
             if self.ledger.failing:
                 self._recover()
         else:
@@ -1005,8 +702,8 @@ class Broker:
                 self.ledger.failing = self.ledger.refusing = True
                 for session in self.sessions.values():
                     session.hold_back()
-            for client in waiting:
-                client.abandon()
+            for output in waiting:
+                output.abandon()
         if self._waiting:
             self.store.hurry()
         self.flush()

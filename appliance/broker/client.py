@@ -1,6 +1,6 @@
 """A network client's conversation: what each of its packets does, and what it is answered.
 
-Pure like the rest of the broker: bytes come in at `receive`, and go out at `flush` to a `Wire`.
+Pure like the rest of the broker: bytes come in at `receive`, and go out through an `Output`.
 """
 
 from __future__ import annotations
@@ -8,11 +8,9 @@ from __future__ import annotations
 import logging
 import math
 import uuid
-from collections import deque
-from collections.abc import Sequence
-from typing import Protocol, cast
+from collections.abc import Iterator
 
-from appliance.broker.broker import Broker, Route
+from appliance.broker.broker import Broker
 from appliance.broker.handshake import (
     agree,
     connack_properties,
@@ -20,17 +18,15 @@ from appliance.broker.handshake import (
     maximum_packet_size,
     pending_will,
 )
+from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
-from appliance.broker.ports import Exchange, Identity, Refusal, Secured
-from appliance.broker.session import LARGE_MESSAGE, Delivery, Held, Session
+from appliance.broker.output import CANNOT_KEEP, Output
+from appliance.broker.ports import Exchange, Identity, Refusal, Wire
+from appliance.broker.routing import Route
+from appliance.broker.session import Held, Session
+from appliance.broker.subscribing import subscribe, unsubscribe
 from appliance.mqtt.codec import Properties, Property, quote
-from appliance.mqtt.connection import (
-    PUBACK,
-    PUBREC,
-    PUBREL,
-    Connection,
-    RawPublish,
-)
+from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, RawPublish
 from appliance.mqtt.packets import (
     Auth,
     Connack,
@@ -44,80 +40,18 @@ from appliance.mqtt.packets import (
     Publish,
     Pubrec,
     Pubrel,
-    Suback,
     Subscribe,
-    Subscription,
-    Unsuback,
     Unsubscribe,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
-
-#: Bytes that a client is sent before the next flush. What waits in its session waits on, until the
-#: network has taken these: it is the network that says how fast a client is.
-OUTPUT_LIMIT = 1024 * 1024
-
-
-#: What a refusal is sent as when it has a reason string, by its first byte.
-_REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
-
 
 #: The effort of a packet that is not of the data path.
 PACKET_EFFORT = 5
 
-#: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE: some ten milliseconds of work.
-MAXIMUM_LEVELS = 20_000
-
-#: The effort of a subscription, in and out; its levels come on top.
-SUBSCRIBE_EFFORT = 10
-
-#: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
-EFFORT_A_TURN = 1000
-
-
 #: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
 HOST_BURST = 100
-
-
-class Wire(Protocol):
-    """The connection under a client, as a listener implements it."""
-
-    #: Where the client is, for the log: "127.0.0.1:54321".
-    address: str
-
-    def authenticate(self, connect: Connect) -> None:
-        """Find out who it is, in the background; `Client.accept` or `Client.refuse` ends it."""
-
-    def exchange(self, method: str) -> Exchange | None:
-        """Begin an enhanced authentication; None when the method is not offered."""
-
-    def now(self) -> float:
-        """Seconds of a clock that never goes back, finer than the broker's."""
-
-    def accepted(self) -> None:
-        """The client has logged in: the time limit for that is over."""
-
-    def secured(self) -> Secured:
-        """What protects the connection, and who its certificate says that the client is."""
-
-    def later(self) -> None:
-        """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
-
-    def write(self, chunks: list[bytes]) -> None:
-        """Write the chunks, one behind the other."""
-
-    def is_behind(self) -> bool:
-        """Whether some of it waits here, as the network takes no more; when it does,
-        `Client.caught_up` is called, or `Client.resume_writing`."""
-
-    def close(self) -> None:
-        """Write what was written so far, then close."""
-
-
-#: Why a message is refused while the store cannot take it.
-CANNOT_KEEP = "it cannot be stored: see the log of the store"
 
 
 def _reason(code: int, route: Route) -> str:
@@ -126,36 +60,26 @@ def _reason(code: int, route: Route) -> str:
 
 
 class Client:
-    """One network connection; its `Link` to a session once it has logged in."""
+    """One network connection: does what its packets say; what it is sent goes through `output`."""
 
     def __init__(self, broker: Broker, wire: Wire) -> None:
         self.broker = broker
         self.wire = wire
         self.connection = Connection(broker.limits.packet_size, broker.limits.topic_alias)
-        self.writable = True
+        self.output = Output(broker, wire, self)
         self.session: Session | None = None
+        self._router = broker.router
         self._ledger = broker.ledger
         self._counters = broker.counters
         self._store = broker.store
-        #: The batch of the store that what it is answered depends on, and what waits for which.
-        self._batch = 0
-        self._waiting: deque[tuple[int, list[bytes]]] = deque()
         #: PUBRELs that wait until the store can keep what they release.
         self._postponed: dict[int, None] = {}
+        #: A packet that is worked on in several turns.
+        self._work: Iterator[Packet | None] | None = None
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
-        self._out: list[bytes] = []
-        self._out_size = 0  # of the PUBLISH packets in there, from their sessions
-        self._full = False  # not writable until the flush, for OUTPUT_LIMIT
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
-        self._maximum_packet_size = 0
-        #: Numbers of the topic names that the client was sent; None when it takes none.
-        self._aliases: dict[str, int] | None = None
-        self._alias_maximum = 0
-        #: Whether a packet may go out as it came in from another client.
-        self._mirrors = True
-        self._explain = False
         self._method = ""  # of its enhanced authentication
         self._exchange: Exchange | None = None
         self._unfinished_maximum = 0
@@ -206,7 +130,7 @@ class Client:
     def _depend(self) -> None:
         """What it was just answered depends on what was just staged."""
         self._store.fresh = False
-        self._batch = self._store.batch
+        self.output.batch = self._store.batch
 
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
@@ -227,19 +151,19 @@ class Client:
     def _on_raw_publish(self, event: RawPublish) -> None:
         """The data path: a PUBLISH without properties."""
         first, topic_wire, packet_id, payload, head = event
-        broker = self.broker
+        router = self._router
         session = self.session
         assert session is not None
         counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(payload)
         # The route has the topic decoded and checked, which would else be done for each message.
-        if session.epoch == broker.epoch and topic_wire in session.routes:
+        if session.epoch == router.epoch and topic_wire in session.routes:
             route = session.routes[topic_wire]
         else:
-            route = broker.route(session, topic_wire)
+            route = router.route(session, topic_wire)
         targets = route.targets
-        if first == 0x30 and route.allowed and broker.observer is None:
+        if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.effort += 1 + len(targets)
             # A plain QoS 0 message to receivers of the same version leaves as it came: no message
             # object is made for it. Who cannot take it like this is left for the long way.
@@ -264,9 +188,9 @@ class Client:
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
-        code = broker.publish_to(targets, route, message, session)
+        code = self.broker.publish_to(targets, route, message, session)
         if qos:
-            self._acknowledge(0x40, packet_id, code, _reason(code, route))
+            self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
 
     def _on_publish(self, packet: Publish) -> None:
         """A PUBLISH that the full decoder has read: with properties, most likely."""
@@ -287,7 +211,7 @@ class Client:
         )
         if packet.dup:
             message = Late(message, math.inf)
-        route = broker.route(session, message.topic_wire)
+        route = self._router.route(session, message.topic_wire)
         packet_id = packet.packet_id or 0
         if broker.features.check_payload_format and not is_text(message.payload, packet.properties):
             self._refuse_payload(session, message, packet_id)
@@ -296,7 +220,11 @@ class Client:
         else:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos:
-                self._acknowledge(0x40, packet_id, code, _reason(code, route))
+                self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
+
+    def _expires_at(self, properties: Properties | None) -> float | None:
+        interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
+        return self._ledger.now + interval if isinstance(interval, int) else None
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
@@ -304,7 +232,7 @@ class Client:
         self.broker.complain(session, "may not publish to %s: %s", quote(message.topic), reason)
         if message.qos:
             first = 0x40 if message.qos == 1 else 0x50
-            self._acknowledge(first, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+            self.output.acknowledge(first, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
 
     def _on_publish_qos2(
         self, session: Session, packet_id: int, message: Message, route: Route
@@ -319,7 +247,7 @@ class Client:
         ):
             session.unhold(packet_id)
             self._counters.publish_dropped += 1
-            self._acknowledge(0x50, packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
+            self.output.acknowledge(0x50, packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
             return
         if held is not None and not held.message.is_like(message):
             # A client that has lost its memory begins anew with the same ids: what it does not
@@ -347,7 +275,7 @@ class Client:
                 code = ReasonCode.QUOTA_EXCEEDED
                 if self._version != 5:
                     raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
-        self._acknowledge(0x50, packet_id, code, _reason(code, route))
+        self.output.acknowledge(0x50, packet_id, code, _reason(code, route))
 
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
@@ -363,14 +291,14 @@ class Client:
             if code < 0x80 and not (self._ledger.failing and session.expiry):
                 # An unknown id is answered too, or a client that missed our end would wait forever;
                 # without 0x92, which says nothing that it needs (and as mosquitto does).
-                self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
+                self.output.acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
             if self._ledger.failing and self._must_postpone(session, packet_id):
                 return
             held = session.unhold(packet_id)
             if held is not None:
                 self.broker.release(held, session, self.wire.now() - held.since)
-            self._acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
+            self.output.acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
 
@@ -381,7 +309,7 @@ class Client:
             # Its PUBCOMP may depend on what is not kept yet.
             postpone = session.persistent
         else:
-            route = self.broker.route(session, held.message.topic_wire)
+            route = self._router.route(session, held.message.topic_wire)
             postpone = self.broker.must_store(route, held.message, session)
         if postpone:
             self._postponed[packet_id] = None
@@ -406,12 +334,13 @@ class Client:
             self._on_acknowledgement(packet.TYPE << 16, packet.packet_id, packet.reason_code)
             return
         self._counters.control_received += 1
+        session = self.session
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
-        elif isinstance(packet, Subscribe):
-            self._on_subscribe(packet)
-        elif isinstance(packet, Unsubscribe):
-            self._on_unsubscribe(packet)
+        elif isinstance(packet, Subscribe) and session is not None:
+            self._begin(subscribe(self.broker, session, packet))
+        elif isinstance(packet, Unsubscribe) and session is not None:
+            self._begin(unsubscribe(self.broker, session, packet))
         elif isinstance(packet, Disconnect):
             self._on_disconnect(packet)
         elif isinstance(packet, Connect):
@@ -419,59 +348,28 @@ class Client:
         elif isinstance(packet, Auth):
             self._on_auth(packet)
 
-    def _on_subscribe(self, packet: Subscribe) -> None:
-        session = self.session
-        assert session is not None
-        identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
-        identifier = identifiers[0] if isinstance(identifiers, list) else 0
-        self._check_filters([subscription.filter for subscription in packet.subscriptions])
-        codes: list[int] = []
-        granted: list[tuple[Subscription, bool]] = []
-        for subscription in packet.subscriptions:
-            if isinstance(identifier, int):
-                subscription.identifier = identifier
-            is_new = subscription.filter not in session.subscriptions
-            code = self.broker.subscribe(session, subscription)
-            codes.append(code)
-            if code <= ReasonCode.GRANTED_QOS_2:
-                granted.append((subscription, is_new))
-        self._send(Suback(packet.packet_id, codes))  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
-        if self._closed:
-            return
-        for subscription, is_new in granted:
-            self.broker.send_retained(session, subscription, is_new)
+    def _begin(self, work: Iterator[Packet | None]) -> None:
+        """Do what a packet asks for that may be much; None is for the turn of the others."""
+        for answer in work:
+            if answer is None:
+                # What comes behind the packet waits for its end.
+                self._work = work
+                self.connection.pause()
+                self.later()
+                return
+            self._send(answer)
+            if self._closed:
+                return
+        self._work = None
 
-    def _check_filters(self, filters: Sequence[str]) -> None:
-        """Raises a ProtocolError when one is no topic filter, or all are too much for one turn."""
-        levels = sum(name.count("/") + 1 for name in filters)
-        self._counters.effort += SUBSCRIBE_EFFORT * len(filters) + levels
-        if levels > MAXIMUM_LEVELS:
-            raise ProtocolError(
-                ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_LEVELS} levels in one packet"
-            )
-        for name in filters:
-            self._check_filter(name)
-
-    def _check_filter(self, topic_filter: str) -> None:
-        """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+    def _go_on(self, work: Iterator[Packet | None]) -> None:
+        """Go on with what the last turn was too short for."""
         try:
-            check_filter(topic_filter)
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        try:
-            shared = parse_shared(topic_filter)
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
-        excess = self.broker.excess(shared[1] if shared else topic_filter)
-        if excess:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic filter with {excess}")
-
-    def _on_unsubscribe(self, packet: Unsubscribe) -> None:
-        session = self.session
-        assert session is not None
-        self._check_filters(packet.filters)
-        codes = [self.broker.unsubscribe(session, name) for name in packet.filters]
-        self._send(Unsuback(packet.packet_id, codes))  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
+            self._begin(work)
+        except ProtocolError as error:
+            self.fail(error)
+        if self._store.fresh:
+            self._depend()
 
     def _on_disconnect(self, packet: Disconnect) -> None:
         expiry = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
@@ -493,9 +391,9 @@ class Client:
     # --- CONNECT -------------------------------------------------------------------------------
 
     def _on_connect(self, packet: Connect) -> None:
-        self._version = packet.version
         self._connect = packet
-        self._maximum_packet_size = maximum_packet_size(packet)
+        self._version = self.output.version = packet.version
+        self.output.maximum_packet_size = maximum_packet_size(packet)
         properties = packet.properties or {}
         properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
         if not packet.client_id and not packet.clean_start and packet.version != 5:
@@ -503,7 +401,7 @@ class Client:
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
         will = packet.will
-        excess = self.broker.excess(will.topic) if will is not None else ""
+        excess = self._router.excess(will.topic) if will is not None else ""
         if excess:
             self.refuse(ReasonCode.TOPIC_NAME_INVALID, f"its will's topic has {excess}")
             return
@@ -606,7 +504,7 @@ class Client:
         try:
             agreement = agree(packet, self.broker.limits)
             session, present = self.broker.connect(
-                self,
+                self.output,
                 identity,
                 clean_start=packet.clean_start,
                 expiry=agreement.expiry,
@@ -622,10 +520,8 @@ class Client:
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         session.reconnected()
         self.session = session
-        self._alias_maximum = agreement.aliases
-        self._aliases = {} if agreement.aliases else None
-        self._mirrors = not (self._maximum_packet_size or agreement.aliases)
-        self._explain = agreement.explain and self.broker.features.reason_strings
+        explains = agreement.explain and self.broker.features.reason_strings
+        self.output.open(session, agreement.aliases, explains=explains)
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
         self._heard_at = self._ledger.now
         self.connection.accept()
@@ -657,241 +553,7 @@ class Client:
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
 
-    def _expires_at(self, properties: Properties | None) -> float | None:
-        interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        return self._ledger.now + interval if isinstance(interval, int) else None
-
-    # --- bytes out: the Link of the session ----------------------------------------------------
-
-    def publish(
-        self,
-        message: Message,
-        qos: int,
-        packet_id: int,
-        dup: bool,
-        retain: bool,
-        subscription_ids: list[int] | None,
-    ) -> None:
-        """Send a PUBLISH; its head, packet id and payload are joined only at the flush."""
-        first = 0x30 | qos << 1 | retain
-        if dup:
-            first |= 8
-        version = self._version
-        if self._maximum_packet_size and self._too_large(first, message, subscription_ids):
-            self._counters.publish_dropped += 1
-            if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
-                self.session.give_up(packet_id)
-            return
-        out = self._out
-        if not out:
-            self.broker.unflushed.append(self)
-        if version == 5 and (
-            subscription_ids or message.expires_at is not None or self._aliases is not None
-        ):
-            if message.size > LARGE_MESSAGE and self._wait_for_its_turn(
-                message, first, subscription_ids
-            ):
-                return
-            out.append(self._encode(first, packet_id, message, subscription_ids))
-        else:
-            if message.wire_key == version << 8 | first:
-                out.append(message.wire_head)
-            else:
-                if message.size > LARGE_MESSAGE and self._wait_for_its_turn(message, first, None):
-                    return
-                out.append(message.head(version, first))
-            if qos:
-                out.append(packet_id.to_bytes(2, "big"))
-                if version == 5:
-                    out.append(message.properties_wire)
-                out.append(message.payload)
-        self._out_size += len(out[-1])
-        if self._out_size > OUTPUT_LIMIT:
-            self._full = True
-            self.writable = False
-        counters = self._counters
-        counters.publish_sent += 1
-        counters.publish_bytes_sent += len(message.payload)
-
-    def is_behind(self) -> bool:
-        """Whether the network has yet to take what it was given, or will be at the flush."""
-        if self._out_size > LARGE_MESSAGE:
-            self._full = True
-            return True
-        return self.wire.is_behind()
-
-    def _wait_for_its_turn(
-        self, message: Message, first: int, subscription_ids: list[int] | None
-    ) -> bool:
-        """Give a large message of QoS 0 back to the session when the client is behind.
-
-        What comes then, and is newer or smaller, is not behind it.
-        """
-        session = self.session
-        if first & 0x06 or session is None or not self.is_behind():
-            return False
-        session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
-        return True
-
-    def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
-        if version != self._version or not self.writable or not self._mirrors:
-            return False
-        out = self._out
-        if not out:
-            self.broker.unflushed.append(self)
-        out.append(packet)
-        counters = self._counters
-        counters.publish_sent += 1
-        counters.publish_bytes_sent += payload_size
-        return True
-
-    def _encode(
-        self, first: int, packet_id: int, message: Message, subscription_ids: list[int] | None
-    ) -> bytes:
-        """An MQTT 5 packet with what is this client's own: the slow way."""
-        alias, named = 0, True
-        aliases = self._aliases
-        if aliases is not None:
-            alias = aliases.get(message.topic, 0)
-            if alias:
-                named = False
-            elif len(aliases) < self._alias_maximum and (
-                not self._maximum_packet_size
-                or (message.size < self._maximum_packet_size and not subscription_ids)
-            ):
-                alias = aliases[message.topic] = len(aliases) + 1
-        return message.encode_for(
-            first, packet_id, subscription_ids, self._ledger.now, alias, named=named
-        )
-
-    def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
-        limit = self._maximum_packet_size
-        if message.size <= limit and not subscription_ids:
-            return False
-        # A topic gets no new alias from a message that is near the limit, see `_encode`.
-        alias = self._aliases.get(message.topic, 0) if self._aliases else 0
-        packet = message.encode_for(
-            first, 1, subscription_ids, self._ledger.now, alias, named=not alias
-        )
-        return len(packet) > limit
-
-    def pubrel(self, packet_id: int) -> None:
-        """Send a PUBREL."""
-        self._acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
-
-    def _acknowledge(self, first: int, packet_id: int, code: int, reason: str = "") -> None:
-        """Send PUBACK, PUBREC, PUBREL or PUBCOMP in its shortest form.
-
-        `reason` is for a refusal, and for clients that are to be told.
-        """
-        packet = bytes((first, 2, packet_id >> 8, packet_id & 0xFF))
-        if code:
-            if self._version == 5:
-                if code >= 0x80 and self._explain and reason:
-                    self._send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
-                    return
-                packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
-            elif code == ReasonCode.QUOTA_EXCEEDED and self._ledger.refusing:
-                # 3.1.1 cannot refuse, and what is acknowledged must be kept.
-                raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
-        out = self._out
-        if not out:
-            self.broker.unflushed.append(self)
-        out.append(packet)
-        self._counters.control_sent += 1
-
-    def _send(self, packet: Packet) -> None:
-        data = packet.encode(self._version or 4)
-        limit = self._maximum_packet_size
-        if limit and len(data) > limit:  # [MQTT-3.1.2-24]
-            self._cannot_send(packet)
-            return
-        if not self._out:
-            self.broker.unflushed.append(self)
-        self._out.append(data)
-        self._counters.control_sent += 1
-
-    def _cannot_send(self, packet: Packet) -> None:
-        """A packet is larger than the client takes: it goes without its words, or not at all."""
-        if isinstance(packet, Puback | Pubrec | Suback | Disconnect) and packet.properties:
-            packet.properties = None  # [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.14.2-3]
-            self._send(packet)
-        elif self.session is None or isinstance(packet, Connack):
-            # There is nothing to refuse it with [MQTT-3.14.0-1].
-            self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
-            self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
-        elif not isinstance(packet, Disconnect):
-            reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
-            self.close(ReasonCode.PACKET_TOO_LARGE, reason)
-
-    def flush(self) -> None:
-        """Write what was sent since the last flush, and close if it was the last."""
-        out = self._out
-        if out:
-            self._out = []
-            self._out_size = 0
-            if self._full:
-                self.writable = not self._closed
-            self.wire.write(out)
-        if self._closed:
-            self.wire.close()
-        elif self._full:
-            self._full = False
-            if self.writable:  # the network has not asked for a pause
-                self.resume_writing()
-
-    def wait(self, committed: int) -> bool:
-        """Keep what was sent since the last flush, if it depends on a later batch than this."""
-        batch = self._batch
-        session = self.session
-        if session is not None and session.batch > batch:
-            batch = session.batch
-        waiting = self._waiting
-        if waiting and waiting[-1][0] > batch:
-            batch = waiting[-1][0]  # nothing passes what waits
-        if batch <= committed:
-            return False
-        out, self._out = self._out, []
-        if waiting and waiting[-1][0] == batch:
-            waiting[-1][1].extend(out)
-        else:
-            waiting.append((batch, out))
-        return True
-
-    def release(self, committed: int) -> bool:
-        """Write what waited for this batch; True when something waits for a later one."""
-        waiting = self._waiting
-        if self._full and not self._out:
-            self.writable = not self._closed
-        while waiting and waiting[0][0] <= committed:
-            chunks = waiting.popleft()[1]
-            if chunks:
-                self.wire.write(chunks)
-        if waiting:
-            return True
-        if not self._out:
-            self._out_size = 0
-            self.flush()
-        return False
-
-    def abandon(self) -> None:
-        """Close without sending what waits: what it would acknowledge could not be kept."""
-        self._waiting.clear()
-        self._out.clear()
-        self.lost()
-        self.wire.close()
-
-    def resume_writing(self) -> None:
-        """The network takes bytes again: send what waited."""
-        self.writable = True
-        if self.session is not None and self.session.link is self:
-            self.session.pump()
-
-    def caught_up(self) -> None:
-        """The network has taken all it was given: send the large messages that waited for that."""
-        if self.writable and self.session is not None and self.session.link is self:
-            self.session.pump()
+    # --- turns, and bytes out ------------------------------------------------------------------
 
     def later(self) -> None:
         """Let the other clients have their turn."""
@@ -902,11 +564,24 @@ class Client:
     def send_on(self) -> None:
         """Go on where the last turn ended: with what waits for the client, and what it sent."""
         self._later = False
-        if self.session is not None and self.session.link is self:
+        if self.session is not None and self.session.link is self.output:
             self.session.take_turn()
-            if self.connection.paused:
+            if self._work is not None:
+                self._go_on(self._work)
+            if self._work is None and self.connection.paused:
                 self.connection.resume()
                 self.receive(b"")
+
+    def _send(self, packet: Packet) -> None:
+        if self.output.send(packet):
+            return
+        if self.session is None or isinstance(packet, Connack):
+            # There is nothing to refuse it with [MQTT-3.14.0-1].
+            self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
+            self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
+        elif not isinstance(packet, Disconnect):
+            reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
+            self.close(ReasonCode.PACKET_TOO_LARGE, reason)
 
     # --- the end -------------------------------------------------------------------------------
 
@@ -920,7 +595,7 @@ class Client:
             # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
             if error.told and (unknown or self.connection.version == 5):
-                self._version = self.connection.version
+                self.output.version = self.connection.version
                 self._send(Connack(False, error.code))
             self._shut()
         elif error.told:
@@ -935,8 +610,8 @@ class Client:
 
     def _end(self, reason: ReasonCode, message: str) -> None:
         if self._version == 5:
-            words: Properties | None = {Property.REASON_STRING: message} if self._explain else None
-            self._send(Disconnect(reason, words))
+            words: Properties = {Property.REASON_STRING: message}
+            self._send(Disconnect(reason, words if self.output.explains else None))
         self._leave(message, publish_will=True)
 
     def _complain(self, message: str, *args: object) -> None:
@@ -952,6 +627,10 @@ class Client:
                 log.info("%s: connection lost", self)
             self._leave("connection lost", publish_will=True)
 
+    def let_go(self, wire: Wire) -> None:
+        """The connection is gone, and not to be held any longer: `wire` stands for it now."""
+        self.wire = self.output.wire = wire
+
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
         if not self._silence or now - self._heard_at <= self._silence:
@@ -965,17 +644,14 @@ class Client:
         if session is not None:
             if self.broker.journal is not None:
                 self.broker.journal.disconnected(session, self.wire.address, why)
-            self.broker.disconnect(session, self, publish_will=publish_will, expiry=expiry)
+            self.broker.disconnect(session, self.output, publish_will=publish_will, expiry=expiry)
 
     def _shut(self) -> None:
-        # The last bytes are written, and the connection closed, by the flush: like all bytes they
-        # wait for what they acknowledge to be kept.
         self._closed = True
+        self._work = None
         self.connection.close()
         self._ledger.queued_bytes -= self._held
         self._ledger.input_bytes -= self._held
         self._held = 0
-        self.writable = False
         self.broker.clients.discard(self)
-        if not self._out:
-            self.broker.unflushed.append(self)
+        self.output.end()

@@ -1,12 +1,13 @@
-"""Sessions as the store has kept them, for `Broker.restore`."""
+"""Sessions as the store has kept them, and how the broker takes them up again."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
-from appliance.broker.session import PendingWill, Session
+from appliance.broker.session import Delivery, Held, PendingWill, Session
 from appliance.mqtt.packets import Subscription
 
 
@@ -41,3 +42,60 @@ class Kept:
     received: dict[int, tuple[Message, list[str], list[str]]] = field(default_factory=dict)
     #: What the broker made of it.
     session: Session | None = None
+
+
+def restore(broker: Broker, kept: list[Kept], retained: list[Message]) -> None:
+    """Take up the sessions and retained messages of the last run, before anybody connects.
+
+    A client that was connected when that ended counts as gone since now: so do the time that
+    its session is kept, and the delay of its will. A session that was not to outlive its
+    connection is there for its will alone, which the next tick publishes (3.1.1 section
+    3.1.2.5, 5.0 section 3.1.2.5).
+    """
+    for entry in kept:
+        session = Session(entry.identity.client_id, entry.identity, broker.ledger)
+        entry.session = broker.sessions[session.client_id] = session
+        session.expiry = entry.expiry
+        session.set_will(entry.will)
+        session.ends_at = entry.ends_at
+        session.will_at = entry.will_at
+        if session.ends_at is None:
+            session.ends_at = broker.now + session.expiry
+            if entry.will is not None:
+                session.will_at = broker.now + min(entry.will.delay, session.expiry)
+        broker.schedule(session)
+        for subscription in entry.subscriptions:
+            session.subscribe(subscription)
+            broker.router.join(session, subscription)
+    for entry in kept:  # what is owed names sessions and groups, all of which are there now
+        _restore_owed(broker, entry)
+    broker.retained.restore(retained)
+
+
+def _restore_owed(broker: Broker, entry: Kept) -> None:
+    def delivery(owed: Owed) -> Delivery:
+        share = broker.router.shares.get(owed.share) if owed.share is not None else None
+        return Delivery(owed.message, owed.qos, owed.retain, owed.subscription_ids, share)
+
+    assert entry.session is not None
+    entry.session.restore(
+        {
+            packet_id: delivery(owed) if owed is not None else None
+            for packet_id, owed in entry.inflight.items()
+        },
+        [delivery(owed) for owed in entry.queue],
+        {
+            packet_id: Held(
+                message,
+                frozenset(
+                    receiver
+                    for receiver in (
+                        *(broker.sessions.get(name) for name in sessions),
+                        *(broker.router.shares.get(name) for name in shares),
+                    )
+                    if receiver is not None
+                ),
+            )
+            for packet_id, (message, sessions, shares) in entry.received.items()
+        },
+    )

@@ -76,7 +76,7 @@ class Message:
         self.size = len(payload) + 3 * len(self.topic_wire) + OVERHEAD
         if properties:
             pairs = properties.get(Property.USER_PROPERTY)
-            self.size += len(encode_property_list(properties))
+            self.size += len(encode_property_list(properties) if passed_on is None else passed_on)
             self.size += PAIR_OVERHEAD * len(pairs) if isinstance(pairs, list) else 0
 
     def head(self, version: int, first: int) -> bytes:

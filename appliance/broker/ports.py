@@ -14,6 +14,7 @@ from appliance.mqtt.reason import ReasonCode
 if TYPE_CHECKING:
     from appliance.broker.message import Message
     from appliance.broker.session import Delivery, Held, Session
+    from appliance.mqtt.packets import Connect
 
 
 class Action(Enum):
@@ -273,6 +274,41 @@ class Secured:
 
     version: str = ""
     certificate: str = ""
+
+
+class Wire(Protocol):
+    """The connection under a client, as a listener implements it."""
+
+    #: Where the client is, for the log: "127.0.0.1:54321".
+    address: str
+
+    def authenticate(self, connect: Connect) -> None:
+        """Find out who it is, in the background; `Client.accept` or `Client.refuse` ends it."""
+
+    def exchange(self, method: str) -> Exchange | None:
+        """Begin an enhanced authentication; None when the method is not offered."""
+
+    def now(self) -> float:
+        """Seconds of a clock that never goes back, finer than the broker's."""
+
+    def accepted(self) -> None:
+        """The client has logged in: the time limit for that is over."""
+
+    def secured(self) -> Secured:
+        """What protects the connection, and who its certificate says that the client is."""
+
+    def later(self) -> None:
+        """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
+
+    def write(self, chunks: list[bytes]) -> None:
+        """Write the chunks, one behind the other."""
+
+    def is_behind(self) -> bool:
+        """Whether some of it waits here, as the network takes no more; when it does,
+        `Output.caught_up` is called, or `Output.resume_writing`."""
+
+    def close(self) -> None:
+        """Write what was written so far, then close."""
 
 
 class Journal(Protocol):

@@ -89,7 +89,7 @@ class SysTopics:
             "retained messages/count": len(broker.retained),
             "store/messages/count": stored,
             "heap/current": self._heap(),
-            "store/messages/bytes": broker.retained_bytes + broker.ledger.queued_bytes,
+            "store/messages/bytes": broker.retained.bytes + broker.ledger.queued_bytes,
         }
         return {name: str(value) for name, value in values.items()} | self._load()
 

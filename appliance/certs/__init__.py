@@ -26,7 +26,7 @@ from .contexts import (
 from .export import check_password, write_bundle, write_pkcs12
 from .files import CertificateError, issued_by, load_certificates, load_key
 from .identity import username_of
-from .listing import Listed, listed
+from .listing import Ending, Listed, endings, listed
 from .registry import Issued
 from .renewal import keep_server_certificate
 from .requests import REQUEST_SIZE
@@ -36,6 +36,7 @@ __all__ = [
     "Address",
     "CertificateError",
     "ClientCertificates",
+    "Ending",
     "Issued",
     "Listed",
     "LoadedTls",
@@ -44,6 +45,7 @@ __all__ = [
     "TlsPolicy",
     "check_password",
     "create_authority",
+    "endings",
     "issue_client",
     "issue_server",
     "issued",

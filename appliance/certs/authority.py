@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import logging
 import re
 import socket
 from collections.abc import Iterator, Sequence
@@ -35,6 +37,7 @@ from .files import (
     make_directory,
     out_of_time,
     read,
+    usable_time,
     write,
     write_certificate,
     write_key,
@@ -43,15 +46,14 @@ from .registry import Issued, Kind, fingerprint
 from .requests import load_request
 from .revocation import CRL_SIZE, parse_crls
 
+log = logging.getLogger("appliance.certs")
+
 AUTHORITY_VALID: Final = timedelta(days=3650)
 # The longest that Apple's systems accept from a private authority. Shorter would not be safer, as
 # the authority's key is on the same computer, and a robot in the field must not fall silent.
 CERTIFICATE_VALID: Final = timedelta(days=825)
 # Clients whose clock is behind, and time zones taken for UTC.
 _BACKDATED: Final = timedelta(days=1)
-# A computer without a battery for its clock starts in 1970 or with the age of its image, and would
-# make certificates that have expired when the clock is set.
-_NEVER_BEFORE: Final = datetime(2025, 1, 1, tzinfo=timezone.utc)
 
 _MAX_COMMON_NAME: Final = 64  # RFC 5280, appendix A: ub-common-name
 _FILE_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
@@ -316,7 +318,7 @@ class _Authority:
         alternatives: x509.SubjectAlternativeName | None,
     ) -> x509.Certificate:
         now = _now()
-        end = min(now + CERTIFICATE_VALID, self.certificate.not_valid_after_utc)
+        end = min(now - _BACKDATED + CERTIFICATE_VALID, self.certificate.not_valid_after_utc)
         purpose = {
             "server": ExtendedKeyUsageOID.SERVER_AUTH,
             "client": ExtendedKeyUsageOID.CLIENT_AUTH,
@@ -484,10 +486,19 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
 
 
 def _now() -> datetime:
-    now = datetime.now(timezone.utc).replace(microsecond=0)
-    if now < _NEVER_BEFORE:
-        raise CertificateError(
-            f"this computer's clock says {now:%Y-%m-%d}; set it first, or clients will find that "
-            "the certificates are not valid"
-        )
+    """The time that certificates are made by; see `usable_time`."""
+    now = usable_time().replace(microsecond=0)
+    clock = datetime.now(timezone.utc)
+    if clock < now:
+        _tell_unset(f"{clock:%Y-%m-%d}", f"{now:%Y-%m-%d}")
     return now
+
+
+@functools.cache
+def _tell_unset(clock: str, now: str) -> None:
+    log.warning(
+        "this computer's clock says %s, which is before this program was made: certificates are "
+        "made and looked at as if it were %s",
+        clock,
+        now,
+    )

@@ -16,6 +16,8 @@ from weakref import WeakKeyDictionary
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from appliance.clock import RELEASED
+
 from .files import (
     CERTIFICATES_SIZE,
     MALFORMED,
@@ -25,6 +27,7 @@ from .files import (
     out_of_time,
     parse_certificates,
     read,
+    usable_time,
 )
 from .identity import UsernameFrom, username_of
 from .registry import fingerprint, serial_text
@@ -39,6 +42,8 @@ EXPIRES_SOON: Final = timedelta(days=30)
 # Ephemeral keys and authenticated encryption only. TLS 1.3 has nothing else.
 _TLS12_CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
 _LEAST_BITS: Final = 128
+# OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which Python has no name for.
+_NO_CHECK_TIME: Final = 0x200000
 _VERSIONS: Final = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3}
 
 
@@ -85,12 +90,19 @@ class LoadedTls:
     authorities: list[x509.Certificate]
     revocations: Revocations
     contexts: Mapping[str, ssl.SSLContext]
+    #: The same for as long as the computer's clock is not set: they do not look at times.
+    undated: Mapping[str, ssl.SSLContext]
     #: Counts those that were in force one after the other.
     generation: int
 
     def warnings(self, now: datetime | None = None) -> list[str]:
         """What has run out or does soon, each with what to do."""
         return list(_warnings(self, now or datetime.now(timezone.utc)))
+
+    def believable(self, now: datetime) -> datetime:
+        """That time, or the earliest that it can be: that of this program's release, and of the
+        making of the server's certificate."""
+        return max(now, RELEASED, self.chain[0].not_valid_before_utc)
 
 
 class TlsContexts:
@@ -147,7 +159,8 @@ class TlsContexts:
         return True
 
     def _remember(self) -> None:
-        for context in self._loaded.contexts.values():
+        loaded = self._loaded
+        for context in (*loaded.contexts.values(), *loaded.undated.values()):
             self._trusted[context] = frozenset(self._loaded.authorities)
 
     def reload(self) -> bool:
@@ -155,8 +168,14 @@ class TlsContexts:
         return self.take(self.prepare())
 
     def context(self, listener: str) -> ssl.SSLContext:
-        """The settings for a connection that begins now."""
-        return self._loaded.contexts[listener]
+        """The settings for a connection that begins now.
+
+        While the computer's clock is not set yet, a client's certificate is not refused for not
+        being valid before some time, and one that has run out is found by `refusal`.
+        """
+        loaded = self._loaded
+        now = datetime.now(timezone.utc)
+        return (loaded.contexts if loaded.believable(now) == now else loaded.undated)[listener]
 
     def source(self, listener: str) -> functools.partial[ssl.SSLContext]:
         """`context` of this listener, to be asked at each connection."""
@@ -175,6 +194,14 @@ class TlsContexts:
         who = f"its certificate {serial_text(certificate.serial_number)}"
         if date is not None:
             return f"{who} was revoked on {date:%Y-%m-%d}"
+        if _is_undated(tls.context):
+            now = datetime.now(timezone.utc)
+            start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+            believable = self._loaded.believable(now)
+            if believable > end:
+                return f"{who} expired on {end:%Y-%m-%d}"
+            if believable == now < start:
+                return f"{who} is not valid before {start:%Y-%m-%d %H:%M} UTC"
         trusted = self._loaded.authorities
         before = self._trusted.get(tls.context, frozenset())
         # Only when one was taken away is it asked by whom it is: a chain may go through one that
@@ -226,7 +253,7 @@ def server_context(
 def load_tls(files: TlsFiles, policies: Mapping[str, TlsPolicy]) -> LoadedTls:
     """Read everything and look at it strictly; CertificateError has all that is wrong."""
     loaded = _load(files, policies, "none", None)
-    problems = list(_out_of_time(loaded, datetime.now(timezone.utc)))
+    problems = list(_out_of_time(loaded, usable_time()))
     if problems:
         raise CertificateError(*problems)
     return loaded
@@ -256,19 +283,21 @@ def _load(
         if wanted == (before.files, before.policies, before.username_from, before.digest):
             return before
         if chain[0] != before.chain[0]:
-            problem = out_of_time(files.certificate, chain[0], datetime.now(timezone.utc))
+            problem = out_of_time(files.certificate, chain[0], usable_time())
             problems += [problem] if problem else []
-    made: dict[TlsPolicy, ssl.SSLContext] = {}
+    made: dict[TlsPolicy, tuple[ssl.SSLContext, ssl.SSLContext]] = {}
     readable = not problems
     for name, policy in policies.items():
         with _collected(problems, f"{name}: "):
             if policy not in made:
-                made[policy] = _context(policy)
-                if readable:
-                    _add_certificates(made[policy], files, policy, authorities)
+                made[policy] = dated, undated = _context(policy), _context(policy)
+                undated.verify_flags = ssl.VerifyFlags(undated.verify_flags | _NO_CHECK_TIME)
+                for context in (dated, undated) if readable else ():
+                    _add_certificates(context, files, policy, authorities)
     if problems:
         raise CertificateError(*problems)
-    contexts = {name: made[policy] for name, policy in policies.items()}
+    contexts = {name: made[policy][0] for name, policy in policies.items()}
+    undated_contexts = {name: made[policy][1] for name, policy in policies.items()}
     generation = 0 if before is None else before.generation + 1
     return LoadedTls(
         files,
@@ -279,6 +308,7 @@ def _load(
         authorities,
         revocations,
         contexts,
+        undated_contexts,
         generation,
     )
 
@@ -330,6 +360,10 @@ def _revocations(
             "put it back (`appliance cert crl` makes ours anew), or start the appliance anew"
         )
     return NOTHING_REVOKED
+
+
+def _is_undated(context: ssl.SSLContext) -> bool:
+    return bool(context.verify_flags & _NO_CHECK_TIME)
 
 
 def _context(policy: TlsPolicy) -> ssl.SSLContext:

@@ -7,7 +7,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from datetime import datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,8 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
     load_pem_private_key,
 )
+
+from appliance.clock import RELEASED
 
 #: What the library raises over a certificate, a request or a list that is not as it should be; some
 #: of it only when a part of it is looked at.
@@ -119,6 +121,15 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
     except MALFORMED:
         return False
     return True
+
+
+def usable_time() -> datetime:
+    """Now, or the time of this program's release while the computer's clock says less.
+
+    A computer without a battery for its clock starts in 1970, or with the age of its image. By that
+    clock it would make certificates that have run out when it is set.
+    """
+    return max(datetime.now(timezone.utc), RELEASED)
 
 
 def out_of_time(path: Path, certificate: x509.Certificate, now: datetime) -> str:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 from .authority import issued
-from .contexts import EXPIRES_SOON
-from .files import CertificateError, load_certificates
+from .contexts import EXPIRES_SOON, TlsFiles
+from .files import CertificateError, load_certificates, read, usable_time
 from .registry import Issued, serial_text
+from .revocation import CRL_SIZE, load_revocations
 
 State = Literal["valid", "replaced", "expired", "revoked"]
 
@@ -60,6 +61,39 @@ class Listed:
             "revoked": self.revoked and self.revoked.isoformat(),
             "file": self.file and str(self.file),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How long something of the listeners' TLS is good for, `days` less than 0 when it is not."""
+
+    what: Literal["server", "ca", "crl"]
+    file: Path
+    ends: datetime
+    days: int
+
+    @property
+    def is_soon(self) -> bool:
+        """Whether it is time to think of the next one."""
+        return self.days < EXPIRES_SOON.days
+
+
+def endings(files: TlsFiles) -> list[Ending]:
+    """When the server's certificate, the CA's and the revocation list run out, as far as they are
+    there. CertificateError when one cannot be read.
+    """
+    now = usable_time()
+    found: list[tuple[Literal["server", "ca", "crl"], Path, datetime]] = []
+    chain = load_certificates(files.certificate)
+    found.append(("server", files.certificate, min(each.not_valid_after_utc for each in chain)))
+    if files.ca is not None and files.ca.exists():
+        authorities = load_certificates(files.ca)
+        found += (("ca", files.ca, each.not_valid_after_utc) for each in authorities)
+        crl = files.revocations
+        if crl is not None and crl.exists():
+            revocations = load_revocations(crl, read(crl, CRL_SIZE), authorities)
+            found += (("crl", crl, end) for _, end in revocations.ends)
+    return [Ending(what, file, end, (end - now).days) for what, file, end in found]
 
 
 def listed(directory: Path) -> list[Listed]:

@@ -9,10 +9,12 @@ from typing import Final
 
 from cryptography import x509
 
+from appliance.clock import is_unset
+
 from .addresses import Address, local_names
 from .authority import issue_server, issued
 from .contexts import EXPIRES_SOON, TlsFiles
-from .files import issued_by, load_certificates
+from .files import issued_by, load_certificates, usable_time
 
 #: Names, and addresses, in one certificate. Those of before stay, as long as there is room: an
 #: interface that is down now comes up again.
@@ -23,8 +25,9 @@ def keep_server_certificate(files: TlsFiles) -> str:
     """Renews the server's certificate if that is due; returns why it was, or nothing.
 
     It is 30 days before its end, when this computer has a name or an address that is not in it,
-    and, with a new key, when it was revoked. Only for certificates that `appliance init` makes;
-    another CA's are used as they are. May wait for the resolver, see `local_names`.
+    when it was made by a clock that was ahead, and, with a new key, when it was revoked. Only for
+    certificates that `appliance init` makes; another CA's are used as they are. May wait for the
+    resolver, see `local_names`.
 
     Raises:
         CertificateError: it is due and cannot be done, or a file cannot be used.
@@ -40,6 +43,8 @@ def keep_server_certificate(files: TlsFiles) -> str:
     reason = ""
     if any(e.serial == certificate.serial_number and e.revoked for e in issued(directory)):
         reason = "it was revoked"
+    elif _begins_later(certificate, authority):
+        reason = f"it was not valid before {certificate.not_valid_before_utc:%Y-%m-%d}"
     elif _ends_soon(certificate, authority):
         reason = f"it would have ended on {certificate.not_valid_after_utc:%Y-%m-%d}"
     else:
@@ -68,7 +73,14 @@ def _is_ours(files: TlsFiles, directory: Path) -> bool:
 def _ends_soon(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     end = certificate.not_valid_after_utc
     # One that ends with its authority would not last longer for being new.
-    return end - datetime.now(timezone.utc) < EXPIRES_SOON and end < authority.not_valid_after_utc
+    return end - usable_time() < EXPIRES_SOON and end < authority.not_valid_after_utc
+
+
+def _begins_later(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    now = datetime.now(timezone.utc)
+    # A clock that is behind the authority's making is what is wrong, not the certificate.
+    is_right = not is_unset(now) and now >= authority.not_valid_before_utc
+    return is_right and now < certificate.not_valid_before_utc
 
 
 def _subjects(certificate: x509.Certificate) -> tuple[Sequence[str], Sequence[Address]]:

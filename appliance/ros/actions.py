@@ -6,19 +6,19 @@ An action is made of services and topics, and is bridged as these: `/act/_action
 | topic under `r2d2/act` | what |
 |---|---|
 | `_goal` | a call with the goal's fields; its answer is `{"goal_id": …}` once it is accepted |
-| `_cancel` | a call with `{"goal_id": …}` or `{"all": true}` |
+| `_cancel` | a call with `{"goal_id": …}`, `{"stamp": …}` for all up to then, or `{"all": true}` |
 | `_feedback/{goal id}` | feedback of every goal, QoS 0: only the newest counts |
 | `_result/{goal id}` | `{"status": "succeeded", "result": {…}}`, retained for `keep_result` |
 | `_status` | all goals that the server knows of, retained |
 
 A result that never comes is `{"status": "unknown", "error": {…}}`.
+
+These are JSON, CBOR or ROS's own bytes, see goals.py.
 """
 
 from __future__ import annotations
 
 import asyncio
-import base64
-import binascii
 import contextlib
 import logging
 import secrets
@@ -26,15 +26,14 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
-
-import orjson
+from typing import Any, Literal
 
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
+from appliance.ros import goals
 from appliance.ros.calls import (
-    JSON,
+    WITHOUT_RAW,
     Answer,
     Call,
     CallCounters,
@@ -42,24 +41,23 @@ from appliance.ros.calls import (
     ErrorCode,
     Offer,
     Switchboard,
+    error_payload,
 )
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.figures import Counters
+from appliance.ros.goals import ALL, CANCEL, STATUS
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names, compile_pattern
+from appliance.ros.patterns import assign, compile_pattern, refusals
+from appliance.ros.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps
 from appliance.ros.requests import Key, Requests
-from appliance.ros.services import to_request
+from appliance.ros.services import from_ros, to_request
+from appliance.ros.skips import Skip, Why
 
 log = logging.getLogger(__name__)
 
 SEND_GOAL = "/_action/send_goal"
-CANCEL = "action_msgs/srv/CancelGoal"
-STATUS = "action_msgs/msg/GoalStatusArray"
-
-#: By the numbers of action_msgs/msg/GoalStatus.
-STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
 #: By the numbers of action_msgs/srv/CancelGoal.
 _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
@@ -74,6 +72,12 @@ LANES = 256
 #: Results that one action keeps at a time; the oldest go first.
 RESULTS = 1000
 
+#: Goals of one action that were given up before they were accepted; the oldest are forgotten first.
+UNWANTED = 1000
+
+#: Goals, of all actions, of which is known who sent them; the oldest are forgotten first.
+OWNED = 10_000
+
 #: Seconds that a server which has just come has to say that it does not know a goal.
 CHECK_TIME = 5.0
 
@@ -83,23 +87,22 @@ LAST_WORD = 1.0
 
 @dataclass(frozen=True, slots=True)
 class ActionSettings:
-    """An action, or a pattern of actions. A `{ros}` in `mqtt` stands for the ROS name.
+    """Actions, by names and patterns; what begins with `!` is left out.
 
-    `timeout` is for the acceptance of a goal and for its cancelling, `keep_result` is how long a
-    result is retained, both in seconds.
+    A `{ros}` in `mqtt` stands for the ROS name. `timeout` is for the acceptance of a goal and for
+    its cancelling, `keep_result` is how long a result is retained, both in seconds. `encoding` is
+    for what is published, and for calls that do not name another. `cancel` says whose goals those
+    may cancel who may call `_cancel`.
     """
 
-    ros: str
+    names: tuple[str, ...]
     mqtt: str
     type: str | None = None
     timeout: float = 5.0
+    encoding: CallEncoding = "json"
     keep_result: float = 60.0
+    cancel: Literal["own", "any"] = "own"
     cancel_on_disconnect: bool = False
-
-    @property
-    def is_pattern(self) -> bool:
-        """Whether `ros` stands for many actions, or (`!`) for those that are left out."""
-        return "*" in self.ros or self.ros.startswith("!")
 
 
 @dataclass(eq=False, slots=True)
@@ -108,7 +111,7 @@ class _Goal:
 
     id: bytes
     owner: Session
-    result: asyncio.Future[dict[str, Any]]
+    result: asyncio.Future[tuple[str, bytes]]
     is_accepted: bool = False
     is_orphan: bool = False
 
@@ -151,11 +154,16 @@ class ActionRoutes:
         self._post = post
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
-        self._excluded = Names(())
         self._actions: dict[str, Action] = {}
+        #: Those whose route has gone before their goals.
+        self._past: list[Action] = []
+        #: Actions that patterns speak of and do not take.
+        self._refused: list[Skip] = []
         self._tasks = _Tasks()
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
+        #: Who has sent a goal, by its id: also when it has ended, or its route was changed.
+        self._owners: OrderedDict[bytes, str] = OrderedDict()
 
     def start(self) -> None:
         """Nothing is known of the bus yet."""
@@ -164,43 +172,35 @@ class ActionRoutes:
 
     def replace(self, routes: Sequence[ActionSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.ros.startswith("!")
-        }
-        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         self.follow()
 
     def follow(self) -> None:
         """Offer what is on the bus now."""
         found = {
-            service.removesuffix(SEND_GOAL): min(types).removesuffix("_SendGoal")
+            service.removesuffix(SEND_GOAL): [min(types).removesuffix("_SendGoal")]
             for service, types in self._requests.services.items()
             if service.endswith(SEND_GOAL)
         }
-        wanted = {route.ros: route for route in reversed(self._counters) if not route.is_pattern}
-        for route in self._counters:
-            if route.is_pattern:
-                pattern = compile_pattern(route.ros)
-                of_type = compile_pattern(route.type) if route.type else None
-                for name, type_name in found.items():
-                    if (
-                        name not in wanted
-                        and pattern.fullmatch(name)
-                        and name not in self._excluded
-                        and (of_type is None or of_type.fullmatch(type_name))
-                    ):
-                        wanted[name] = route
+        routes = list(self._counters)
+
+        def misfit(route: ActionSettings, name: str) -> tuple[Why, str] | None:
+            return _misfit(route, found[name][0])
+
+        wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
+        self._refused = refusals(routes, found, wanted, "action", misfit)
+        self._past = [action for action in self._past if action.has_goals]
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
                 del self._actions[name]
+                self._past.append(action)
         for name, route in wanted.items():
             if name not in self._actions:
                 self._actions[name] = Action(name, route, self._counters[route], self)
             fixed = route.type if route.type is not None and "*" not in route.type else None
-            self._actions[name].type = fixed or found.get(name) or self._actions[name].type
+            seen = found[name][0] if name in found else self._actions[name].type
+            self._actions[name].type = fixed or seen
             self._actions[name].see(name in found)
 
     def keys(self) -> Iterable[Key]:
@@ -208,11 +208,30 @@ class ActionRoutes:
         for action in self._actions.values():
             yield from action.keys()
 
+    def own(self, id_: bytes, owner: str) -> None:
+        """Remember who has sent a goal."""
+        self._owners[id_] = owner
+        if len(self._owners) > OWNED:
+            self._owners.popitem(last=False)
+
+    def owner(self, id_: bytes) -> str | None:
+        """Who has sent a goal; None for one of a ROS node, or from long ago."""
+        return self._owners.get(id_)
+
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
         if session in self.goals:
-            for action in self._actions.values():
+            for action in self._all():
                 action.departed(session)
+
+    def server_came(self, ros: str) -> None:
+        """Another server of that action has come."""
+        for action in self._all():
+            if action.ros == ros:
+                action.check_goals()
+
+    def _all(self) -> list[Action]:
+        return [*self._actions.values(), *self._past]
 
     def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the actions that it offers now."""
@@ -229,18 +248,30 @@ class ActionRoutes:
                 "mqtt": action.base,
                 "type": action.type or "",
                 "direction": "action",
-                "encoding": "json",
+                "encoding": action.route.encoding,
             }
             for action in self._actions.values()
             if action.is_there
         ]
+
+    def skips(self) -> list[Skip]:
+        """The actions that routes speak of and are not bridged."""
+        skips = list(self._refused)
+        for action in self._actions.values():
+            type_name = action.type or ""
+            problem = self._requests.problem(f"{action.ros}{SEND_GOAL}", f"{type_name}_SendGoal")
+            if problem is not None:
+                skips.append(Skip(action.ros, "action", type_name, "problem", problem))
+            elif not action.is_there:
+                skips.append(Skip(action.ros, "action", type_name, "absent", "no node offers it"))
+        return skips
 
     async def cancel_orphans(self) -> None:
         """The appliance stops, and with it every client's way to its goals: cancel those that
         are not to go on without them."""
         cancels = [
             action._cancel_quietly(goal.id, "the appliance stops")
-            for action in self._actions.values()
+            for action in self._all()
             if action.route.cancel_on_disconnect
             for goal in action._goals.values()
             if goal.is_accepted
@@ -254,6 +285,8 @@ class ActionRoutes:
         for action in self._actions.values():
             action.forget()
         self._actions.clear()
+        self._past.clear()
+        self._refused.clear()
         await self._tasks.stop()
 
     # The ROS thread
@@ -267,6 +300,13 @@ class ActionRoutes:
         """The bus is gone, and with it all subscriptions."""
         for action in list(self._actions.values()):
             action.lost()
+
+
+def _misfit(route: ActionSettings, type_name: str) -> tuple[Why, str] | None:
+    """Why a pattern of the route does not take an action of that type; None when it does."""
+    if route.type is None or compile_pattern(route.type).fullmatch(type_name):
+        return None
+    return "other_type", f"the route takes {route.type}"
 
 
 class Action:
@@ -285,7 +325,10 @@ class Action:
         self._board = routes._board
         self._requests = routes._requests
         self._converters = routes._converters
+        self._wire = routes._node.wire
         self._goals: dict[bytes, _Goal] = {}
+        #: Goals that nobody waits for any more, should their server accept them yet.
+        self._unwanted: OrderedDict[bytes, None] = OrderedDict()
         #: Topics of results that are retained, and until when; they all have the same time.
         self._kept: deque[tuple[str, float]] = deque()
         # The ROS thread's.
@@ -296,9 +339,20 @@ class Action:
         self._counted = Counters()
         self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
         self._status_lane = Lane(1, self._counted)
-        for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel)):
-            topic = f"{self.base}/{verb}"
-            self._board.offer(Offer(topic, f"{ros} {verb[1:]}", route.timeout, counters, handle))
+        self._offers = [
+            Offer(
+                f"{self.base}/{verb}",
+                f"{ros} {verb[1:]}",
+                route.timeout,
+                counters,
+                handle,
+                route.encoding,
+                (*WITHOUT_RAW, self._wire.encoding),
+            )
+            for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
+        ]
+        for offer in self._offers:
+            self._board.offer(offer)
         log.info("%s can be called at %s/_goal", ros, self.base)
 
     def see(self, is_there: bool) -> None:
@@ -320,17 +374,12 @@ class Action:
         type_name = self.type
         if type_name is None or not self.is_there:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
-        request_type = f"{type_name}_SendGoal_Request"
-        # The goal alone is checked first, so that an error names its fields as the client does.
-        to_request(self._converters, f"{type_name}_Goal", call.payload)
+        goal_cdr = to_request(self._converters, f"{type_name}_Goal", call.payload, call.encoding)
         self._check_room(call.caller)
         if self.route.cancel_on_disconnect and call.caller.link is None:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
-        fields = orjson.loads(call.payload or b"{}")
-        request = self._converters.get(request_type).from_dict(
-            {"goal_id": {"uuid": id_}, "goal": fields}
-        )
+        request = goals.with_id(goal_cdr, id_, self._wire)
         goal = _Goal(id_, call.caller, asyncio.get_running_loop().create_future())
         self._goals[id_] = goal
         self._routes.goals[call.caller] += 1
@@ -342,78 +391,104 @@ class Action:
             if not said["accepted"]:
                 raise CallError("rejected", f"{self.ros} does not accept the goal")
         except asyncio.CancelledError:
-            # It may be accepted yet, and nobody would know of it.
-            self._forget(goal)
+            # It may be accepted yet, and nobody would know of it: it is cancelled now, and once
+            # more should it begin after that.
+            self._give_up(goal)
             self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
+            raise
+        except CallError as error:
+            if error.code == "vanished":  # for a moment only, perhaps
+                self._give_up(goal)
+            else:
+                self._forget(goal)
             raise
         except BaseException:
             self._forget(goal)
             raise
         goal.is_accepted = True
+        self._routes.own(id_, _owner(call.caller))
         self._routes._tasks.begin(self._follow_goal(goal, type_name))
         if goal.is_orphan:
             self._cancel_orphan(goal)
-        return Answer(orjson.dumps({"goal_id": id_.hex(), "stamp": said["stamp"]}))
+        return goals.accepted(self._converters, id_, said["stamp"], call.encoding)
 
     def _check_room(self, caller: Session) -> None:
         limits = self._board.limits
-        goals = self._routes.goals
-        if goals[caller] >= limits.client:
+        under_way = self._routes.goals
+        if under_way[caller] >= limits.client:
             raise CallError(
                 "too_many", f"{limits.client} goals of this client are under way, as many as may be"
             )
-        if goals.total() >= limits.total:
+        if under_way.total() >= limits.total:
             raise CallError("too_many", f"{limits.total} goals are under way, as many as may be")
 
     def _forget(self, goal: _Goal) -> None:
         if self._goals.pop(goal.id, None) is not None:
-            goals = self._routes.goals
-            goals[goal.owner] -= 1
-            if not goals[goal.owner]:
-                del goals[goal.owner]
+            under_way = self._routes.goals
+            under_way[goal.owner] -= 1
+            if not under_way[goal.owner]:
+                del under_way[goal.owner]
+
+    def _give_up(self, goal: _Goal) -> None:
+        """Nobody waits for its acceptance any more: should it come, it is cancelled."""
+        self._forget(goal)
+        self._unwanted[goal.id] = None
+        if len(self._unwanted) > UNWANTED:
+            self._unwanted.popitem(last=False)
 
     async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
         """Wait for the result, as long as it takes, and publish it."""
         asking = asyncio.ensure_future(self._ask_result(goal, type_name))
         try:
             await asyncio.wait({asking, goal.result}, return_when=asyncio.FIRST_COMPLETED)
-            result = goal.result.result() if goal.result.done() else asking.result()
+            status, cdr = goal.result.result() if goal.result.done() else asking.result()
+            encoding = self.route.encoding
+            try:
+                payload = goals.result(self._converters, type_name, cdr, encoding)
+            except ConversionError as problem:
+                raise CallError("ros_error", f"the result cannot be read: {problem}") from None
         except CallError as error:
             self._counters.errors[error.code] += 1
             self._counters.last_error = f"{error.code}: {error}"
             log.warning("goal %s of %s has no result: %s", goal.id.hex(), self.ros, error)
-            problem = {"code": error.code, "message": str(error)}
-            result = {"status": "unknown", "error": problem}
+            status = "unknown"
+            payload, encoding = error_payload(error, self.route.encoding, status=status)
         finally:
             asking.cancel()
             self._forget(goal)
-        self._publish_result(goal.id, result, type_name)
+        kind = "GetResult_Response" if encoding in RAW else "Result"
+        about = [
+            ("status", "ok" if status == "succeeded" else "error"),
+            ("ros-type", f"{type_name}_{kind}"),
+        ]
+        properties: Properties = {
+            Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
+            Property.USER_PROPERTY: about,
+        }
+        self._publish_result(f"{self.base}/_result/{goal.id.hex()}", payload, properties)
 
-    async def _ask_result(self, goal: _Goal, type_name: str) -> dict[str, Any]:
+    async def _ask_result(self, goal: _Goal, type_name: str) -> tuple[str, bytes]:
+        """What became of the goal, and the response of `get_result`. Raises CallError."""
         converter = self._converters.get(f"{type_name}_GetResult_Request")
         response = await self._requests.ask(
             f"{self.ros}/_action/get_result",
             f"{type_name}_GetResult",
             converter.from_dict({"goal_id": {"uuid": goal.id}}),
         )
-        said = self._converters.get(f"{type_name}_GetResult_Response").to_dict(response)
-        status = STATES[said["status"]] if 0 <= said["status"] < len(STATES) else "unknown"
+        status = goals.status_of(response, self._wire)
         if status == "unknown":
             text = f"the server of {self.ros} has come anew and does not know the goal"
             raise CallError("vanished", text)
-        return {"status": status, "result": said["result"]}
+        return status, response
 
-    def _publish_result(self, id_: bytes, result: dict[str, Any], type_name: str) -> None:
-        topic = f"{self.base}/_result/{id_.hex()}"
-        is_ok = result["status"] == "succeeded"
-        about = [("status", "ok" if is_ok else "error"), ("ros-type", f"{type_name}_Result")]
+    def _publish_result(self, topic: str, payload: bytes, properties: Properties) -> None:
         keep = self.route.keep_result
         message = Message(
             topic,
-            orjson.dumps(result),
+            payload,
             1,
             keep > 0,
-            {Property.CONTENT_TYPE: JSON, Property.USER_PROPERTY: about},
+            properties,
             self._board.now() + keep if keep > 0 else None,
         )
         self._board.publish(message)
@@ -425,7 +500,11 @@ class Action:
             if len(kept) > RESULTS:
                 self._board.publish(Message(kept.popleft()[0], b"", 0, True))
 
-    def server_came(self) -> None:
+    @property
+    def has_goals(self) -> bool:
+        return bool(self._goals)
+
+    def check_goals(self) -> None:
         """Another server has come: it may have taken the place of one that was ended."""
         type_name = self.type
         if type_name is None:
@@ -447,26 +526,46 @@ class Action:
     # Cancelling
 
     async def _on_cancel(self, call: Call) -> Answer:
-        id_ = _which_goal(call.payload)
+        id_, stamp = goals.which(self._converters, call.payload, call.encoding)
+        self._check_right(call.caller, id_)
         if not self.is_there:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
-        return Answer(orjson.dumps({"goals_canceling": await self._cancel(id_)}))
+        canceling, response = await self._cancel(id_, stamp)
+        if call.encoding in RAW:
+            return Answer(response, call.encoding, f"{CANCEL}_Response")
+        return Answer(dumps({"goals_canceling": canceling}, call.encoding), call.encoding)
 
-    async def _cancel(self, id_: bytes) -> list[str]:
-        """Cancel a goal, 16 zeros for all; returns the ids of those that are cancelling."""
+    def _check_right(self, caller: Session, id_: bytes) -> None:
+        """Raises CallError when the caller may cancel only its own goals, and this is another's."""
+        right = f"{self.base}/_cancel_any"
+        if self.route.cancel == "any" or self._routes.owner(id_) == _owner(caller):
+            return
+        if not self._board.may_publish(caller, right):
+            what = f"goal {id_.hex()} is" if id_ != ALL else "these goals may be"
+            raise CallError(
+                "not_authorized",
+                f"{what} another's; to cancel those as well takes the right to write to {right}, "
+                "or cancel: any in the route",
+            )
+
+    async def _cancel(
+        self, id_: bytes, stamp: dict[str, int] | None = None
+    ) -> tuple[list[str], bytes]:
+        """Cancel a goal, or ALL up to a time; returns the ids of those that are
+        cancelling, and the response."""
         request = self._converters.get(f"{CANCEL}_Request").from_dict(
-            {"goal_info": {"goal_id": {"uuid": id_}}}
+            {"goal_info": {"goal_id": {"uuid": id_}, "stamp": stamp or {}}}
         )
         response = await self._requests.ask(f"{self.ros}/_action/cancel_goal", CANCEL, request)
         said = self._converters.get(f"{CANCEL}_Response").to_dict(response)
-        canceling = [_id(info["goal_id"]).hex() for info in said["goals_canceling"]]
+        canceling = [goals.id_of(info["goal_id"]).hex() for info in said["goals_canceling"]]
         if said["return_code"] in _NOT_CANCELLED:
             code, text = _NOT_CANCELLED[said["return_code"]]
             raise CallError(code, text)
-        if not canceling and any(id_):
+        if not canceling and id_ != ALL:
             # rclpy's server says nothing worse of a goal that it refuses to cancel.
             raise CallError("rejected", "the action's server does not cancel it")
-        return canceling
+        return canceling, response
 
     async def _cancel_quietly(self, id_: bytes, why: str) -> None:
         try:
@@ -478,6 +577,13 @@ class Action:
             log.warning("goal %s of %s is not cancelled: no answer", id_.hex(), self.ros)
         else:
             log.info("goal %s of %s is cancelled: %s", id_.hex(), self.ros, why)
+
+    def _cancel_unwanted(self, ids: list[bytes]) -> None:
+        for id_ in ids:
+            if id_ in self._unwanted:
+                del self._unwanted[id_]
+                why = "it was accepted when nobody waited for it any more"
+                self._routes._tasks.begin(self._cancel_quietly(id_, why))
 
     def departed(self, session: Session) -> None:
         """The client has gone."""
@@ -495,8 +601,8 @@ class Action:
 
     def stop(self) -> None:
         """The route was removed. Goals go on, and their results are published."""
-        for verb in ("_goal", "_cancel"):
-            self._board.withdraw(f"{self.base}/{verb}")
+        for offer in self._offers:
+            self._board.withdraw(offer)
         self.forget()
         self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
         try:
@@ -517,7 +623,7 @@ class Action:
             return
         servers = node.count(f"{self.ros}/_action/status")[0]
         if servers > self._servers and self._subscribed is not None:
-            self._routes._post(self.server_came)
+            self._routes._post(self._routes.server_came, self.ros)
         self._servers = servers
         if type_name == self._subscribed:
             return
@@ -528,9 +634,10 @@ class Action:
         try:
             own = node.subscribe_raw(status, STATUS, latched, self._on_status)
             self._subscriptions.append(own)
-            feedback_type = f"{type_name}_FeedbackMessage"
-            on_feedback = partial(self._on_feedback, feedback_type)
-            own = node.subscribe_raw(feedback, feedback_type, QosProfile(), on_feedback)
+            on_feedback = partial(self._on_feedback, f"{type_name}_Feedback")
+            own = node.subscribe_raw(
+                feedback, f"{type_name}_FeedbackMessage", QosProfile(), on_feedback
+            )
             self._subscriptions.append(own)
         except (BusError, UnknownTypeError) as error:
             self._counters.last_error = str(error)
@@ -554,64 +661,43 @@ class Action:
 
     def _on_status(self, cdr: bytes) -> None:
         try:
-            said = self._converters.get(STATUS).to_dict(cdr)
+            payload = goals.statuses(self._converters, cdr, self.route.encoding)
+            late = goals.going_on(self._converters, cdr) if self._unwanted else []
         except ConversionError as error:
             self._counters.last_error = str(error)
             return
-        goals = [
-            {
-                "goal_id": _id(one["goal_info"]["goal_id"]).hex(),
-                "status": STATES[one["status"]] if 0 <= one["status"] < len(STATES) else "unknown",
-                "stamp": one["goal_info"]["stamp"],
-            }
-            for one in said["status_list"]
-        ]
-        self._put(self._status_lane, f"{self.base}/_status", goals, STATUS, retain=True)
+        if any(id_ in self._unwanted for id_ in late):
+            self._routes._post(self._cancel_unwanted, late)
+        self._put(self._status_lane, f"{self.base}/_status", payload, STATUS, retain=True)
 
     def _on_feedback(self, type_name: str, cdr: bytes) -> None:
+        id_, feedback = goals.split_id(cdr, self._wire)
         try:
-            said = self._converters.get(type_name).to_dict(cdr)
-        except ConversionError as error:
+            payload = from_ros(self._converters, type_name, feedback, self.route.encoding)
+        except (ConversionError, UnknownTypeError) as error:
             self._counters.last_error = str(error)
             return
-        id_ = _id(said["goal_id"])
         lane = self._lanes.pop(id_, None) or Lane(1, self._counted)
         self._lanes[id_] = lane
         if len(self._lanes) > LANES:
             self._lanes.popitem(last=False)
         topic = f"{self.base}/_feedback/{id_.hex()}"
-        self._put(lane, topic, said["feedback"], type_name.replace("_FeedbackMessage", "_Feedback"))
+        self._put(lane, topic, payload, type_name)
 
     def _put(
-        self, lane: Lane, topic: str, value: object, type_name: str, *, retain: bool = False
+        self, lane: Lane, topic: str, payload: bytes, type_name: str, *, retain: bool = False
     ) -> None:
         properties: Properties = {
-            Property.CONTENT_TYPE: JSON,
+            Property.CONTENT_TYPE: CONTENT_TYPE[self.route.encoding],
             Property.USER_PROPERTY: [("ros-type", type_name)],
         }
-        message = Message(topic, orjson.dumps(value), int(retain), retain, properties)
+        message = Message(topic, payload, int(retain), retain, properties)
         self._routes._mailbox.put(lane, message)
 
 
-def _id(uuid: dict[str, str]) -> bytes:
-    return base64.b64decode(uuid["uuid"])
-
-
-def _which_goal(payload: bytes) -> bytes:
-    """The goal that a call of `_cancel` means, 16 zeros for all. Raises CallError."""
-    wanted = 'say which goal: {"goal_id": "…"}, the 32 hex digits of its id, or {"all": true}'
-    try:
-        value = orjson.loads(payload)
-    except orjson.JSONDecodeError as error:
-        raise CallError("bad_request", f"not JSON: {error}") from None
-    if value == {"all": True}:
-        return bytes(16)
-    if not isinstance(value, dict) or set(value) != {"goal_id"}:
-        raise CallError("bad_request", wanted)
-    try:
-        id_ = binascii.unhexlify(value["goal_id"].replace("-", ""))
-    except (binascii.Error, AttributeError, ValueError):
-        raise CallError("bad_request", f"goal_id: {wanted}") from None
-    if len(id_) != 16 or not any(id_):
-        raise CallError("bad_request", f"goal_id: {wanted}")
-    return id_
+def _owner(caller: Session) -> str:
+    """Whose goals a client's are: its user's, on whichever client; without one, its own."""
+    identity = caller.identity
+    if identity is None or identity.username is None:
+        return f"client {caller.client_id}"
+    return f"user {identity.username}"

@@ -4,7 +4,9 @@ Two threads meet here. On the ROS thread the graph is looked at, subscriptions a
 made, and what ROS sends is throttled, converted and left in the mailbox. On the event loop's thread
 the mailbox is emptied into the broker, and what MQTT sends is converted and published on ROS at
 once: a conversion takes microseconds, and rclpy's publish holds the interpreter's lock all the way
-through, so that handing it to another thread would add a wake-up and free nothing.
+through, so that handing it to another thread would add a wake-up and free nothing. For the same
+reason small messages from ROS are taken, converted and published on the loop's thread right away,
+where the node can do that.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable
-from time import time_ns
+from collections.abc import Callable, Iterable, Mapping
+from time import thread_time, time_ns
+from typing import Literal, TypeAlias
 
 import orjson
 
@@ -29,12 +32,14 @@ from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
 from appliance.ros.graph import CallRoutes, Calls
-from appliance.ros.mailbox import Mailbox
+from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
+from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
+from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 
-__all__ = ["Bridge", "Bridged", "RouteSettings", "RouteStatus", "TopicStatus"]
+__all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 
 log = logging.getLogger(__name__)
 
@@ -43,14 +48,27 @@ CLIENT_ID = "_bridge"
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
 
+#: Bytes of a payload up to which converting it takes some ten microseconds.
+LITTLE = 1024
+
 #: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
 #: one may have been replaced by another. At each look it is the turn of some topics.
 THOROUGH_LOOK = 5
+
+#: Every so many looks the other nodes are counted.
+COUNTED_LOOK = 10
+
+#: Seconds until ROS is tried again when it could not be joined or was lost; each time twice as
+#: many, up to the second of these.
+RETRY = 1.0
+LONGEST_RETRY = 60.0
 
 #: Seconds between two looks at the counters, for the rates; and how many of these it takes until
 #: what is bridged is told again for the figures in it.
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
+
+BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
 SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
@@ -58,7 +76,8 @@ SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json
 class Bridge:
     """Carries the topics of routes between a node and the broker; belongs to the loop's thread.
 
-    `problem` is None, or why there is no ROS (any more).
+    `problem` is None, or why there is no ROS, or none any more; it is tried again and again.
+    `peers` is how many other nodes were seen, None while the bus is not joined.
     """
 
     def __init__(
@@ -72,14 +91,21 @@ class Bridge:
         *,
         diagnostics: float = 0.0,
     ) -> None:
-        """What is bridged is told on `{robot}/_appliance/routes`, and every so many seconds how it
-        goes on `/diagnostics`, not at all for 0.
+        """What is bridged is told on `{robot}/_appliance/routes`, what is not on `…/skipped`, and
+        every so many seconds how it goes on `/diagnostics`, not at all for 0.
         """
         self.problem: str | None = None
+        self.peers: int | None = None
+        self._was_joined = False
+        self._joined_at: float | None = None
+        self._retry = RETRY
+        self._retry_timer: asyncio.TimerHandle | None = None
+        self._is_stopping = False
         self._node = node
         self._broker = broker
         self._loop = loop
         self._topic = f"{robot}/_appliance/routes"
+        self._skipped_topic = f"{robot}/_appliance/skipped"
         self._schemas = f"{robot}/_appliance/schema/"
         #: The types whose schemas are told.
         self._told: set[str] = set()
@@ -91,13 +117,15 @@ class Bridge:
         self._metered = 0
         #: What was last told of what is bridged.
         self._announced = b""
+        self._announced_skips = b""
         #: Replaced as one by the loop's thread; the ROS thread follows at its next look.
         self._routes: list[Route] = []
         self._followed: list[Route] | None = None
         #: Topics that have a route by name, which goes before patterns.
         self._named: dict[Direction, set[str]] = {"to_mqtt": set(), "to_ros": set()}
-        #: The topics when patterns were last matched.
+        #: The topics when patterns were last matched, and those that no pattern took.
         self._topics: dict[str, list[str]] | None = None
+        self._refused: list[Skip] = []
         #: By what they carry. These belong to the ROS thread; those to ROS only as far as patterns
         #: found them, of which the loop's thread is told when they can be received for.
         self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
@@ -112,6 +140,7 @@ class Bridge:
         self._receivers: dict[str, list[ToRos]] = {}
         self._subscribed: dict[str, Subscription] = {}
         self._looks = 0
+        self._is_joined = False
         #: Services, actions and parameters.
         self.calls = Calls(
             node, broker, loop, self._converters, self._mailbox, self._post, self._announce
@@ -205,7 +234,7 @@ class Bridge:
             self._broker.unsubscribe(session, topic)
 
     def _add_to_mqtt(self, route: Route, ros: str) -> None:
-        flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox)
+        flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox, self._publish)
         key = flow.ros, flow.mqtt
         if key in self._to_mqtt:
             text = "%s has a route already; the later one is left out"
@@ -242,10 +271,28 @@ class Bridge:
         self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
             self._diagnostics.start(self._loop)
-        self._node.start(self._look, self._failed)
+        self._join()
+
+    def _join(self) -> None:
+        self._node.start(self._look, self._failed, self._loop)
+
+    @property
+    def state(self) -> BusState:
+        """Whether the bus is joined, was lost, or has not been there yet."""
+        if self._joined_at is not None:
+            return "joined"
+        return "lost" if self._was_joined else "waiting"
+
+    @property
+    def obstacle(self) -> str | None:
+        """What is in the way for now, although nothing has failed."""
+        return self._node.obstacle
 
     async def stop(self) -> None:
         """Leave the bus, hand over what it had sent, and leave the broker; may be called twice."""
+        self._is_stopping = True
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
         if self._meter_timer is not None:
             self._meter_timer.cancel()
         if self._diagnostics is not None:
@@ -262,6 +309,7 @@ class Bridge:
         while self._deliver():
             pass
         await self.calls.stop()
+        self._refused = []
         self._announce()
         self._session = None
         self._broker.detach(session)
@@ -279,14 +327,27 @@ class Bridge:
             topic_status(flow.bridged, flow) for flow in self._flows() if flow.bridged is not None
         ]
 
+    def skips(self) -> list[Skip]:
+        """What routes speak of and is not bridged, and why."""
+        of_flows = [skip for flow in self._flows() for skip in flow.skips()]
+        return ordered([*of_flows, *self._refused, *self.calls.skips()])
+
     @property
     def node_name(self) -> str:
         """The full name of the bridge's node."""
         return self._node.name
 
     def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+        payload = message.payload
+        # A few bytes can be a megabyte when they are decompressed, and a list of texts takes ten
+        # times as long as one of numbers: only the clock knows whose turn is over. It is that of
+        # the thread's own work, and too dear for a command.
+        is_long = len(payload) > LITTLE or payload.startswith(ZSTD_MAGIC)
+        begun = thread_time() if is_long else 0.0
         for receiver in self._receivers.get(message.topic, ()):
             receiver.receive(message, retain, origin)
+        if is_long:
+            self._broker.counters.effort += int((thread_time() - begun) * 1e6)
 
     def _drain(self) -> None:
         if self._deliver():
@@ -294,10 +355,16 @@ class Bridge:
 
     def _deliver(self) -> bool:
         """Publish what waits in the mailbox, up to a batch; True when there may be more."""
-        session = self._session
-        if session is None:
+        if self._session is None:
             return False
         batch, has_more = self._mailbox.take(BATCH)
+        self._publish(batch)
+        return has_more
+
+    def _publish(self, batch: Iterable[tuple[Lane, Message]]) -> None:
+        session = self._session
+        if session is None:
+            return
         publish = self._broker.publish
         for lane, message in batch:
             counters = lane.counters
@@ -309,7 +376,6 @@ class Bridge:
             counters.bytes += len(message.payload)
             publish(message, session)
         self._broker.flush()
-        return has_more
 
     def _announce(self) -> None:
         """Tell what is bridged, if that or a figure in it has changed."""
@@ -319,6 +385,11 @@ class Bridge:
             self._announced = payload
             self._broker.publish(Message(self._topic, payload, 0, True), self._session)
             self._tell_schemas({topic.type for topic in topics}, self._session)
+            self._broker.flush()
+        payload = orjson.dumps(summary(self.skips()))
+        if self._session is not None and payload != self._announced_skips:
+            self._announced_skips = payload
+            self._broker.publish(Message(self._skipped_topic, payload, 0, True), self._session)
             self._broker.flush()
 
     def _meter(self) -> None:
@@ -345,9 +416,31 @@ class Bridge:
             )
         self._told = types
 
+    def _joined(self) -> None:
+        log.info("on ROS as %s", self._node.name)
+        self.problem = None
+        self._was_joined = True
+        self._joined_at = self._loop.time()
+
+    def _counted(self, peers: int) -> None:
+        self.peers = peers
+
     def _stopped(self, reason: str) -> None:
-        self.problem = reason
-        log.warning("there is no bridge to ROS: %s", reason)
+        before, self.problem = self.problem, reason
+        since, self._joined_at, self.peers = self._joined_at, None, None
+        if self._is_stopping:
+            return
+        now = self._loop.time()
+        if since is not None and now - since > LONGEST_RETRY:
+            self._retry = RETRY
+        delay, self._retry = self._retry, min(2 * self._retry, LONGEST_RETRY)
+        if reason != before:
+            log.warning(
+                "there is no bridge to ROS: %s (it is tried again, at least every %g s)",
+                reason,
+                LONGEST_RETRY,
+            )
+        self._retry_timer = self._loop.call_later(delay, self._join)
 
     # Any thread
 
@@ -373,8 +466,12 @@ class Bridge:
 
     def _look(self) -> None:
         """Follow what has come and gone on the graph."""
-        if self._looks == 0:
-            self._tell(logging.INFO, "on ROS as %s", self._node.name)
+        if not self._is_joined:
+            self._is_joined = True
+            self._looks = 0
+            self._post(self._joined)
+        if self._looks % COUNTED_LOOK == 0:
+            self._post(self._counted, len(set(self._node.nodes()) - {self._node.name}))
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
@@ -421,6 +518,7 @@ class Bridge:
         is bridged has changed."""
         patterns = [route for route in self._routes if route.is_pattern]
         if not patterns:
+            self._refused = []
             return False
         topics = self._node.topics()
         if topics == self._topics:
@@ -431,7 +529,7 @@ class Bridge:
             if flow.is_matched and not flow.route.matches(flow.ros, topics.get(flow.ros, ())):
                 has_changed |= flow.bridged is not None
                 self._end(flow)
-        taken = {
+        taken: dict[Direction, set[str]] = {
             "to_mqtt": self._named["to_mqtt"] | {flow.ros for flow in self._to_mqtt.values()},
             "to_ros": self._named["to_ros"] | {flow.ros for flow in self._found.values()},
         }
@@ -442,7 +540,25 @@ class Bridge:
                     mine.add(ros)
                     add = self._add_to_mqtt if route.direction == "to_mqtt" else self._add_to_ros
                     add(route, ros)
+        refused = self._find_refused(patterns, taken)
+        has_changed |= refused != self._refused
+        self._refused = refused
         return has_changed
+
+    def _find_refused(
+        self, patterns: list[Route], taken: Mapping[Direction, set[str]]
+    ) -> list[Skip]:
+        found: dict[tuple[str, str], Skip] = {}
+        for route in patterns:
+            direction = route.direction
+            for ros, types in (self._topics or {}).items():
+                # Those of actions belong to bridge.actions, which has a say of its own.
+                if ros in taken[direction] or (ros, direction) in found or "/_action/" in ros:
+                    continue
+                refusal = route.refusal(ros, types)
+                if refusal is not None:
+                    found[ros, direction] = Skip(ros, direction, min(types), *refusal)
+        return list(found.values())
 
     def _end(self, flow: Flow) -> None:
         flow.close()
@@ -454,8 +570,10 @@ class Bridge:
         self._post(flow.route.past.add, flow.counters)
 
     def _failed(self, reason: str) -> None:
-        for flow in self._flows():
+        self._is_joined = False
+        for flow in (*self._flows(), *self._leaving):
             flow.lost()
+        self._refused = []
         self.calls.lost()
         if self._diagnostics is not None:
             self._diagnostics.lost()

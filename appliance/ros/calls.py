@@ -12,7 +12,8 @@ Response Topic is one that the caller could have published to itself, or one bel
 a way back or because the caller may not use it, is not carried out: the error is on
 `r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
 
-Everything here is for the event loop's thread.
+A call may be JSON, CBOR or ROS's own bytes, as its content type says, else as the route does; its
+answer is the same. Everything here is for the event loop's thread.
 """
 
 from __future__ import annotations
@@ -25,8 +26,6 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-import orjson
-
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
@@ -35,6 +34,7 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.ros.backlog import Backlog
+from appliance.ros.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps, named_encoding, too_large
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,7 @@ ErrorCode: TypeAlias = Literal[
     "expired",  # it was sent long before it came
     "no_response_topic",  # there is no way to answer
     "not_authorized",  # the caller may not have the answer there, or not ask for that
+    "too_large",  # the payload is larger than what is converted
     "too_many",  # the caller, or all together, have too many calls under way
     "unavailable",  # there is no such service, action or node on the bus now
     "vanished",  # there was, and it went away before it answered
@@ -57,10 +58,20 @@ ErrorCode: TypeAlias = Literal[
     "stopping",  # the appliance stops
 ]
 
-JSON = "application/json"
+
+#: Encodings of a call that has other values than ROS messages in it; of such, ROS's own bytes too.
+WITHOUT_RAW: tuple[CallEncoding, ...] = ("json", "cbor")
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
+
+
+#: Bytes that are converted in a microsecond or so, and count for that in the broker's
+#: `Counters.effort`: who sends much then waits for the others.
+BYTES_AN_EFFORT = 16
+
+#: Bytes of payload of all calls under way.
+TOTAL_BYTES = 64 * 1024 * 1024
 
 
 class CallError(Exception):
@@ -73,19 +84,20 @@ class CallError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to a call: its payload, and the ROS type that this is of, if any."""
+    """The answer to a call: its payload, how that is encoded, and the ROS type of it, if any."""
 
     payload: bytes
+    encoding: CallEncoding
     type: str | None = None
-    content_type: str = JSON
 
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Calls and goals under way: of one client, and of all together."""
+    """Calls and goals under way: of one client, and of all together; and bytes of a call."""
 
     client: int = 20
     total: int = 500
+    payload: int = 1024 * 1024
 
 
 @dataclass(eq=False, slots=True)
@@ -104,13 +116,16 @@ class Call:
     """One call that can be answered.
 
     `topic` is without the token. `reply` is the answer as far as it is known beforehand: its topic,
-    QoS and Correlation Data.
+    QoS and Correlation Data. `encoding` is the payload's, and will be the answer's; `doubt` says
+    why it may be another.
     """
 
     caller: Session
     payload: bytes
     topic: str
     reply: Message
+    encoding: CallEncoding
+    doubt: str = ""
     is_late: bool = False
     task: asyncio.Task[None] | None = None
 
@@ -122,7 +137,8 @@ Handle: TypeAlias = Callable[[Call], Awaitable[Answer]]
 class Offer:
     """What can be called under a topic: `handle` gives the answer or raises CallError.
 
-    `name` is what the log calls it. `timeout` is in seconds.
+    `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
+    `encodings` are those that it takes.
     """
 
     topic: str
@@ -130,6 +146,8 @@ class Offer:
     timeout: float
     counters: CallCounters
     handle: Handle
+    encoding: CallEncoding = "json"
+    encodings: tuple[CallEncoding, ...] = WITHOUT_RAW
 
 
 Receive: TypeAlias = Callable[[Session, Message], None]
@@ -171,9 +189,11 @@ class Switchboard:
         self._receivers: dict[int, Receive] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
-        self._offers: set[str] = set()
+        #: By topic, the first of those that were offered there; the others wait for it to go.
+        self._offers: dict[str, list[Offer]] = {}
         self._under_way: Counter[Session] = Counter()
         self._calls: set[Call] = set()
+        self._bytes = 0
         self._report_at: dict[str, float] = {}
 
     def start(self) -> None:
@@ -188,7 +208,8 @@ class Switchboard:
     async def stop(self) -> None:
         """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
         for topic in list(self._offers):
-            self.withdraw(topic)
+            del self._offers[topic]
+            self._ignore_calls(topic)
         tasks = [call.task for call in self._calls if call.task is not None]
         for task in tasks:
             task.cancel()
@@ -226,20 +247,42 @@ class Switchboard:
 
     def offer(self, offer: Offer) -> None:
         """Let `offer.topic`, which may have a `+` in it, be called."""
-        self._offers.add(offer.topic)
+        offers = self._offers.setdefault(offer.topic, [])
+        offers.append(offer)
+        if len(offers) == 1:
+            self._listen_for(offer)
+        else:
+            text = "%s cannot be called: calls at %s are for %s"
+            log.warning(text, offer.name, offer.topic, offers[0].name)
+
+    def _listen_for(self, offer: Offer) -> None:
         self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
         self.listen(
             f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
         )
 
-    def withdraw(self, topic: str) -> None:
+    def withdraw(self, offer: Offer) -> None:
         """Offer it no longer; calls under way have their answers yet."""
-        self._offers.remove(topic)
+        offers = self._offers.get(offer.topic, [])
+        if offer not in offers:
+            return  # `stop` has withdrawn all
+        was_first = offers[0] is offer
+        offers.remove(offer)
+        if not offers:
+            del self._offers[offer.topic]
+            self._report_at.pop(offer.topic, None)
+        if was_first:
+            self._ignore_calls(offer.topic)
+            if offers:
+                self._listen_for(offers[0])
+
+    def _ignore_calls(self, topic: str) -> None:
         self.ignore(topic)
         self.ignore(f"{topic}/+")
 
     def receive(self, origin: Session, message: Message, identifier: int) -> None:
         """A message came through the subscription with that identifier."""
+        self._broker.counters.effort += len(message.payload) // BYTES_AN_EFFORT
         receive = self._receivers.get(identifier)
         if receive is not None:
             receive(origin, message)
@@ -265,6 +308,13 @@ class Switchboard:
             if left.fullmatch(topic):
                 self.publish(Message(topic, b"", 0, True))
 
+    def may_publish(self, caller: Session, topic: str) -> bool:
+        """Whether the rules in force let the caller publish there."""
+        try:
+            return self._broker.route(caller, encode_string(topic)).allowed
+        except ProtocolError:
+            return False
+
     def now(self) -> float:
         """Seconds of the broker's clock."""
         return self._broker.now
@@ -276,21 +326,31 @@ class Switchboard:
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
         fallback = Message(own, b"", 1)
+        said = (message.properties or {}).get(Property.CONTENT_TYPE)
+        named = named_encoding(said)
+        encoding = named or offer.encoding
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
-            may_tell = not set("/+#\0") & set(caller.client_id)
-            self._fail(offer, caller, fallback if may_tell else None, error)
+            may_tell = _is_level(caller.client_id)
+            self._fail(offer, caller, fallback if may_tell else None, encoding, error)
             return
-        call = Call(caller, message.payload, topic, reply)
+        call = Call(caller, message.payload, topic, reply, encoding)
+        if isinstance(said, str) and named is None:
+            call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
         try:
             self._admit(offer, caller, message)
+            if encoding not in offer.encodings:
+                either = " or ".join(offer.encodings)
+                text = f"a call of {offer.name} may be {either}, not {encoding}"
+                raise CallError("bad_request", text)
         except CallError as error:
-            self._fail(offer, caller, reply, error)
+            self._fail(offer, caller, reply, encoding, error)
             return
         self._under_way[caller] += 1
         offer.counters.under_way += 1
         self._calls.add(call)
+        self._bytes += len(call.payload)
         call.task = self._loop.create_task(self._run(offer, call))
         call.task.add_done_callback(lambda _: self._forget(offer, call))
 
@@ -306,13 +366,14 @@ class Switchboard:
                     "there is no Response Topic, nor, for 3.1.1, a token as the topic's last "
                     f"level: publish to {message.topic}/TOKEN, and subscribe to {own}/TOKEN",
                 )
-            if set("/+#\0") & set(caller.client_id):
+            if not _is_level(caller.client_id):
                 raise CallError(
                     "no_response_topic",
                     f"the client id {quote(caller.client_id)} cannot be a level of a topic",
                 )
             topic = f"{own}/{token}"
-        if topic == own or topic.startswith(f"{own}/"):
+        # What is below the id of a client `alice/1` belongs to the client `alice`.
+        if _is_level(caller.client_id) and (topic == own or topic.startswith(f"{own}/")):
             if not self._broker.may_receive(caller, topic):
                 raise CallError("not_authorized", f"the caller may not read {quote(topic)}")
         else:
@@ -342,6 +403,11 @@ class Switchboard:
             # Nobody waits for its answer any more, and what it would do nobody expects now.
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
         limits = self.limits
+        size = len(message.payload)
+        if size > limits.payload:
+            raise CallError("too_large", too_large(size, limits.payload))
+        if self._bytes + size > TOTAL_BYTES:
+            raise CallError("too_many", f"{self._bytes} bytes of calls are under way")
         if self._under_way[caller] >= limits.client:
             raise CallError(
                 "too_many", f"{limits.client} calls of this client are under way, as many as may be"
@@ -359,33 +425,44 @@ class Switchboard:
         try:
             answer = await offer.handle(call)
         except CallError as error:
-            self._fail(offer, call.caller, call.reply, error)
+            if error.code == "bad_request" and call.doubt:
+                error = CallError(error.code, f"{error}{call.doubt}")
+            self._fail(offer, call.caller, call.reply, call.encoding, error)
         except asyncio.CancelledError:
             text = f"no answer from {offer.name} within {offer.timeout:g} s"
             end = CallError("timeout", text) if call.is_late else _stopping()
-            self._fail(offer, call.caller, call.reply, end)
+            self._fail(offer, call.caller, call.reply, call.encoding, end)
         except Exception as problem:  # a fault in here must not leave the caller without an answer
             log.exception("a call of %s failed", offer.name)
-            self._fail(offer, call.caller, call.reply, CallError("ros_error", repr(problem)))
+            end = CallError("ros_error", repr(problem))
+            self._fail(offer, call.caller, call.reply, call.encoding, end)
         else:
             offer.counters.answers += 1
             about = [("status", "ok")]
             if answer.type is not None:
                 about.append(("ros-type", answer.type))
-            self._answer(call.reply, answer.payload, answer.content_type, about)
+            self._answer(call.reply, answer.payload, answer.encoding, about)
         finally:
             timer.cancel()
 
     def _forget(self, offer: Offer, call: Call) -> None:
         if call.task is not None and call.task.cancelled():  # before it had begun
-            self._fail(offer, call.caller, call.reply, _stopping())
+            self._fail(offer, call.caller, call.reply, call.encoding, _stopping())
         offer.counters.under_way -= 1
         self._calls.discard(call)
+        self._bytes -= len(call.payload)
         self._under_way[call.caller] -= 1
         if not self._under_way[call.caller]:
             del self._under_way[call.caller]
 
-    def _fail(self, offer: Offer, caller: Session, reply: Message | None, error: CallError) -> None:
+    def _fail(
+        self,
+        offer: Offer,
+        caller: Session,
+        reply: Message | None,
+        encoding: CallEncoding,
+        error: CallError,
+    ) -> None:
         counters = offer.counters
         counters.errors[error.code] += 1
         counters.last_error = f"{error.code}: {error}"
@@ -397,21 +474,32 @@ class Switchboard:
             log.warning(text, offer.name, caller, count, error.code, error)
         if reply is not None:
             # In a turn of its own: the caller's chunk is still being worked on.
-            payload = error_payload(error)
-            self._loop.call_soon(self._answer, reply, payload, JSON, [("status", "error")])
+            about = [("status", "error")]
+            self._loop.call_soon(self._answer, reply, *error_payload(error, encoding), about)
 
     def _answer(
-        self, reply: Message, payload: bytes, content_type: str, about: list[tuple[str, str]]
+        self, reply: Message, payload: bytes, encoding: CallEncoding, about: list[tuple[str, str]]
     ) -> None:
         properties = dict(reply.properties or {})
-        properties[Property.CONTENT_TYPE] = content_type
+        properties[Property.CONTENT_TYPE] = CONTENT_TYPE[encoding]
         properties[Property.USER_PROPERTY] = about
         self.publish(Message(reply.topic, payload, reply.qos, properties=properties))
 
 
-def error_payload(error: CallError) -> bytes:
-    """An error as every answer has it: `{"error": {"code": …, "message": …}}`."""
-    return orjson.dumps({"error": {"code": error.code, "message": str(error)}})
+def error_payload(
+    error: CallError, encoding: CallEncoding, **more: str
+) -> tuple[bytes, CallEncoding]:
+    """An error as every answer has it, `{"error": {"code": …, "message": …}}`, and its encoding.
+
+    ROS's own bytes have no words for it: that is JSON then, which no CDR begins like.
+    """
+    about = {"code": error.code, "message": str(error)}
+    return dumps({**more, "error": about}, encoding), "json" if encoding in RAW else encoding
+
+
+def _is_level(client_id: str) -> bool:
+    """Whether the id can be one level of a topic, as `_reply/{client id}` needs it."""
+    return not set("/+#\0") & set(client_id)
 
 
 def _stopping() -> CallError:

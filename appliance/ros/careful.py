@@ -52,13 +52,16 @@ class ConversionError(ValueError):
 # --- CDR to values --------------------------------------------------------------------------
 
 
-def decode(description: TypeDescription, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
+def decode(
+    description: TypeDescription, cdr: bytes, *, binary: bool = False, strict: bool = False
+) -> dict[str, Any]:
     """The value of a serialized message: byte order, alignment and strings as its wire has them.
 
     uint8[], byte[] and char[] come as base64, as in JSON; when `binary`, as bytes, and other
     arrays of numbers, but for bools, as `Numbers`. Bytes after the message are ignored,
     as every DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) comes with
-    U+FFFD in it, as rclpy gives it. Raises ConversionError.
+    U+FFFD in it; when `strict`, what is not UTF-16 is refused, as rclpy cannot take it, and so is
+    a string that is longer than its bound. Raises ConversionError.
     """
     order = "<"
     if description.wire.header:
@@ -67,7 +70,7 @@ def decode(description: TypeDescription, cdr: bytes, *, binary: bool = False) ->
         if cdr[0] != 0 or cdr[1] > 1:
             raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
         order = "<" if cdr[1] else ">"
-    return _Reader(cdr, description.wire, order, binary).structure(description, "")
+    return _Reader(cdr, description.wire, order, binary, strict).structure(description, "")
 
 
 def pick(value: Any, wanted: Selection) -> Any:
@@ -84,11 +87,12 @@ def pick(value: Any, wanted: Selection) -> Any:
 class _Reader:
     """A position in the bytes of one message."""
 
-    def __init__(self, cdr: bytes, wire: Wire, order: str, binary: bool) -> None:
+    def __init__(self, cdr: bytes, wire: Wire, order: str, binary: bool, strict: bool) -> None:
         self._cdr = cdr
         self._wire = wire
         self._order = order
         self._binary = binary
+        self._strict = strict
         self._position = len(wire.header)
 
     def structure(self, description: TypeDescription, path: str) -> dict[str, Any]:
@@ -102,10 +106,11 @@ class _Reader:
     def _value(self, type_: FieldType, path: str) -> Any:
         if isinstance(type_, Primitive):
             return self._numbers(type_, 1, path)[0]
-        if isinstance(type_, String):
-            return self._string(path)
-        if isinstance(type_, WideString):
-            return self._wide_string(path)
+        if isinstance(type_, (String, WideString)):
+            text = self._string(path) if isinstance(type_, String) else self._wide_string(path)
+            if self._strict:
+                _check_bound(type_, text, path)
+            return text
         if isinstance(type_, Array):
             return self._items(type_.item, type_.length, path)
         if isinstance(type_, Sequence):
@@ -156,7 +161,11 @@ class _Reader:
         units = self._numbers(_UNIT, count, path)
         if any(unit > 0xFFFF for unit in units):
             raise ConversionError(path, "not UTF-16")
-        return struct.pack(f"<{count}H", *units).decode("utf-16-le", "replace")
+        text = struct.pack(f"<{count}H", *units)
+        try:
+            return text.decode("utf-16-le", "strict" if self._strict else "replace")
+        except UnicodeDecodeError:
+            raise ConversionError(path, "not UTF-16") from None
 
     def _align(self, size: int) -> None:
         # It counts from the end of the header.
@@ -242,15 +251,9 @@ class _Checker:
     def _text(self, type_: String | WideString, value: object, path: str) -> str:
         if not isinstance(value, str):
             raise ConversionError(path, f"expected a string, got {_say(value)}")
-        wide = isinstance(type_, WideString)
-        try:
-            size = len(value.encode("utf-16-le")) // 2 if wide else len(value.encode())
-        except UnicodeEncodeError:
-            raise ConversionError(path, "the string has half a surrogate pair in it") from None
-        if type_.bound is not None and size > type_.bound:
-            unit = "units of UTF-16" if wide else "bytes of UTF-8"
-            raise ConversionError(path, f"{size} {unit}, at most {type_.bound} are allowed")
-        if not wide and self._wire.terminator and "\0" in value:
+        _check_bound(type_, value, path)
+        is_ended = isinstance(type_, String) and self._wire.terminator
+        if is_ended and "\0" in value:
             # What follows would be lost on the way: strings end at NUL in C, and in rclpy.
             raise ConversionError(path, "a ROS string cannot hold the character U+0000")
         return value
@@ -309,6 +312,17 @@ def _number(primitive: Primitive, value: object, path: str) -> Any:
     except (OverflowError, struct.error):
         raise ConversionError(path, f"{_say(value)} does not fit in {primitive.name}") from None
     return number
+
+
+def _check_bound(type_: String | WideString, text: str, path: str) -> None:
+    wide = isinstance(type_, WideString)
+    try:
+        size = len(text.encode("utf-16-le")) // 2 if wide else len(text.encode())
+    except UnicodeEncodeError:
+        raise ConversionError(path, "the string has half a surrogate pair in it") from None
+    if type_.bound is not None and size > type_.bound:
+        unit = "units of UTF-16" if wide else "bytes of UTF-8"
+        raise ConversionError(path, f"{size} {unit}, at most {type_.bound} are allowed")
 
 
 def _base64(value: str, path: str) -> bytes:

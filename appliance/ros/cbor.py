@@ -68,8 +68,8 @@ def _encode_numbers(encoder: cbor2.CBOREncoder, value: Any) -> None:
     encoder.encode(cbor2.CBORTag(TAGS[value.primitive.name], value.data))
 
 
-def dumps(value: dict[str, Any]) -> bytes:
-    """The CBOR of what a reader of `generate_binary` gives."""
+def dumps(value: object) -> bytes:
+    """The CBOR of a value, in which there may be what a reader of `generate_binary` gives."""
     return cbor2.dumps(value, default=_encode_numbers)
 
 

@@ -81,7 +81,7 @@ class Commands(ToRos):
         #: Both replaced as one by the ROS thread.
         self._limits: FieldLimits | None = None
         self._stop: _Stop | None = None
-        #: Looks that have found a subscription.
+        #: Looks that have found a subscription, since there is this publisher.
         self._looks = 0
         #: Who may command alone, None while nobody does.
         self._holder: Session | None = None
@@ -95,8 +95,8 @@ class Commands(ToRos):
         self._backlog = Backlog()
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
-        #: A retained message from before there was anybody on ROS to have it.
-        self._waiting: Message | None = None
+        #: Whether the topic had a retained message before there was anybody on ROS to have it.
+        self._is_awaited = False
         self._timer: asyncio.TimerHandle | None = None
         self._is_left = True
         self._told: dict[str, float] = {}
@@ -122,6 +122,9 @@ class Commands(ToRos):
             except ConversionError as error:
                 raise ConversionError("on_silence.publish", str(error)) from None
         self._limits, self._stop = limits, stop
+        # Another publisher has not been found by anybody: as at the route's beginning, a stop
+        # message that it sends now may be lost, and is sent again.
+        self._looks = 0
         return super()._open(node, type_name, qos, type_hash)
 
     # The loop's thread
@@ -130,9 +133,15 @@ class Commands(ToRos):
         broker = self._around.broker
         self._is_left = False
         broker.departures.append(self._departed)
-        if self.rules.exclusive:
-            broker.guards.setdefault(self.mqtt, []).append(self)
-            broker.guards_changed()
+        # Also when anybody may command: the topic is then known as one that no answer goes to.
+        broker.guards.setdefault(self.mqtt, []).append(self)
+        broker.guards_changed()
+        if self.rules.on_silence is not None:
+            # Of the time before, of another run even, nothing is known. Who drove then and is away
+            # may come back with what it had queued.
+            for session in broker.sessions.values():
+                if session.identity is not None and session.link is None:
+                    self._backlog.expect(session.client_id)
 
     def leave(self) -> None:
         if self._is_left:
@@ -145,20 +154,20 @@ class Commands(ToRos):
             self._timer = None
         broker = self._around.broker
         broker.departures.remove(self._departed)
-        if self.rules.exclusive:
-            guards = broker.guards[self.mqtt]
-            guards.remove(self)
-            if not guards:
-                del broker.guards[self.mqtt]
-            broker.guards_changed()
+        guards = broker.guards[self.mqtt]
+        guards.remove(self)
+        if not guards:
+            del broker.guards[self.mqtt]
+        broker.guards_changed()
         self._holder = self._source = None
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         if self._is_left or not self._is_in_time(message, retain, origin):
             return
         out = self._out
-        if retain and (out is None or self._looks < LOOKS_TO_MATCH):
-            self._waiting = message
+        is_kept = retain or (message.retain and self.rules.take_retained)
+        if is_kept and (out is None or self._looks < LOOKS_TO_MATCH):
+            self._is_awaited = True
             return
         if out is None:
             self.fail(f"was refused: {self._why_not()}")
@@ -214,7 +223,7 @@ class Commands(ToRos):
         self._is_driven = self._stop is not None and cdr != self._stop.example
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
-        self._waiting = None
+        self._is_awaited = False
         if self.rules.exclusive and self._holder is None and origin is not None and origin.link:
             self._holder = origin
             self._around.broker.guards_changed()
@@ -257,6 +266,9 @@ class Commands(ToRos):
             self._source = None
             if self._is_driven:
                 self._publish_stop(f"{session} has left")
+            if self._stop is not None and not self._stop.is_like(self._last):
+                # Its library may have queued what it commanded since, and marks none of it as old.
+                self._backlog.expect(session.client_id)
 
     def _arm(self) -> None:
         due = math.inf
@@ -303,10 +315,13 @@ class Commands(ToRos):
         if self._is_left:
             return
         if not self._has_stopped:
-            self._publish_stop("the route begins")
-        message, self._waiting = self._waiting, None
-        if message is not None:
-            self.receive(message, True, None)
+            self._publish_stop("there is somebody to hear it")
+        if self._is_awaited:
+            self._is_awaited = False
+            # What is retained now: it may have been replaced, or taken back.
+            message = self._around.broker.retained.get(self.mqtt)
+            if message is not None:
+                self.receive(message, True, None)
 
     def _publish_stop(self, why: str) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""
@@ -328,7 +343,7 @@ class Commands(ToRos):
                 self._stop_later()
             return
         self._is_driven = self._must_stop = False
-        self._has_stopped = True
+        self._has_stopped = self._looks >= LOOKS_TO_MATCH
         self.counters.stops += 1
         self._mention("stopped", "%s: the stop message was published: %s", why)
 

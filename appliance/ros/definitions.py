@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 # Names end up in generated source (generate.py), so nothing but an identifier may pass.
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -117,12 +117,13 @@ class Field:
 class Wire:
     """How messages are serialized.
 
-    They begin with `header`. Numbers are aligned to their size, at most to `alignment` (MAXALIGN of
-    DDS-XTypes), counted from its end. `terminator` ends a string and is counted with it; `empty` is
-    all that there is of a structure without fields.
+    `encoding` is what that is called on MQTT. Messages begin with `header`. Numbers are aligned to
+    their size, at most to `alignment` (MAXALIGN of DDS-XTypes), counted from its end. `terminator`
+    ends a string and is counted with it; `empty` is all that there is of a structure without
+    fields.
     """
 
-    name: str
+    encoding: Literal["cdr", "ros1"]
     header: bytes
     alignment: int
     terminator: bytes
@@ -130,10 +131,10 @@ class Wire:
 
 
 #: ROS 2's: plain CDR, little endian, no options.
-CDR = Wire("CDR", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
+CDR = Wire("cdr", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
 
 #: ROS 1's: always little endian, and nothing but the values.
-PACKED = Wire("ROS 1", b"", 1, b"", b"")
+PACKED = Wire("ros1", b"", 1, b"", b"")
 
 
 @dataclass(frozen=True)
@@ -217,6 +218,8 @@ def describe(message_class: type, load: Callable[[str], type]) -> TypeDescriptio
     Raises UnknownTypeError for a field of a type that rclpy has no support for (wchar, long
     double), and whatever `load` raises.
     """
+    if isinstance(read := getattr(message_class, "DESCRIPTION", None), TypeDescription):
+        return read  # from its definition, see uncompiled.py
     package, kind = message_class.__module__.split(".")[:2]
     name = f"{package}/{kind}/{message_class.__name__}"
     names = message_class.get_fields_and_field_types()  # type: ignore[attr-defined]
@@ -284,12 +287,17 @@ def import_message(name: str) -> type:
     if match is None:
         raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
     package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
+    # Any node may make up a type's name: it does not get what else there is in Python imported.
+    if package in sys.stdlib_module_names:
+        raise UnknownTypeError(f"no {name}: {package} is not a package of messages")
     if package not in sys.modules:
         _look_in_workspaces(package)
     try:
         module = import_module(f"{package}.{kind}")
     except ImportError as error:
         raise UnknownTypeError(f"no {name}: the package {package} is not installed here") from error
+    except Exception as error:  # what a package does when it is imported may be any
+        raise UnknownTypeError(f"no {name}: the package {package} is broken: {error!r}") from error
     found = getattr(module, type_name, None)
     if found is None and "_" in type_name:
         # The packages do not export an action's Goal, Result and Feedback: beside their action.

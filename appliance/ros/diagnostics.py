@@ -69,7 +69,7 @@ class Diagnostics:
     # The ROS thread
 
     def look(self, node: RosNode, converters: Converters, tell: Tell) -> None:
-        """Get ready to publish, once."""
+        """Get ready to publish, once on each bus."""
         if self._has_looked:
             return
         self._has_looked = True
@@ -82,6 +82,7 @@ class Diagnostics:
     def lost(self) -> None:
         """The bus is gone."""
         self._out = None
+        self._has_looked = False
 
     # The loop's thread
 

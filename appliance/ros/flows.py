@@ -18,7 +18,13 @@ from typing import ClassVar, Literal, Protocol, TypeAlias
 
 from appliance.broker.message import Message, Watched
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Properties, Property, encode_string
+from appliance.mqtt.codec import (
+    Properties,
+    Property,
+    encode_property_list,
+    encode_string,
+    quote,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import CDR, UnknownTypeError, Wire
 from appliance.ros.figures import Counters, Meter
@@ -44,6 +50,7 @@ from appliance.ros.payloads import (
 )
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 from appliance.ros.rules import CommandRules
+from appliance.ros.skips import Skip, Why
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 
@@ -67,7 +74,7 @@ class RouteSettings:
     (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
     is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
     paths of those that go to MQTT, all of them when there are none; what comes from MQTT has at
-    most `largest` bytes when it is decompressed.
+    most `largest` bytes, and no more when it is decompressed.
     """
 
     ros: str | tuple[str, ...]
@@ -82,7 +89,7 @@ class RouteSettings:
     compression: Compression = "none"
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
-    largest: int = 16 * 1024 * 1024
+    largest: int = 1024 * 1024
     #: What holds for what goes to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 
@@ -117,6 +124,15 @@ class Route:
     def matches(self, ros: str, types: Iterable[str]) -> bool:
         """Whether a topic that carries these types is one of this route's."""
         return ros in self._names and any(map(self.fits, types))
+
+    def refusal(self, ros: str, types: Iterable[str]) -> tuple[Why, str] | None:
+        """Why a topic that the route's pattern speaks of is not one of its; None when it is, or
+        when no pattern speaks of it."""
+        if ros not in self._names:
+            return self._names.refusal(ros)
+        if any(map(self.fits, types)):
+            return None
+        return "other_type", f"the route takes {self.settings.type}"
 
     def fits(self, type_name: str) -> bool:
         """Whether it is what the route says of the type, if it says something."""
@@ -181,6 +197,8 @@ class Flow(ABC):
     """One ROS topic carried in one direction; its methods are for the ROS thread."""
 
     direction: ClassVar[Direction]
+    #: Why a topic that a route names may not be carried yet.
+    absence: ClassVar[str]
 
     def __init__(
         self,
@@ -276,6 +294,22 @@ class Flow(ABC):
         self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
         self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 
+    def skips(self) -> list[Skip]:
+        """What of the topic is not carried; from any thread."""
+        problem, count, wanted, bridged = self._problem, self._count, self._wanted, self.bridged
+        if bridged is not None:
+            reason = f"the topic carries {bridged.type} as well, which is bridged"
+            return [
+                Skip(self.ros, self.direction, name, "two_types", reason) for name in self._foreign
+            ]
+        if problem is not None:
+            type_name = wanted[0] if wanted else ""
+            return [Skip(self.ros, self.direction, type_name, "problem", problem)]
+        if self.is_matched or count is None:
+            return []
+        type_name = self.settings.type or ""
+        return [Skip(self.ros, self.direction, type_name, "absent", self.absence)]
+
     def _tell_foreign(self, types: set[str], chosen: str) -> None:
         if types != self._foreign:
             self._foreign = types
@@ -336,6 +370,7 @@ class ToMqtt(Flow):
     """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
 
     direction = "to_mqtt"
+    absence = "no node publishes it"
 
     def __init__(
         self,
@@ -344,11 +379,14 @@ class ToMqtt(Flow):
         converters: Converters,
         tell: Tell,
         mailbox: Mailbox,
+        publish: Callable[[Iterable[tuple[Lane, Message]]], None],
     ) -> None:
+        """`publish` is how messages leave that are on the loop's thread already."""
         super().__init__(route, ros, converters, tell)
         settings = route.settings
         self.echo: Echo | None = None
         self._mailbox = mailbox
+        self._publish = publish
         self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
         self._due = 0.0
@@ -358,6 +396,9 @@ class ToMqtt(Flow):
         self._subscription: RosSubscription | None = None
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._topic_wire = encode_string(self.mqtt)
+        #: The properties of the last message, most often those of the next, and their bytes.
+        self._properties: Properties = {}
+        self._properties_wire = b""
         self._qos = 0
         self._retain = False
 
@@ -385,7 +426,7 @@ class ToMqtt(Flow):
         self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
         self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
         self._subscription = node.subscribe_raw(
-            self.ros, type_name, qos, self.on_message, timed=True
+            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
         )
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
@@ -400,28 +441,60 @@ class ToMqtt(Flow):
         self._subscription = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
-        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch.
+        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
+        message = self._convert(cdr, published_at)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
+
+    def on_lot(self, lot: list[tuple[bytes, int]], lost: int) -> None:
+        """The same for messages that the loop's thread has taken itself. Nobody else has them then,
+        and but for those that may still be in the mailbox they go straight to the broker."""
+        self.counters.dropped += lost
+        lane = self._lane
+        batch = []
+        for cdr, published_at in lot:
+            message = self._convert(cdr, published_at)
+            if message is None:
+                continue
+            if lane.waiting:
+                self._mailbox.put(lane, message)
+            else:
+                batch.append((lane, message))
+        if batch:
+            self._publish(batch)
+
+    def _convert(self, cdr: bytes, published_at: int) -> Message | None:
+        """The message for MQTT; None for one that does not go there.
 
         Nothing may be logged by ROS here: it would feed /rosout.
         """
         if self.echo is not None and self.echo.is_own(cdr):
-            return
+            return None
         if (self._interval or self._bytes_per_second) and not self._admit(monotonic()):
-            return
+            return None
         try:
             payload, properties = self._pack(cdr)
         except ConversionError as error:
             self.fail(f"cannot be converted: {error}")
-            return
+            return None
         if self._bytes_per_second:
             self._budget -= len(payload)
+        if properties is not self._properties:
+            self._properties, self._properties_wire = properties, encode_property_list(properties)
         message = Watched(
-            self.mqtt, payload, self._qos, self._retain, properties, None, self._topic_wire
+            self.mqtt,
+            payload,
+            self._qos,
+            self._retain,
+            properties,
+            None,
+            self._topic_wire,
+            self._properties_wire,
         )
         message.watcher = self.counters
         if published_at:
             self._lane.timed = message, published_at
-        self._mailbox.put(self._lane, message)
+        return message
 
     def _admit(self, now: float) -> bool:
         """Whether a message at that time keeps to the rate, as an average over uneven ones, and to
@@ -443,6 +516,7 @@ class ToRos(Flow):
     """From MQTT to ROS: a publisher. `receive` and `fail` are for the loop's thread."""
 
     direction = "to_ros"
+    absence = "no node subscribes to it, which would tell its type; the route can name it"
 
     def __init__(
         self,
@@ -549,7 +623,8 @@ class ToRos(Flow):
         wanted = self._wanted
         claimed = claim(properties, "ros-type")
         if wanted is not None and claimed is not None and claimed != wanted[0]:
-            raise ConversionError("", f"it says to be {claimed}, {self.ros} carries {wanted[0]}")
+            problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
+            raise ConversionError("", problem)
         try:
             return convert(message.payload)
         except ConversionError as error:
@@ -557,7 +632,9 @@ class ToRos(Flow):
             encoding = self.settings.encoding
             if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
                 raise
-            problem = f"{error.problem} (it says to be {said}, and the route takes {encoding})"
+            problem = (
+                f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"
+            )
             raise ConversionError(error.path, problem) from None
 
     def _why_not(self) -> str:

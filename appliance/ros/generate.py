@@ -376,9 +376,9 @@ class _Decoder(_Generator):
         if isinstance(type_, TypeDescription):
             return self._structure(type_)
         if isinstance(type_, String):
-            return self._string(hint)
+            return self._string(type_, hint)
         if isinstance(type_, WideString):
-            return self._wide_string(hint)
+            return self._wide_string(type_, hint)
         if isinstance(type_, Array):
             return self._array(type_, hint)
         return self._sequence(type_, hint)
@@ -414,9 +414,11 @@ class _Decoder(_Generator):
         name, layout = self._end_run("unpack_from")
         self._line(f"{target}{name}{layout}(b, {'q' if layout else position})")
 
-    def _string(self, hint: str) -> str:
+    def _string(self, string: String, hint: str) -> str:
         size = self._number(_COUNT, f"{hint}_size")
         self._flush()
+        if string.bound is not None:
+            self._line(f"if {size} > {string.bound + 1}: raise ValueError")
         self._settle()
         name, end = self._name(hint), self._name("end")
         if self._wire.terminator:
@@ -432,9 +434,11 @@ class _Decoder(_Generator):
         self._phase = self._phase.lost()
         return name
 
-    def _wide_string(self, hint: str) -> str:
+    def _wide_string(self, string: WideString, hint: str) -> str:
         count = self._number(_COUNT, f"{hint}_count")
         self._flush()
+        if string.bound is not None:
+            self._line(f"if {count} > {string.bound}: raise ValueError")
         name = self._name(hint)
         self._line(f"{name} = read_wide_string(b, {self._position()}, {count})")
         self._terms.append(f"{count} * 4")

@@ -21,6 +21,7 @@ from appliance.ros.parameter_server import ServerParameters
 from appliance.ros.parameters import ParameterRoutes, ParameterSettings
 from appliance.ros.requests import Requests
 from appliance.ros.services import ServiceRoutes, ServiceSettings
+from appliance.ros.skips import Skip
 
 __all__ = [
     "ActionSettings",
@@ -142,12 +143,16 @@ class Calls:
             *self._parameters.bridged(),
         ]
 
+    def skips(self) -> list[Skip]:
+        """What routes speak of and is not bridged, and why."""
+        return [*self._services.skips(), *self._actions.skips(), *self._parameters.skips()]
+
     # The ROS thread
 
     def look(self) -> None:
         """Follow what has come and gone on the graph."""
         routes = self._routes
-        if routes.services or routes.actions or routes.parameters:
+        if routes.services or routes.actions or routes.parameters or self._requests.has_clients:
             self._requests.look()
         self._services.look()
         self._actions.look()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -70,7 +71,8 @@ class RosSubscription(Protocol):
     """A subscription of this node."""
 
     def destroy(self) -> None:
-        """End it: the callback is not called again. On the ROS thread."""
+        """End it: the callback is not called again, but for what the loop's thread has taken
+        already. On the ROS thread."""
 
 
 class RosPublisher(Protocol):
@@ -100,6 +102,11 @@ class RosClient(Protocol):
         """End it; what is under way is not answered any more."""
 
 
+#: Some messages as CDR, each with the time at which it was published, in nanoseconds since the
+#: epoch, or 0; and how many others were lost, as there was no room for more.
+TakeLot: TypeAlias = Callable[[list[tuple[bytes, int]], int], None]
+
+
 #: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
 Respond: TypeAlias = Callable[[bytes | None], None]
 
@@ -118,10 +125,10 @@ class ParameterServer(Protocol):
         """The full names of all parameters."""
 
     def get(self, names: Sequence[str]) -> dict[str, Any]:
-        """The values of those that are there, as JSON knows values."""
+        """The values of those that are there: as JSON knows values, and bytes."""
 
     def set(self, name: str, value: Any) -> None:
-        """Set one, which need not be there yet."""
+        """Set one, which need not be there yet. Integers have 32 bits."""
 
 
 class RosNode(Protocol):
@@ -141,12 +148,23 @@ class RosNode(Protocol):
     #: Where parameters are; None when every node keeps its own, and has services for them.
     parameter_server: ParameterServer | None
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    @property
+    def obstacle(self) -> str | None:
+        """What is in the way for now, while the bus is being joined or when it cannot be seen: one
+        line; from any thread."""
+
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
         """Join the bus in the background and return at once.
 
         `poll` is called when the node is there and then 5 to 10 times a second: the time to look
         at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
-        node ends by itself; nothing is called after it.
+        node ends by itself; nothing is called after it, until the node is started again. `loop` is
+        the one whose thread may take messages itself.
         """
 
     def stop(self) -> None:
@@ -158,6 +176,9 @@ class RosNode(Protocol):
     def now(self) -> int:
         """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
         the node is told so, and the computer's before there is any."""
+
+    def nodes(self) -> list[str]:
+        """The full names of all nodes on the bus, as far as they are known, this one included."""
 
     def topics(self) -> dict[str, list[str]]:
         """The types of each topic that has an endpoint, this node's own included."""
@@ -191,9 +212,14 @@ class RosNode(Protocol):
         callback: Callable[..., None],
         *,
         timed: bool = False,
+        on_loop: TakeLot | None = None,
     ) -> RosSubscription:
         """Call `callback` with each message, as CDR; when it is `timed`, with a few also with the
         time at which they were published, in nanoseconds since the epoch.
+
+        Where the bus can wake the event loop by itself, `on_loop` is called instead, on the loop's
+        thread, while messages are small: it saves waking the ROS thread for each of them. The two
+        are never called at once, and all messages come in their order.
 
         Raises BusError, UnknownTypeError.
         """
@@ -249,6 +275,14 @@ class FakeSubscription:
     topic: str
     endpoint: Endpoint
     callback: Callable[..., None]
+    on_loop: TakeLot | None = None
+
+    def take(self, cdr: bytes) -> None:
+        """A message has come for it."""
+        if self.bus.takes_on_loop and self.on_loop is not None:
+            self.on_loop([(cdr, 0)], 0)
+        else:
+            self.callback(cdr)
 
     def destroy(self) -> None:
         self.bus.subscriptions.remove(self)
@@ -330,16 +364,19 @@ class FakeNode:
 
     Other nodes' endpoints are added and removed by hand, and each time the bridge gets its look at
     the graph at once. Messages reach subscriptions whose QoS and type match, own ones included, as
-    on a real bus. `types` are the types that can be loaded; None: any, as an empty class.
+    on a real bus. `types` are the types that can be loaded; None: any, as an empty class. With
+    `takes_on_loop` set, the caller's thread is the loop's for those who offered to be called there.
     """
 
     wire = CDR
     parameter_server: ParameterServer | None = None
+    obstacle: str | None = None
 
     def __init__(self, name: str = "/appliance", types: Mapping[str, type[Any]] | None = None):
         self.name = name
         self.types = types
         self.running = False
+        self.takes_on_loop = False
         self.remote_publishers: list[FakePeer] = []
         self.remote_subscribers: list[FakePeer] = []
         self.subscriptions: list[FakeSubscription] = []
@@ -398,7 +435,7 @@ class FakeNode:
 
     def fail(self, reason: str) -> None:
         """The node ends by itself."""
-        self.running = False
+        self.stop()
         if self._failed:
             self._failed(reason)
 
@@ -417,11 +454,16 @@ class FakeNode:
                 peer.received.append(cdr)
         for subscription in list(self.subscriptions):
             if matches(subscription.topic, subscription.endpoint):
-                subscription.callback(cdr)
+                subscription.take(cdr)
 
     # RosNode
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
         self._poll = poll
         self._failed = failed
         self.running = True
@@ -448,6 +490,10 @@ class FakeNode:
 
     def now(self) -> int:
         return time.time_ns()
+
+    def nodes(self) -> list[str]:
+        ends = [*self.remote_publishers, *self.remote_subscribers]
+        return [self.name, *sorted({end.endpoint.node for end in ends})]
 
     def topics(self) -> dict[str, list[str]]:
         found: dict[str, set[str]] = {}
@@ -497,9 +543,10 @@ class FakeNode:
         callback: Callable[..., None],
         *,
         timed: bool = False,
+        on_loop: TakeLot | None = None,
     ) -> FakeSubscription:
         self.load(type_name)
-        own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback)
+        own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback, on_loop)
         self.subscriptions.append(own)
         if qos.durability is Durability.TRANSIENT_LOCAL:
             for peer in self.remote_publishers:
@@ -509,7 +556,7 @@ class FakeNode:
                     and peer.endpoint.qos.satisfies(qos)
                 ):
                     for cdr in peer.latched:
-                        callback(cdr)
+                        own.take(cdr)
         return own
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> FakePublisher:

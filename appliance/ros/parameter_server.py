@@ -12,25 +12,40 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic
 from typing import Any
 
-import orjson
+import pybase64
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import Answer, Call, CallCounters, CallError, Offer, Switchboard
 from appliance.ros.node import BusError, ParameterServer, RosNode
-from appliance.ros.parameters import ParameterSettings, from_json, shorten
-from appliance.ros.patterns import Names
+from appliance.ros.parameters import (
+    LONGEST_NAME,
+    ParameterSettings,
+    shorten,
+    to_bytes,
+    value_of,
+    values_of,
+)
+from appliance.ros.patterns import Names, is_plain
+from appliance.ros.payloads import CONTENT_TYPE, dumps
+from appliance.ros.skips import Skip
 
 log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the parameters.
 INTERVAL = 1.0
+
+#: Lists in lists that a parameter may have.
+DEEPEST = 16
+
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
 @dataclass(eq=False, slots=True)
@@ -40,8 +55,13 @@ class _Namespace:
     name: str
     base: str
     route: ParameterSettings
-    wanted: Names
+    wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
+    offers: list[Offer] = field(default_factory=list)
+
+    def wants(self, parameter: str) -> bool:
+        """Whether it is shown, and may be set."""
+        return any(parameter in names for names in self.wanted)
 
 
 class ServerParameters:
@@ -67,6 +87,9 @@ class ServerParameters:
         #: All parameters of the last look, by namespace, and the values of those that are wanted.
         self._names: dict[str, list[str]] = {}
         self._values: dict[str, Any] = {}
+        #: Whether nothing is known of the parameters, so that none is absent either; and why not.
+        self._is_blind = True
+        self._problem: str | None = None
         # The ROS thread's.
         self._looked_at = 0.0
 
@@ -80,11 +103,7 @@ class ServerParameters:
         if list(routes) == list(self._routes):
             return
         self._routes = routes
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.node.startswith("!")
-        }
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         for namespace in list(self._namespaces.values()):
             self._leave(namespace)
         self._looked_at = 0.0
@@ -94,28 +113,24 @@ class ServerParameters:
 
     def _find(self, name: str) -> _Namespace | None:
         """The namespace `/arm`, as the routes want it; None when they do not."""
-        mine = [route for route in self._counters if name in Names([route.node])]
-        if not mine:
+        wanted = {route: names for route in self._counters if (names := route.of(name))}
+        if not wanted:
             return None
-        excluded = [
-            f"!{route.name}"
-            for route in self._routes
-            if route.node.startswith("!") and name in Names([route.node[1:]])
-        ]
-        wanted = Names([*(route.name for route in mine), *excluded])
-        return _Namespace(name, mine[0].mqtt.replace("{node}", name), mine[0], wanted)
+        route = next(iter(wanted))
+        base = route.mqtt.replace("{node}", name)
+        return _Namespace(name, base, route, list(wanted.values()))
 
     def _take(self, names: dict[str, list[str]], values: dict[str, Any]) -> None:
         """What there is now."""
+        absent = self._absent()
+        has_changed = self._is_blind or self._problem is not None
         self._names, self._values = names, values
-        found: dict[str, dict[str, bytes]] = {}
+        self._is_blind, self._problem = False, None
+        has_changed |= self._absent() != absent
+        found: dict[str, dict[str, Any]] = {}
         for full_name, value in values.items():
             space, _, name = full_name.rpartition("/")
-            try:
-                found.setdefault(space, {})[name] = orjson.dumps(value)
-            except TypeError:  # an integer too large for JSON
-                log.debug("%s cannot be shown", full_name)
-        has_changed = False
+            found.setdefault(space, {})[name] = value
         for shown in list(self._namespaces.values()):
             if shown.name not in found:
                 self._leave(shown)
@@ -128,77 +143,102 @@ class ServerParameters:
                 self._join(namespace)
                 has_changed = True
             for parameter in namespace.shown.keys() - own.keys():
-                self._show(namespace, parameter, b"")
-            for parameter, payload in own.items():
-                if parameter in namespace.wanted:
-                    self._show(namespace, parameter, payload)
+                self._show(namespace, parameter, None)
+            for parameter, value in own.items():
+                if namespace.wants(parameter):
+                    self._show(namespace, parameter, value)
         if has_changed:
+            self._changed()
+
+    def _fail(self, problem: str) -> None:
+        """They could not be read; what was read last stays."""
+        if problem != self._problem:
+            log.warning("the parameters cannot be read: %s", problem)
+            self._is_blind, self._problem = False, problem
             self._changed()
 
     def _join(self, namespace: _Namespace) -> None:
         self._namespaces[namespace.name] = namespace
 
         async def set_one(call: Call) -> Answer:
-            return await self._set(namespace, {call.topic.split("/")[-2]: from_json(call.payload)})
+            values = {call.topic.split("/")[-2]: value_of(call)}
+            return await self._set(namespace, values, call)
 
         async def set_all(call: Call) -> Answer:
-            values = from_json(call.payload)
-            if not isinstance(values, dict) or not values:
-                raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-            return await self._set(namespace, values)
+            return await self._set(namespace, values_of(call), call)
 
-        counters = self._counters[namespace.route]
+        route = namespace.route
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
-            what = f"the parameters of {namespace.name or '/'}"
-            topic = f"{namespace.base}/{topic}"
-            self._board.offer(Offer(topic, what, namespace.route.timeout, counters, handle))
+            offer = Offer(
+                f"{namespace.base}/{topic}",
+                f"the parameters of {namespace.name or '/'}",
+                route.timeout,
+                self._counters[route],
+                handle,
+                route.encoding,
+            )
+            namespace.offers.append(offer)
+            self._board.offer(offer)
         log.info("the parameters of %s are at %s", namespace.name or "/", namespace.base)
 
     def _leave(self, namespace: _Namespace) -> None:
         del self._namespaces[namespace.name]
-        for topic in ("+/set", "_set"):
-            self._board.withdraw(f"{namespace.base}/{topic}")
+        for offer in namespace.offers:
+            self._board.withdraw(offer)
         for parameter in list(namespace.shown):
-            self._show(namespace, parameter, b"")
+            self._show(namespace, parameter, None)
 
-    def _show(self, namespace: _Namespace, name: str, payload: bytes) -> None:
-        if payload == namespace.shown.get(name, b"") or set("+#\0") & set(name):
+    def _show(self, namespace: _Namespace, name: str, value: Any) -> None:
+        """Publish a parameter as it is now; None for one that is no more."""
+        encoding = namespace.route.encoding
+        try:
+            payload = (
+                b""
+                if value is None
+                else dumps(value if encoding == "cbor" else _to_plain(value), encoding)
+            )
+        except TypeError:  # an integer too large for JSON
+            log.debug("%s/%s cannot be shown", namespace.name, name)
+            return
+        is_topic = not set("+#\0") & set(name) and len(name) <= LONGEST_NAME
+        if payload == namespace.shown.get(name, b"") or not is_topic:
             return
         if payload:
             namespace.shown[name] = payload
         else:
             del namespace.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: JSON}
+        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
         self._board.publish(Message(f"{namespace.base}/{name}", payload, 1, True, properties))
 
-    async def _set(self, namespace: _Namespace, values: dict[str, Any]) -> Answer:
+    async def _set(self, namespace: _Namespace, values: dict[str, Any], call: Call) -> Answer:
         full_names = {f"{namespace.name}/{name}": value for name, value in values.items()}
-        for full_name, value in full_names.items():
-            if full_name.rpartition("/")[
-                2
-            ] not in namespace.wanted or "/" in full_name.removeprefix(f"{namespace.name}/"):
-                text = f"the parameter {full_name!r} is not among bridge.parameters"
+        for name in values:
+            if "/" in name or not namespace.wants(name):
+                text = f"the parameter {namespace.name}/{name} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
-            if value is None or isinstance(value, dict):
+        for full_name, value in full_names.items():
+            if isinstance(value, dict) or not _is_value(value):
                 text = f"{full_name}: no parameter can have the value {shorten(value)}"
+                if isinstance(value, int):
+                    text += ": integers have 32 bits in ROS 1"
                 raise CallError("bad_request", text)
             if full_name in self._names:
                 text = f"{full_name} holds other parameters: set these"
                 raise CallError("rejected", text)
-            if isinstance(self._values.get(full_name), float) and type(value) is int:
-                full_names[full_name] = float(value)
+            full_names[full_name] = _like(self._values.get(full_name), full_name, value)
         done: asyncio.Future[None] = self._loop.create_future()
         try:
             self._node.call_soon(partial(self._set_all, full_names, done))
         except BusError as error:
             raise CallError("ros_error", str(error)) from None
         await done
-        return Answer(orjson.dumps({"successful": True, "reason": ""}))
+        said = {"successful": True, "reason": ""}
+        return Answer(dumps(said, call.encoding), call.encoding)
 
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the namespaces that it shows now."""
         return [
-            (route, counters, [name for name in self._namespaces if name in Names([route.node])])
+            (route, counters, [name for name in self._namespaces if route.of(name)])
             for route, counters in self._counters.items()
         ]
 
@@ -210,13 +250,31 @@ class ServerParameters:
                 "mqtt": namespace.base,
                 "type": "",
                 "direction": "parameters",
-                "encoding": "json",
+                "encoding": namespace.route.encoding,
             }
             for namespace in self._namespaces.values()
         ]
 
+    def skips(self) -> list[Skip]:
+        """The parameters that routes name and are not there."""
+        if self._is_blind:
+            return []
+        if self._problem is not None:
+            return [Skip("/", "parameters", "", "problem", self._problem)]
+        reason = "the Master has no such parameter"
+        return [Skip(name, "parameters", "", "absent", reason) for name in sorted(self._absent())]
+
+    def _absent(self) -> set[str]:
+        named = {name for route in self._counters for name in route.names if is_plain(name)}
+        return named - self._values.keys()
+
     async def stop(self) -> None:
         """The bus has been left: no value is true any more."""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._names, self._values = {}, {}
+        self._is_blind = True
         for namespace in list(self._namespaces.values()):
             self._leave(namespace)
 
@@ -232,7 +290,7 @@ class ServerParameters:
         try:
             self._read(server)
         except BusError as error:
-            self._post(log.debug, "the parameters cannot be read: %s", error)
+            self._post(self._fail, str(error))
 
     def _read(self, server: ParameterServer) -> None:
         names: dict[str, list[str]] = {}
@@ -249,7 +307,7 @@ class ServerParameters:
             for space, found in names.items()
             if (namespace := spaces[space]) is not None
             for name in found
-            if name in namespace.wanted
+            if namespace.wants(name)
         ]
         self._post(self._take, names, server.get(wanted))
 
@@ -267,8 +325,41 @@ class ServerParameters:
         self._post(_settle, done, problem)
 
     def lost(self) -> None:
-        """The bus is gone; `stop` takes back what is shown."""
-        self._post(self._take, {}, {})
+        """The bus is gone, and nothing is known of its parameters."""
+        self._looked_at = 0.0
+        self._post(self._forget)
+
+
+def _is_value(value: Any, depth: int = 0) -> bool:
+    """Whether a parameter can have it: XML-RPC has no word for nothing, nor XML for all
+    characters."""
+    if isinstance(value, str):
+        return _NOT_XML.search(value) is None
+    if isinstance(value, list):
+        return depth < DEEPEST and all(_is_value(item, depth + 1) for item in value)
+    if isinstance(value, dict):
+        return _is_value([*value.keys(), *value.values()], depth)
+    if isinstance(value, int):
+        return -(2**31) <= value < 2**31
+    return isinstance(value, (float, bytes))
+
+
+def _like(before: Any, name: str, value: Any) -> Any:
+    """A value as its payload cannot say it: a double without a fraction, bytes in base64."""
+    if isinstance(before, float) and type(value) is int:
+        return float(value)
+    if isinstance(before, bytes) and not isinstance(value, bytes):
+        return to_bytes(name, value)
+    return value
+
+
+def _to_plain(value: Any) -> Any:
+    """A value as JSON knows it: bytes are base64."""
+    if isinstance(value, list):
+        return [_to_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _to_plain(item) for key, item in value.items()}
+    return pybase64.b64encode_as_string(value) if isinstance(value, bytes) else value
 
 
 def _settle(done: asyncio.Future[None], problem: CallError | None) -> None:

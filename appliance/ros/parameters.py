@@ -1,9 +1,10 @@
 """Parameters of other nodes: their values as retained topics, and calls that set them.
 
 `r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
-`/parameter_events`; byte arrays are base64. `…/_param/speed/set` sets it, `…/_param/_set` several
-of the node at once or none of them: `{"speed": 0.5, "mode": "slow"}`. The type is the one that the
-node has declared, so that `1` will do for a double. When the node goes, so do its values.
+`/parameter_events`; byte arrays are base64, or bytes where the encoding is `cbor`.
+`…/_param/speed/set` sets it, `…/_param/_set` several of the node at once or none of them:
+`{"speed": 0.5, "mode": "slow"}`. The type is the one that the node has declared, so that `1` will
+do for a double. When the node goes, so do its values.
 """
 
 from __future__ import annotations
@@ -13,19 +14,29 @@ import logging
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import orjson
 import pybase64
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import JSON, Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import (
+    WITHOUT_RAW,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    Offer,
+    Switchboard,
+)
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names
+from appliance.ros.patterns import Names, compile_pattern, is_plain
+from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, loads
 from appliance.ros.requests import Requests
+from appliance.ros.skips import Skip
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +52,9 @@ RETRY = 2.0
 
 #: The longest that a node may take to tell them, in seconds.
 PATIENCE = 5.0
+
+#: Longer names, in characters, are not shown: they would be no topics.
+LONGEST_NAME = 1024
 
 #: Parameters that are asked for at a time.
 CHUNK = 200
@@ -64,16 +78,26 @@ _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 @dataclass(frozen=True, slots=True)
 class ParameterSettings:
-    """Parameters by patterns: of the nodes `node`, those called `name`.
+    """Parameters, by names and patterns such as `/node/parameter`; what begins with `!` is left
+    out.
 
     `mqtt` is the topic above a node's values; a `{node}` in it stands for the node's full name.
-    `timeout` is for setting, in seconds. With `!` before `node` they are left out.
+    `timeout` is for setting, in seconds.
     """
 
-    node: str
-    name: str
+    names: tuple[str, ...]
     mqtt: str
     timeout: float = 5.0
+    encoding: Literal["json", "cbor"] = "json"
+
+    def of(self, node: str) -> Names | None:
+        """Those that are wanted of a node; None for none at all."""
+        mine: list[str] = []
+        for text in self.names:
+            pattern, _, name = text.removeprefix("!").rpartition("/")
+            if compile_pattern(pattern).fullmatch(node):
+                mine.append(f"!{name}" if text.startswith("!") else name)
+        return Names(mine) if any(not name.startswith("!") for name in mine) else None
 
 
 @dataclass(eq=False, slots=True)
@@ -83,11 +107,18 @@ class _Node:
     name: str
     base: str
     route: ParameterSettings
-    wanted: Names
+    wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
+    offers: list[Offer] = field(default_factory=list)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
+    #: Why its parameters cannot be read.
+    problem: str | None = None
+
+    def wants(self, parameter: str) -> bool:
+        """Whether it is shown, and may be set."""
+        return any(parameter in names for names in self.wanted)
 
 
 class ParameterRoutes:
@@ -130,11 +161,7 @@ class ParameterRoutes:
         if list(routes) == list(self._routes):
             return
         self._routes = routes
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.node.startswith("!")
-        }
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         for node in list(self._nodes.values()):  # which patterns a value is of has to be asked anew
             self._leave(node)
         self.follow()
@@ -153,40 +180,41 @@ class ParameterRoutes:
             self._join(name)
 
     def _join(self, name: str) -> None:
-        mine = [route for route in self._counters if name in Names([route.node])]
-        if not mine or name == self._node.name:
+        wanted = {route: names for route in self._counters if (names := route.of(name))}
+        if not wanted or name == self._node.name:
             return
-        excluded = [
-            f"!{route.name}"
-            for route in self._routes
-            if route.node.startswith("!") and name in Names([route.node[1:]])
-        ]
-        wanted = Names([*(route.name for route in mine), *excluded])
-        route = mine[0]
-        node = _Node(name, route.mqtt.replace("{node}", name), route, wanted)
+        route = next(iter(wanted))
+        node = _Node(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
         self._nodes[name] = node
 
         async def set_one(call: Call) -> Answer:
             parameter = call.topic.split("/")[-2]
-            return await self._set(node, {parameter: from_json(call.payload)}, at_once=False)
+            return await self._set(node, {parameter: value_of(call)}, call, at_once=False)
 
         async def set_all(call: Call) -> Answer:
-            values = from_json(call.payload)
-            if not isinstance(values, dict) or not values:
-                raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-            return await self._set(node, values, at_once=True)
+            return await self._set(node, values_of(call), call, at_once=True)
 
         counters = self._counters[route]
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
             what = f"{name}'s parameters"
-            self._board.offer(Offer(f"{node.base}/{topic}", what, route.timeout, counters, handle))
+            offer = Offer(
+                f"{node.base}/{topic}",
+                what,
+                route.timeout,
+                counters,
+                handle,
+                route.encoding,
+                WITHOUT_RAW,
+            )
+            node.offers.append(offer)
+            self._board.offer(offer)
         self._load(node)
 
     def _leave(self, node: _Node) -> None:
         del self._nodes[node.name]
         node.is_gone = True
-        for topic in ("+/set", "_set"):
-            self._board.withdraw(f"{node.base}/{topic}")
+        for offer in node.offers:
+            self._board.withdraw(offer)
         for parameter in node.shown:
             self._board.publish(Message(f"{node.base}/{parameter}", b"", 0, True))
         node.shown.clear()
@@ -194,7 +222,7 @@ class ParameterRoutes:
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the nodes that it shows now."""
         return [
-            (route, counters, [name for name in self._nodes if name in Names([route.node])])
+            (route, counters, [name for name in self._nodes if route.of(name)])
             for route, counters in self._counters.items()
         ]
 
@@ -206,9 +234,25 @@ class ParameterRoutes:
                 "mqtt": node.base,
                 "type": "rcl_interfaces/msg/ParameterValue",
                 "direction": "parameters",
-                "encoding": "json",
+                "encoding": node.route.encoding,
             }
             for node in self._nodes.values()
+        ]
+
+    def skips(self) -> list[Skip]:
+        """The nodes that routes name and are not there, or do not tell their parameters."""
+        if self._is_stopped:
+            return []
+        skips = [
+            Skip(node.name, "parameters", "", "problem", node.problem)
+            for node in self._nodes.values()
+            if node.problem is not None
+        ]
+        named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
+        return skips + [
+            Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
+            for node in sorted(named - self._nodes.keys())
+            if is_plain(node)
         ]
 
     async def stop(self) -> None:
@@ -250,12 +294,16 @@ class ParameterRoutes:
             try:
                 values = await asyncio.wait_for(self._get_all(node), PATIENCE)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
+                    return
+                why = str(error) or "no answer"
+                node.problem = f"its parameters cannot be read: {why}"
                 if not has_failed:
-                    why = error if str(error) else "no answer"
                     log.warning("the parameters of %s cannot be read: %s", node.name, why)
                 has_failed = node.is_stale = True
                 await asyncio.sleep(RETRY)
                 continue
+            node.problem = None
             if not node.is_stale and not node.is_gone:
                 for name in node.shown.keys() - values.keys():
                     self._show(node, name, None)
@@ -266,7 +314,7 @@ class ParameterRoutes:
 
     async def _get_all(self, node: _Node) -> dict[str, Any]:
         listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
-        names = [name for name in listed["result"]["names"] if name in node.wanted]
+        names = [name for name in listed["result"]["names"] if node.wants(name)]
         values: dict[str, Any] = {}
         for start in range(0, len(names), CHUNK):
             chunk = names[start : start + CHUNK]
@@ -286,16 +334,17 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or name not in node.wanted:
+        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or not node.wants(name):
             return
-        payload = b"" if value is None else _to_json(value)
+        encoding = node.route.encoding
+        payload = b"" if value is None else _to_payload(value, encoding)
         if payload == node.shown.get(name, b""):
             return
         if payload:
             node.shown[name] = payload
         else:
             del node.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: JSON}
+        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
         self._board.publish(Message(f"{node.base}/{name}", payload, 1, True, properties))
 
     def _take_events(self) -> None:
@@ -325,9 +374,11 @@ class ParameterRoutes:
 
     # Setting
 
-    async def _set(self, node: _Node, values: dict[str, Any], *, at_once: bool) -> Answer:
+    async def _set(
+        self, node: _Node, values: dict[str, Any], call: Call, *, at_once: bool
+    ) -> Answer:
         for name in values:
-            if name not in node.wanted:
+            if not node.wants(name):
                 text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
         names = list(values)
@@ -348,7 +399,8 @@ class ParameterRoutes:
         if not result.get("successful"):
             reason = result.get("reason") or "it gives no reason"
             raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
-        return Answer(orjson.dumps({"successful": True, "reason": result["reason"]}))
+        said = {"successful": True, "reason": result["reason"]}
+        return Answer(dumps(said, call.encoding), call.encoding)
 
     # The ROS thread
 
@@ -376,19 +428,36 @@ class ParameterRoutes:
     def lost(self) -> None:
         """The bus is gone, and with it the subscription."""
         self._subscription = None
+        self._is_refused = False
 
 
-def from_json(payload: bytes) -> Any:
+def value_of(call: Call) -> Any:
+    """The value in a call. Raises CallError."""
     try:
-        return orjson.loads(payload)
-    except orjson.JSONDecodeError as error:
-        raise CallError("bad_request", f"not JSON: {error}") from None
+        return loads(call.payload, call.encoding)
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
 
 
-def _to_json(value: Mapping[str, Any]) -> bytes:
-    """The JSON of a ParameterValue; empty when the parameter is not set."""
+def values_of(call: Call) -> dict[str, Any]:
+    """The values in a call, by the names of parameters. Raises CallError."""
+    values = value_of(call)
+    is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
+    if not is_mapping or not values:
+        raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
+    named: dict[str, Any] = values
+    return named
+
+
+def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
+    """The payload of a ParameterValue; empty when the parameter is not set."""
     kind = value["type"]
-    return orjson.dumps(value[_FIELDS[kind][0]]) if 0 < kind < len(_FIELDS) else b""
+    if not 0 < kind < len(_FIELDS):
+        return b""
+    plain = value[_FIELDS[kind][0]]
+    if encoding == "cbor" and kind == _BYTES:
+        plain = pybase64.b64decode(plain)
+    return dumps(plain, encoding)
 
 
 def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
@@ -404,7 +473,7 @@ def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, 
         kind = _type_of(name, value)
     field_name, expected = _FIELDS[kind]
     if kind == _BYTES:
-        value = _to_bytes(name, value)
+        value = to_bytes(name, value)
     elif kind in (_BOOLS, _INTEGERS, _DOUBLES, _STRINGS):
         if not isinstance(value, list) or not all(_is(kind - 5, item) for item in value):
             raise _unlike(name, expected, value)
@@ -427,11 +496,12 @@ def _is(kind: int, value: Any) -> bool:
     return isinstance(value, (int, float))
 
 
-def _to_bytes(name: str, value: Any) -> bytes:
+def to_bytes(name: str, value: Any) -> bytes:
+    """The bytes that a value of JSON or CBOR stands for. Raises CallError."""
     try:
         if isinstance(value, str):
             return pybase64.b64decode(value, validate=True)
-        if isinstance(value, list):
+        if isinstance(value, (bytes, list)):
             return bytes(value)
     except (TypeError, ValueError):
         pass
@@ -452,5 +522,9 @@ def _unlike(name: str, expected: str, value: Any) -> CallError:
 
 
 def shorten(value: Any) -> str:
-    text = orjson.dumps(value).decode()
+    """A value as an error shows it."""
+    try:
+        text = orjson.dumps(value).decode()
+    except TypeError:  # what only CBOR has
+        text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}…"

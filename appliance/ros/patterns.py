@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from typing import Protocol, TypeVar
+
+from appliance.ros.skips import Skip, Why
 
 
-def compile_pattern(text: str) -> re.Pattern[str]:
+def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:
     """What matches the names that a pattern stands for: `*` is part of a name, `**` of a path.
 
-    Hidden names, with a token that begins with `_`, have to be spelt out in the pattern.
+    Hidden names, with a token that begins with `_`, have to be spelt out in the pattern, unless
+    they are wanted as well.
     """
     parts = re.split(r"(\*\*|\*)", text)
     wild = {"**": ".*", "*": "[^/]*"}
-    visible = "" if "/_" in text else r"(?!.*/_)"
+    visible = "" if hidden or "/_" in text else r"(?!.*/_)"
     return re.compile(visible + "".join(wild.get(part, re.escape(part)) for part in parts))
+
+
+def is_plain(name: str) -> bool:
+    """Whether it is the name of one thing, and no pattern and nothing that is left out."""
+    return "*" not in name and not name.startswith("!")
 
 
 class Names:
@@ -22,10 +31,67 @@ class Names:
 
     def __init__(self, patterns: Iterable[str]) -> None:
         every = list(patterns)
-        self._wanted = [compile_pattern(text) for text in every if not text.startswith("!")]
-        self._excluded = [compile_pattern(text[1:]) for text in every if text.startswith("!")]
+        wanted = [text for text in every if not text.startswith("!")]
+        self._wanted = [compile_pattern(text) for text in wanted]
+        self._spoken_of = [compile_pattern(text, hidden=True) for text in wanted]
+        self._excluded = [(text, compile_pattern(text[1:])) for text in every if text[0] == "!"]
 
     def __contains__(self, name: str) -> bool:
         return any(pattern.fullmatch(name) for pattern in self._wanted) and not any(
-            pattern.fullmatch(name) for pattern in self._excluded
+            pattern.fullmatch(name) for _, pattern in self._excluded
         )
+
+    def refusal(self, name: str) -> tuple[Why, str] | None:
+        """Why a name that a pattern speaks of is not among them; None when it is, or none does."""
+        if name in self or not any(pattern.fullmatch(name) for pattern in self._spoken_of):
+            return None
+        for text, pattern in self._excluded:
+            if pattern.fullmatch(name):
+                return "left_out", f"left out by {text}"
+        return "hidden", "a part of its name begins with _, which the pattern does not spell out"
+
+
+class Listed(Protocol):
+    """A route for names and patterns."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names, patterns, and what is left out."""
+
+
+ListedT = TypeVar("ListedT", bound=Listed)
+
+
+def assign(
+    routes: Sequence[ListedT],
+    found: Mapping[str, Sequence[str]],
+    fits: Callable[[ListedT, str], bool],
+) -> dict[str, ListedT]:
+    """The route of each name: one that spells it out, whether it was found or not; else, of those
+    that were found, the first that has a pattern for it and that it `fits`."""
+    assigned = {name: route for route in reversed(routes) for name in route.names if is_plain(name)}
+    for route in routes:
+        names = Names(route.names)
+        for name in found:
+            if name not in assigned and name in names and fits(route, name):
+                assigned[name] = route
+    return assigned
+
+
+def refusals(
+    routes: Iterable[ListedT],
+    found: Mapping[str, Sequence[str]],
+    assigned: Container[str],
+    direction: str,
+    misfit: Callable[[ListedT, str], tuple[Why, str] | None],
+) -> list[Skip]:
+    """Of the names that were found, those that a route speaks of and none was assigned to."""
+    skips: dict[str, Skip] = {}
+    for route in routes:
+        names = Names(route.names)
+        for name, types in found.items():
+            if name not in assigned and name not in skips:
+                why = misfit(route, name) if name in names else names.refusal(name)
+                if why is not None:
+                    skips[name] = Skip(name, direction, min(types), *why)
+    return list(skips.values())

@@ -5,14 +5,18 @@ about it in properties.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
+
+import orjson
 
 from appliance.mqtt.codec import Properties, Property
+from appliance.ros import cbor
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import NO_BINARY, Converter, image_format
-from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.definitions import CDR, PACKED, UnknownTypeError, Wire
 
 Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
+CallEncoding: TypeAlias = Literal["json", "cbor", "cdr", "ros1"]
 Compression: TypeAlias = Literal["none", "zstd"]
 
 CONTENT_TYPE = {
@@ -25,7 +29,14 @@ CONTENT_TYPE = {
 }
 
 #: ROS's own serialized bytes, of ROS 2 and of ROS 1.
-RAW = frozenset({"cdr", "ros1"})
+RAW: dict[str, Wire] = {wire.encoding: wire for wire in (CDR, PACKED)}
+
+_OF_CONTENT_TYPE: dict[str, CallEncoding] = {
+    "application/json": "json",
+    "application/cbor": "cbor",
+    "application/cdr": "cdr",
+    "application/x-ros1": "ros1",
+}
 
 #: What a user property is called that names the compression, MQTT having no property for it.
 CONTENT_ENCODING = "content-encoding"
@@ -111,11 +122,11 @@ def unpacker(
 ) -> Callable[[bytes], bytes]:
     """The function that makes a serialized message of a payload, or raises ConversionError.
 
-    With a compression, payloads may be compressed or not; decompressed they have no more than
-    `largest` bytes.
+    They have at most `largest` bytes. With a compression, they may be compressed or not, and have
+    no more when they are decompressed.
     """
 
-    unpack = {
+    convert = {
         "json": converter.from_json,
         "cbor": converter.from_cbor,
         "text": converter.from_text,
@@ -123,6 +134,12 @@ def unpacker(
         "cdr": converter.checked,
         "ros1": converter.checked,
     }[encoding]
+
+    def unpack(payload: bytes) -> bytes:
+        if len(payload) > largest:
+            raise ConversionError("", too_large(len(payload), largest))
+        return convert(payload)
+
     if compression == "none":
         return unpack
     decompress = _decompressor(largest)
@@ -133,6 +150,34 @@ def unpacker(
         return unpack(payload)
 
     return unpack_compressed
+
+
+def too_large(size: int, largest: int) -> str:
+    """What is wrong with a payload for ROS that would hold up all others for too long."""
+    return f"it has {size} bytes, at most {largest} are converted (bridge.limits.payload)"
+
+
+def named_encoding(content_type: object) -> CallEncoding | None:
+    """The encoding of calls that a content type names, with or without parameters behind it."""
+    if not isinstance(content_type, str):
+        return None
+    return _OF_CONTENT_TYPE.get(content_type.partition(";")[0].strip().lower())
+
+
+def dumps(value: object, encoding: CallEncoding) -> bytes:
+    """JSON or CBOR of a value that is no ROS message; JSON where the encoding is one of
+    RAW, which have no words for it."""
+    return cbor.dumps(value) if encoding == "cbor" else orjson.dumps(value)
+
+
+def loads(payload: bytes, encoding: CallEncoding) -> Any:
+    """The value of JSON or CBOR. Raises ConversionError."""
+    if encoding == "cbor":
+        return cbor.loads(payload)
+    try:
+        return orjson.loads(payload)
+    except orjson.JSONDecodeError as error:
+        raise ConversionError("", f"not JSON: {error}") from None
 
 
 def claim(properties: Properties, name: str) -> str | None:
@@ -161,8 +206,7 @@ def _decompressor(largest: int) -> Callable[[bytes], bytes]:
             # A size that is told is made room for, whatever it is: it is looked at first.
             size = frame_content_size(payload)
             if size > largest:
-                problem = f"{size} bytes when decompressed, at most {largest} are allowed"
-                raise ConversionError("", problem)
+                raise ConversionError("", too_large(size, largest))
             return decompressor.decompress(payload, max_output_size=largest, allow_extra_data=False)
         except ZstdError as error:
             problem = f"not zstd, or more than {largest} bytes of it: {error}"

@@ -87,6 +87,11 @@ class Requests:
             if waiting.answer.cancelled():
                 self._soon(partial(self._give_up, key, waiting))
 
+    def problem(self, service: str, type_name: str) -> str | None:
+        """Why a service that is there cannot be asked; from any thread."""
+        problem = self._unusable.get((service, type_name))
+        return problem[1] if problem else None
+
     def keep_ready(self, services: Iterable[Key]) -> None:
         """Have a client ready for each of these while they are on the bus."""
         self._pinned = frozenset(services)
@@ -107,6 +112,11 @@ class Requests:
 
     # The ROS thread
 
+    @property
+    def has_clients(self) -> bool:
+        """Whether there is a client of a service: something may be under way, or it is idle yet."""
+        return bool(self._remotes)
+
     def look(self) -> None:
         """Follow the graph, send what has waited for its server, tell who waits in vain."""
         services = self._node.services()
@@ -115,7 +125,7 @@ class Requests:
             self._unusable.clear()
             self._post(self._take_services, services)
         for key in self._pinned:
-            if key not in self._remotes and key[0] in self._seen:
+            if key not in self._remotes and self._is_seen(key):
                 self._remote(key)
         for key, remote in list(self._remotes.items()):
             self._follow(key, remote)
@@ -136,14 +146,26 @@ class Requests:
             for request in remote.waiting:
                 self._send(remote, request)
             remote.waiting.clear()
-        elif remote.waiting and key[0] not in self._seen:
+        elif remote.waiting and not self._is_seen(key):
             for request in remote.waiting:
-                self._fail(request, *_unavailable(key[0]))
+                self._fail(request, *self._unavailable(key))
             remote.waiting.clear()
         remote.idle = 0 if remote.waiting or remote.sent else remote.idle + 1
         if remote.idle > IDLE_LOOKS and key not in self._pinned:
             remote.client.destroy()
             del self._remotes[key]
+
+    def _is_seen(self, key: Key) -> bool:
+        service, type_name = key
+        return type_name in self._seen.get(service, ())
+
+    def _unavailable(self, key: Key) -> tuple[ErrorCode, str]:
+        service, type_name = key
+        others = self._seen.get(service)
+        if others:
+            text = f"{service} is a {', '.join(others)} on the bus, not a {type_name}"
+            return "unavailable", text
+        return "unavailable", f"there is no {service} on the bus"
 
     def _remote(self, key: Key) -> _Remote | None:
         remote = self._remotes.get(key)
@@ -159,8 +181,8 @@ class Requests:
     def _begin(self, key: Key, request: _Request) -> None:
         if not request.cdr:
             return
-        if key not in self._remotes and key[0] not in self._seen:
-            self._fail(request, *_unavailable(key[0]))
+        if key not in self._remotes and not self._is_seen(key):
+            self._fail(request, *self._unavailable(key))
             return
         remote = self._remote(key)
         if remote is None:
@@ -168,10 +190,10 @@ class Requests:
         elif remote.client.is_ready():
             remote.was_ready = True
             self._send(remote, request)
-        elif key[0] in self._seen:
+        elif self._is_seen(key):
             remote.waiting.append(request)  # they have not found each other yet
         else:
-            self._fail(request, *_unavailable(key[0]))
+            self._fail(request, *self._unavailable(key))
 
     def _send(self, remote: _Remote, request: _Request) -> None:
         cdr, request.cdr = request.cdr, b""
@@ -213,7 +235,3 @@ class Requests:
         self._remotes.clear()
         self._seen = {}
         self._post(self._take_services, {})
-
-
-def _unavailable(service: str) -> tuple[ErrorCode, str]:
-    return "unavailable", f"there is no {service} on the bus"

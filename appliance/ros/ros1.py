@@ -3,14 +3,16 @@
 rospy gives and takes messages as their bytes, through classes that have a type's name and MD5 sum
 and nothing else. It does not come back by itself when the Master was away or came anew: the state
 of the graph, which is asked for anyway, says when our registrations are missing from it, and they
-are made again.
+are made again. And it starts only once: to join anew, it is imported anew.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,6 +20,7 @@ from contextlib import suppress
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -31,6 +34,7 @@ from appliance.ros.node import (
     Respond,
     RosClient,
     RosSubscription,
+    TakeLot,
 )
 from appliance.ros.ros1_actions import (
     HIDDEN,
@@ -73,14 +77,39 @@ _Graph = dict[str, list[str]]
 
 
 def available() -> tuple[bool, str]:
-    """Whether a node can be started here, and if not, one line that says why and what to do."""
+    """Whether a node can be started here, and if not, one line that says why and what to do.
+
+    Imports nothing.
+    """
     if find_spec("rospy") is None:
         return False, (
             "there is no ROS 1 here: rospy cannot be imported. Source a ROS 1 setup file first, or "
             "apt install python3-rospy, and install the appliance for the system's Python: "
             "/usr/bin/python3 -m venv --system-site-packages"
         )
+    messages = find_spec("std_msgs")
+    folders = list(messages.submodule_search_locations or ()) if messages is not None else []
+    if not any(Path(folder, "msg", "_String.py").is_file() for folder in folders):
+        return False, (
+            "ROS 2's packages come before those of ROS 1 here, and have the same names. Make an "
+            "environment without the extra `ros`, and source no ROS 2"
+            if folders
+            else "there is rospy, but not std_msgs. apt install python3-std-msgs"
+        )
     return True, ""
+
+
+def found() -> str:
+    """The ROS 1 that is used, in words; where one is `available`."""
+    spec = find_spec("rospy")
+    where = Path(spec.origin).parent.parent if spec is not None and spec.origin else "?"
+    distribution = os.environ.get("ROS_DISTRO", "")
+    return f"ROS 1{' ' if distribution else ''}{distribution} in {where}"
+
+
+def master_uri() -> str:
+    """Where the Master is, as every node of ROS 1 takes it."""
+    return os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
 
 
 def remappings(arguments: Iterable[str]) -> Iterator[str]:
@@ -93,7 +122,7 @@ def remappings(arguments: Iterable[str]) -> Iterator[str]:
 
 
 class Ros1Node:
-    """A RosNode on ROS 1. There can be one in the life of a process: rospy starts only once.
+    """A RosNode on ROS 1. There can be one at a time in a process, as rospy is one.
 
     Messages come on threads of rospy's, one at a time for each subscription.
     """
@@ -104,19 +133,27 @@ class Ros1Node:
         self, name: str = "appliance", namespace: str = "/", arguments: Sequence[str] = ()
     ) -> None:
         """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
-        self.name = f"{namespace.rstrip('/')}/{name}"
-        self._master = Master(os.environ.get("ROS_MASTER_URI", DEFAULT_MASTER), self.name)
+        self._arguments = list(remappings(arguments))
+        said = dict(argument.split(":=", 1) for argument in self._arguments)
+        self.name = f"{said.get('__ns', namespace).rstrip('/')}/{said.get('__name', name)}"
+        self._master = Master(said.get("__master", master_uri()), self.name)
         self.parameter_server: ParameterServer | None = MasterParameters(self._master)
         self._base_name = name
         self._namespace = namespace
-        self._arguments = list(remappings(arguments))
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
+        self._told: dict[str, Definition] = {}
+        self._complained: set[str] = set()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Be as if there had been no bus yet."""
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._is_running = False
         self._rospy: Any = None
         self._uri = ""
-        self._is_away = False
+        #: Why the Master cannot be asked, if it cannot.
+        self._silence: str | None = None
         # The graph, as of the last look.
         self._publishers: _Graph = {}
         self._subscribers: _Graph = {}
@@ -130,16 +167,27 @@ class Ros1Node:
         #: Definitions of types that are not installed, and the types of services.
         self._definitions: Answers[Definition] = Answers()
         self._service_types: Answers[str] = Answers()
-        self._told: dict[str, Definition] = {}
         #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
         self._holding: dict[Subscription, None] = {}
-        self._complained: set[str] = set()
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    @property
+    def obstacle(self) -> str | None:
+        silence = self._silence
+        return None if silence is None else f"the ROS Master does not answer: {silence}"
+
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
         is_available, reason = available()
         if not is_available:
             failed(reason)
             return
+        if self._thread is not None:  # it has failed, and is about to end
+            self._thread.join()
+            self._forget()
         self._thread = threading.Thread(
             target=self._run, args=(poll, failed), name="ros", daemon=True
         )
@@ -179,17 +227,10 @@ class Ros1Node:
         os.environ["ROS_MASTER_URI"] = self._master.uri
         if self._namespace != "/":
             os.environ["ROS_NAMESPACE"] = self._namespace
-        if not hasattr(import_module("std_msgs.msg").String, "_md5sum"):
-            raise BusError(
-                "ROS 2's packages come before those of ROS 1 here, and have the same names: make "
-                "an environment without the extra `ros`, and source no ROS 2"
-            )
-        import rospy
-
-        if rospy.core.is_shutdown():
-            raise BusError("rospy starts once in a process: restart the appliance")
         if not self._await_master():
             return False
+        self._check_name()
+        rospy = _fresh_rospy()
         # rospy would take over the logging of the whole process.
         rospy.core.configure_logging = lambda *_, **__: None
         rospy.init_node(
@@ -205,17 +246,29 @@ class Ros1Node:
         self._master.caller = self.name
         return True
 
+    def _check_name(self) -> None:
+        """The Master would end the other, and that, tried again, this one: neither came to rest."""
+        try:
+            uri = self._master.call("lookupNode", self.name)
+            Master(uri, self.name).call("getPid")
+        except BusError:  # there is none, or none any more
+            return
+        raise BusError(
+            f"another node, at {uri}, is called {self.name}: end it, or give this one another "
+            "name, bridge.node"
+        )
+
     def _await_master(self) -> bool:
         while not self._stopping.is_set():
             try:
                 self._master.call("getPid")
             except BusError as error:
-                if not self._is_away:
-                    self._is_away = True
+                if self._silence is None:
                     log.warning("waiting for the ROS Master: %s", error)
+                self._silence = str(error)
                 self._stopping.wait(KNOCK_INTERVAL)
             else:
-                self._is_away = False
+                self._silence = None
                 return True
         return False
 
@@ -224,7 +277,7 @@ class Ros1Node:
             if self._rospy.is_shutdown():
                 raise BusError(
                     f"{self.name} was shut down from outside: by `rosnode kill`, or by another "
-                    "node of the same name. Restart the appliance; bridge.node names its node"
+                    "node of the same name"
                 )
             if self._see():
                 holding = list(self._holding)
@@ -257,6 +310,10 @@ class Ros1Node:
 
     # The graph
 
+    def nodes(self) -> list[str]:
+        graphs = (self._publishers, self._subscribers, self._servers)
+        return sorted({node for graph in graphs for nodes in graph.values() for node in nodes})
+
     def _see(self) -> bool:
         """Look at the graph; False when there is none to be seen."""
         try:
@@ -276,12 +333,12 @@ class Ros1Node:
                     self._heard.pop(key, None)
                 self._definitions.keep(there)
         except (BusError, TypeError, ValueError) as error:
-            if not self._is_away:
-                self._is_away = True
+            if self._silence is None:
                 log.warning("the ROS Master does not answer; what is connected stays so: %s", error)
+            self._silence = str(error)
             return False
-        if self._is_away:
-            self._is_away = False
+        if self._silence is not None:
+            self._silence = None
             log.info("the ROS Master is back at %s", self._master.uri)
         return True
 
@@ -436,6 +493,7 @@ class Ros1Node:
         callback: Callable[..., None],
         *,
         timed: bool = False,
+        on_loop: TakeLot | None = None,
     ) -> RosSubscription:
         if HIDDEN in topic:
             return self._action_clients.subscribe(topic, type_name, callback)
@@ -497,6 +555,13 @@ class Ros1Node:
     ) -> Service:
         definition = installed_service(type_name)
         return Service(self._rospy, service, definition, callback, self.call_soon)
+
+
+def _fresh_rospy() -> Any:
+    """rospy as it is before it was started."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
+        del sys.modules[name]
+    return import_module("rospy")
 
 
 @cache

@@ -70,6 +70,7 @@ _GOAL_STATUS = _type("action_msgs/msg/GoalStatus", goal_info=_INFO, status=_INT8
 _KNOWN = {
     type_.name: type_
     for type_ in (
+        _INFO,
         _type(STATUS, status_list=Sequence(_GOAL_STATUS)),
         _type(f"{CANCEL}_Request", goal_info=_INFO),
         _type(f"{CANCEL}_Response", return_code=_INT8, goals_canceling=Sequence(_INFO)),
@@ -360,7 +361,8 @@ class _Server:
         return self._begin(_Call(self._text_of(request[:16]), look, done))
 
     def cancel(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
-        """Cancel a goal, or all for 16 zeros; answered when the server tells that it does."""
+        """Cancel a goal; or for 16 zeros all up to a time, all there are for the time 0. It is
+        answered when the server tells that it does."""
         is_all = not any(request[:16])
         id_ = "" if is_all else self._text_of(request[:16])
         status = None if is_all else self._status(id_)
@@ -368,7 +370,9 @@ class _Server:
             code = _UNKNOWN_GOAL if status is None else _GOAL_ENDED
             self._bus.call_soon(partial(done, struct.pack("<bI", code, 0)))
             return lambda: None
-        self._cancel.publish(bytes(8) + _text(id_))
+        until = request[16:24] if is_all else bytes(8)
+        self._cancel.publish(until + _text(id_))
+        is_meant = partial(_is_until, until)
         before = {goal for goal, (state, _) in (self._goals or {}).items() if state in _ENDED}
 
         def look(call: _Call) -> bytes | None:
@@ -379,7 +383,8 @@ class _Server:
                     for goal, (state, _) in goals.items()
                     if state in _CANCELING and goal not in before
                 ]
-                if not wanted and any(state not in _ENDED for state, _ in goals.values()):
+                left = [state for state, stamp in goals.values() if is_meant(stamp)]
+                if not wanted and any(state not in _ENDED for state in left):
                     return None
             else:
                 now = self._status(id_)
@@ -537,6 +542,11 @@ def _text(text: str) -> bytes:
 def _stamp(nanoseconds: int) -> bytes:
     seconds, rest = divmod(nanoseconds, 1_000_000_000)
     return struct.pack("<II", seconds & 0xFFFFFFFF, rest)
+
+
+def _is_until(until: bytes, stamp: bytes) -> bool:
+    """Whether a time is not after another, 0 of which means always."""
+    return not any(until) or struct.unpack("<II", stamp) <= struct.unpack("<II", until)
 
 
 def _message(type_name: str) -> str:

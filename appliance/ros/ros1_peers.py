@@ -9,7 +9,6 @@ four bytes.
 
 from __future__ import annotations
 
-import base64
 import socket
 import struct
 import threading
@@ -101,20 +100,17 @@ class MasterParameters:
         }
 
     def set(self, name: str, value: Any) -> None:
-        try:
-            self._master.call("setParam", name, value)
-        except OverflowError:
-            raise BusError("ROS 1 keeps integers of 32 bits only") from None
+        self._master.call("setParam", name, value)
 
 
 def _plain(value: Any) -> Any:
-    """A value of XML-RPC as JSON knows it: bytes in base64, dates as their text."""
+    """A value of XML-RPC in Python's own types: dates as their text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, xmlrpc.client.Binary):
-        return base64.b64encode(value.data).decode()
+        return value.data
     return str(value) if isinstance(value, xmlrpc.client.DateTime) else value
 
 

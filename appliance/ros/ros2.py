@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import logging
 import os
+import re
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from appliance.ros import installation, uncompiled
 from appliance.ros.definitions import (
     CDR,
     TypeDescription,
     UnknownTypeError,
+    describe,
     import_message,
-    load_description,
 )
 from appliance.ros.node import (
     BusError,
@@ -30,6 +33,16 @@ from appliance.ros.node import (
     QosProfile,
     Reliability,
     Respond,
+    RosSubscription,
+    TakeLot,
+)
+from appliance.ros.reach import Reach, look_again, reach
+from appliance.ros.ros2_loop import (
+    FIRST_TIMED,
+    ONE_TIMED_OF,
+    LoopSubscription,
+    UnavailableError,
+    published_at,
 )
 
 log = logging.getLogger(__name__)
@@ -37,11 +50,16 @@ log = logging.getLogger(__name__)
 #: Seconds between two looks at the graph, of which rclpy does not tell changes.
 POLL_INTERVAL = 0.15
 
-#: How many messages of a subscription are timed first, and of how many one is then.
-FIRST_TIMED = 100
-ONE_TIMED_OF = 16
+#: Seconds between two looks at what networks there are.
+NETWORK_INTERVAL = 2.0
+
+#: What ROS takes for the name of a topic or service, and no more characters than that. On DDS there
+#: may be others: asking ROS about one raises an error.
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+_LONGEST_NAME = 247
 
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
+_UDP_PROFILE = _PROFILE.with_name("fastdds_udp.xml")
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
@@ -52,11 +70,9 @@ def available() -> tuple[bool, str]:
     Imports nothing. A middleware that is asked for and not there is found out here because rcl
     would end the whole process over it.
     """
-    if find_spec("rclpy") is None:
-        return False, (
-            "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
-            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
-        )
+    found = installation.find()
+    if found.source == "none" or (found.advice and os.environ.get(installation.CHOICE) == "system"):
+        return False, found.advice
     wanted = os.environ.get("RMW_IMPLEMENTATION")
     installed = sorted(set(_resources("rmw_typesupport")) - {"rmw_implementation"})
     if wanted and installed and wanted not in installed:
@@ -69,30 +85,39 @@ def available() -> tuple[bool, str]:
 
 def _resources(kind: str) -> Iterator[str]:
     """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
+    for folder in _shares():
+        index = folder / "ament_index" / "resource_index" / kind
+        if index.is_dir():
+            yield from (entry.name for entry in index.iterdir())
+
+
+def _shares() -> Iterator[Path]:
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    for prefix in (*prefixes, sys.prefix):
-        folder = Path(prefix, "share", "ament_index", "resource_index", kind)
-        if folder.is_dir():
-            yield from (entry.name for entry in folder.iterdir())
+    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
 
 
 def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
     """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
 
     The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
-    `ROS_LOCALHOST_ONLY`.
+    `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
     """
+    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
+    is_old = any((share / "fastrtps").is_dir() for share in _shares())
     if (
         not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
-        or "FASTDDS_BUILTIN_TRANSPORTS" in environment
-        or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
+        or environment.get("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4") != "UDPv4"
+        or (is_old and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
         or any(variable in environment for variable in _PROFILE_VARIABLES)
         or any(Path(file).exists() for file in _PROFILE_FILES)
     ):
         return False
-    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
-    is_old = "fastrtps" in _resources("packages")
-    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(_PROFILE)
+    profile = _PROFILE
+    if "FASTDDS_BUILTIN_TRANSPORTS" in environment:
+        if not is_old:
+            return False
+        profile = _UDP_PROFILE  # in Humble and before it does not know the variable
+    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(profile)
     return True
 
 
@@ -101,6 +126,7 @@ class Ros2Node:
 
     wire = CDR
     parameter_server: ParameterServer | None = None
+    obstacle: str | None = None
 
     def __init__(
         self,
@@ -129,13 +155,23 @@ class Ros2Node:
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
-    def start(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        self._loop = loop
         is_available, reason = available()
         if not is_available:
             failed(reason)
             return
         use_fastdds_profile(os.environ)
+        if self._thread is not None:  # it has failed, and is about to end
+            self._thread.join()
         # Not a daemon: one that is alive when Python ends aborts the process.
         self._thread = threading.Thread(target=self._run, args=(poll, failed), name="ros")
         self._thread.start()
@@ -154,7 +190,7 @@ class Ros2Node:
         except Exception as error:
             # The thread's end, whatever ended it: it must be told, and the bus be left in order.
             log.debug("the ROS thread ended", exc_info=True)
-            reason = f"{type(error).__name__}: {error}"
+            reason = str(error) if isinstance(error, BusError) else _described(error)
         finally:
             self._leave()
         if reason:
@@ -167,6 +203,7 @@ class Ros2Node:
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
+        look_again()
         self._rclpy = rclpy
         self._context = Context()
         rclpy.init(
@@ -195,6 +232,8 @@ class Ros2Node:
         from rclpy.executors import ExternalShutdownException
         from rclpy.task import Future
 
+        began_with = reach()
+        look_at = time.monotonic() + NETWORK_INTERVAL
         poll()
         never: Any = Future(executor=self._executor)
         try:
@@ -202,11 +241,17 @@ class Ros2Node:
                 # A finite time-out also mends EventsExecutor, whose endless wait overflows.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
+                if began_with < Reach.NETWORK and time.monotonic() >= look_at:
+                    look_at = time.monotonic() + NETWORK_INTERVAL
+                    if reach() > began_with:
+                        raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
                 raise
 
     def _leave(self) -> None:
+        for subscription in list(self._on_loop):
+            subscription.destroy()
         if self._executor is not None:
             self._executor.shutdown()
         if self._node is not None:
@@ -234,8 +279,12 @@ class Ros2Node:
         clock = self._clock
         return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
 
+    def nodes(self) -> list[str]:
+        found = self._node.get_node_names_and_namespaces()
+        return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
+
     def topics(self) -> dict[str, list[str]]:
-        return dict(self._node.get_topic_names_and_types())
+        return _named(self._node.get_topic_names_and_types())
 
     def services(self) -> dict[str, list[str]]:
         from rclpy.node import NodeNameNonExistentError
@@ -243,8 +292,9 @@ class Ros2Node:
         # Asked for all at once, ROS also names the services that there are only clients of.
         found: dict[str, list[str]] = {}
         for node in self._node.get_node_names_and_namespaces():
-            with suppress(NodeNameNonExistentError):  # it has gone meanwhile
-                found.update(self._node.get_service_names_and_types_by_node(*node))
+            # It has gone meanwhile, or its name is none that ROS takes.
+            with suppress(NodeNameNonExistentError, *_errors()):
+                found.update(_named(self._node.get_service_names_and_types_by_node(*node)))
         return found
 
     def count(self, topic: str) -> tuple[int, int]:
@@ -265,7 +315,7 @@ class Ros2Node:
         return [endpoint for endpoint in endpoints if endpoint.node != self.name]
 
     def describe(self, type_name: str) -> TypeDescription:
-        return load_description(type_name)
+        return describe(load_message(type_name), load_message)
 
     # Subscriptions and publishers
 
@@ -277,8 +327,15 @@ class Ros2Node:
         callback: Callable[..., None],
         *,
         timed: bool = False,
-    ) -> _Subscription:
-        message_class = import_message(type_name)
+        on_loop: TakeLot | None = None,
+    ) -> RosSubscription:
+        message_class = load_message(type_name)
+        if on_loop is not None and self._loop is not None:
+            try:
+                return self._subscribe_on_loop(message_class, topic, qos, callback, on_loop)
+            except UnavailableError as reason:
+                log.info("the ROS thread takes all messages: %s", reason)
+                self._loop = None
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
         if timed and not self._is_event_driven:
             callback = _with_time(callback)
@@ -288,11 +345,43 @@ class Ros2Node:
             )
         if timed and self._is_event_driven:
             own.__class__ = _timed_subscription()
-            own.since = time.time_ns()
+            own.since = time.monotonic_ns()
         return _Subscription(self._node, own)
 
+    def _subscribe_on_loop(
+        self,
+        message_class: type[Any],
+        topic: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        on_loop: TakeLot,
+    ) -> LoopSubscription:
+        """Raises BusError, UnavailableError."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+        from rclpy.type_support import check_is_valid_msg_type
+
+        assert self._loop is not None
+        middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
+        if not middleware.startswith("rmw_fastrtps"):
+            raise UnavailableError(f"it has not been tried with {middleware}")
+        check_is_valid_msg_type(message_class)  # it also loads what the type needs
+        with _as_bus_error(ValueError), self._node.handle:
+            # What rclpy would make has to be told to the node, and with it to the executor.
+            handle = rclpy_implementation.Subscription(
+                self._node.handle, message_class, topic, _to_rclpy(qos).get_c_qos_profile()
+            )
+        try:
+            own = LoopSubscription(
+                handle, message_class, self._loop, self.call_soon, callback, on_loop
+            )
+        except UnavailableError:
+            handle.destroy_when_not_in_use()
+            raise
+        self._on_loop.add(own)
+        return own
+
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
-        message_class = import_message(type_name)
+        message_class = load_message(type_name)
         events = _event_callbacks().PublisherEventCallbacks(use_default_callbacks=False)
         with _as_bus_error():
             own = self._node.create_publisher(
@@ -312,6 +401,14 @@ class Ros2Node:
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
     ) -> _Service:
         return _Service(self._node, service, import_service(type_name), callback)
+
+
+def _named(found: list[tuple[str, list[str]]]) -> dict[str, list[str]]:
+    return {
+        name: types
+        for name, types in found
+        if len(name) <= _LONGEST_NAME and _NAME.match(name) is not None
+    }
 
 
 class _Subscription:
@@ -416,15 +513,53 @@ class _Service:
         self._node.destroy_service(own)
 
 
+@functools.cache
+def load_message(name: str) -> type[Any]:
+    """The class of a message type: with its compiled support or, where that does not load, read
+    from its definition. Raises UnknownTypeError that says why it is neither.
+    """
+    try:
+        return _with_support(import_message(name))
+    except UnknownTypeError as error:
+        definition = uncompiled.find_definition(name)
+        if definition is None:
+            raise
+        if definition.suffix != ".msg":
+            raise UnknownTypeError(
+                f"{error}; its definition {definition} is not enough: rclpy makes calls only with "
+                f"support compiled for its own Python, here {sys.version_info[0]}."
+                f"{sys.version_info[1]}"
+            ) from error
+        found = uncompiled.message_class(name, definition, load_message)
+        log.info("%s; %s is read from %s", error, name, definition)
+        return found
+
+
+def _with_support(found: type[Any]) -> type[Any]:
+    from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
+
+    try:
+        found.__class__.__import_type_support__()  # type: ignore[attr-defined]
+    except UnsupportedTypeSupport as error:
+        package = found.__module__.partition(".")[0]
+        reason = str(error.__context__ or error).partition("\n")[0]
+        raise UnknownTypeError(f"the package {package} does not load: {reason}") from error
+    return found
+
+
 def import_service(name: str) -> Any:
     """The class of a service `std_srvs/srv/Trigger`, and of those that an action is made of,
     `pkg/action/Name_SendGoal` and `pkg/action/Name_GetResult`. Raises UnknownTypeError.
     """
-    request = import_message(f"{name}_Request")
+    request = load_message(f"{name}_Request")
     service = getattr(sys.modules[request.__module__], name.rpartition("/")[2], None)
     if service is None:
         raise UnknownTypeError(f"no {name}: it is not a service")
     return service
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _errors() -> tuple[type[Exception], ...]:
@@ -433,10 +568,10 @@ def _errors() -> tuple[type[Exception], ...]:
 
 
 @contextmanager
-def _as_bus_error() -> Iterator[None]:
+def _as_bus_error(*more: type[Exception]) -> Iterator[None]:
     from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
 
-    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException)
+    refusals: tuple[Any, ...] = (NameValidationException, NoTypeSupportImportedException, *more)
     try:
         yield
     except refusals + _errors() as error:
@@ -457,7 +592,7 @@ def _new_executor(context: Any) -> tuple[Any, bool]:
 
 def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
     """What calls the callback with some messages' time; rclpy tells it of all that it is given."""
-    since = time.time_ns()
+    since = time.monotonic_ns()
     until_timed = ONE_TIMED_OF
 
     def timed(cdr: bytes, info: Any) -> None:
@@ -467,15 +602,9 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
             callback(cdr)
             return
         until_timed = ONE_TIMED_OF
-        callback(cdr, _published_at(info, since))
+        callback(cdr, published_at(info, since))
 
     return timed
-
-
-def _published_at(info: Any, since: int) -> int:
-    """0 for what was published before `since`, and kept for late subscribers."""
-    published_at = int(info["source_timestamp"])
-    return published_at if published_at > since else 0
 
 
 @functools.cache
@@ -507,7 +636,7 @@ def _timed_subscription() -> Any:
             self._until_timed = 1 if self._timed < FIRST_TIMED else ONE_TIMED_OF
             taken = self.handle.take_message(self.msg_type, True)
             if taken is not None:
-                self._callback(taken[0], _published_at(taken[1], self.since))
+                self._callback(taken[0], published_at(taken[1], self.since))
 
     return TimedSubscription
 

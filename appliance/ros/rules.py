@@ -176,7 +176,7 @@ def _inside(type_: Primitive, bound: float, *, upwards: bool) -> float:
     if nearest == bound or (nearest > bound) is upwards:
         return nearest
     (bits,) = struct.unpack("<i", struct.pack("<f", nearest))
-    away_from_zero = (nearest > 0) is upwards
+    away_from_zero = (math.copysign(1, nearest) > 0) is upwards
     step = 1 if away_from_zero else -1
     (neighbour,) = struct.unpack("<f", struct.pack("<i", bits + step))
     assert isinstance(neighbour, float)

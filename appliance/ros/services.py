@@ -21,14 +21,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-import orjson
-
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.calls import (
     REPORT_INTERVAL,
+    WITHOUT_RAW,
     Answer,
     Call,
     CallCounters,
@@ -39,9 +38,17 @@ from appliance.ros.calls import (
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
-from appliance.ros.patterns import Names, compile_pattern
-from appliance.ros.payloads import CONTENT_TYPE, RAW
+from appliance.ros.patterns import assign, compile_pattern, refusals
+from appliance.ros.payloads import (
+    CONTENT_TYPE,
+    RAW,
+    CallEncoding,
+    loads,
+    named_encoding,
+    too_large,
+)
 from appliance.ros.requests import Key, Requests
+from appliance.ros.skips import Skip, Why
 
 log = logging.getLogger(__name__)
 
@@ -55,25 +62,21 @@ Post = Callable[..., None]
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """A service, or a pattern of services, that go `to` ROS or to MQTT (then `type` is needed).
+    """Services, by names and patterns, that go `to` ROS; or one to MQTT (then `type` is needed).
 
-    A `{ros}` in `mqtt` stands for the ROS name. `timeout` is in seconds. A pattern with a `type`,
-    in which `*` is a part of the name, takes only services of that type. `on_error` is the JSON of
+    What begins with `!` in `names` is left out. A `{ros}` in `mqtt` stands for the ROS name.
+    `timeout` is in seconds. With a `type`, in which `*` is a part of the name, patterns take only
+    services of that type. `encoding` is for what does not name another. `on_error` is the JSON of
     the response that a ROS client gets when MQTT gave none.
     """
 
-    ros: str
+    names: tuple[str, ...]
     mqtt: str
     to: Literal["ros", "mqtt"] = "ros"
     type: str | None = None
     timeout: float = 5.0
-    encoding: Literal["json", "cdr", "ros1"] = "json"
+    encoding: CallEncoding = "json"
     on_error: str | None = None
-
-    @property
-    def is_pattern(self) -> bool:
-        """Whether `ros` stands for many services, or (`!`) for those that are left out."""
-        return "*" in self.ros or self.ros.startswith("!")
 
     def base(self, ros: str) -> str:
         """The MQTT topic above all that belong to this service."""
@@ -81,7 +84,7 @@ class ServiceSettings:
 
 
 def to_request(
-    converters: Converters, type_name: str, payload: bytes, encoding: str = "json"
+    converters: Converters, type_name: str, payload: bytes, encoding: CallEncoding
 ) -> bytes:
     """The serialized message of a payload; an empty one has every field's default.
 
@@ -89,13 +92,23 @@ def to_request(
     """
     try:
         converter = converters.get(type_name)
+        if not payload:
+            return converter.from_dict({})
         if encoding in RAW:
             return converter.checked(payload)
-        return converter.from_json(payload or b"{}")
+        return converter.from_cbor(payload) if encoding == "cbor" else converter.from_json(payload)
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
     except UnknownTypeError as error:
         raise CallError("unknown_type", str(error)) from None
+
+
+def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of a serialized message. Raises ConversionError, UnknownTypeError."""
+    if encoding in RAW:
+        return cdr
+    converter = converters.get(type_name)
+    return converter.to_cbor(cdr) if encoding == "cbor" else converter.to_json(cdr)
 
 
 class ServiceRoutes:
@@ -117,21 +130,17 @@ class ServiceRoutes:
         self._loop = loop
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
-        self._excluded = Names(())
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
         self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
         self._provided: dict[ServiceSettings, Provided] = {}
+        #: Services that patterns speak of and do not take.
+        self._refused: list[Skip] = []
         #: The type that a service last had.
         self._types: dict[str, str] = {}
 
     def replace(self, routes: Sequence[ServiceSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
-        self._counters = {
-            route: self._counters.get(route) or CallCounters()
-            for route in routes
-            if not route.ros.startswith("!")
-        }
-        self._excluded = Names(route.ros[1:] for route in routes if route.ros.startswith("!"))
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         wanted = [route for route in self._counters if route.to == "mqtt"]
         for route, provided in list(self._provided.items()):
             if route not in wanted:
@@ -158,7 +167,7 @@ class ServiceRoutes:
         wanted = self._wanted()
         for name, (route, offer) in list(self._offered.items()):
             if wanted.get(name) != route:
-                self._board.withdraw(offer.topic)
+                self._board.withdraw(offer)
                 del self._offered[name]
         for name, route in wanted.items():
             if name not in self._offered:
@@ -170,32 +179,30 @@ class ServiceRoutes:
         }
 
     def _wanted(self) -> dict[str, ServiceSettings]:
-        """The services that MQTT may call, and the route of each; names go before patterns."""
-        own = {route.ros for route in self._provided}
+        """The services that MQTT may call, and the route of each."""
+        own = {route.names[0] for route in self._provided}
+        found = {name: types for name, types in self._requests.services.items() if name not in own}
         routes = [route for route in self._counters if route.to == "ros"]
-        wanted = {route.ros: route for route in reversed(routes) if not route.is_pattern}
-        for route in routes:
-            if not route.is_pattern:
-                continue
-            pattern = compile_pattern(route.ros)
-            of_type = compile_pattern(route.type) if route.type else None
-            takes_all = "*" in route.ros.rpartition("/")[2]
-            for name, types in self._requests.services.items():
-                if (
-                    name not in wanted
-                    and name not in own
-                    and pattern.fullmatch(name)
-                    and name not in self._excluded
-                    and (of_type is None or any(map(of_type.fullmatch, types)))
-                    and not (of_type is None and takes_all and _OF_EVERY_NODE.fullmatch(min(types)))
-                ):
-                    wanted[name] = route
+
+        def misfit(route: ServiceSettings, name: str) -> tuple[Why, str] | None:
+            return _misfit(route, found[name])
+
+        wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
+        # Those of actions belong to bridge.actions.
+        others = {name: types for name, types in found.items() if "/_action/" not in name}
+        self._refused = refusals(routes, others, wanted, "service", misfit)
         return wanted
 
     def _offer(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
         offer = Offer(
-            topic, name, route.timeout, self._counters[route], partial(self._handle, name, route)
+            topic,
+            name,
+            route.timeout,
+            self._counters[route],
+            partial(self._handle, name, route),
+            route.encoding,
+            (*WITHOUT_RAW, self._node.wire.encoding),
         )
         self._offered[name] = route, offer
         self._board.offer(offer)
@@ -209,12 +216,11 @@ class ServiceRoutes:
         type_name = self._type(name, route)
         if type_name is None:
             raise CallError("unavailable", f"there is no {name} on the bus")
-        request = to_request(self._converters, f"{type_name}_Request", call.payload, route.encoding)
+        request = to_request(self._converters, f"{type_name}_Request", call.payload, call.encoding)
         response = await self._requests.ask(name, type_name, request)
         response_type = f"{type_name}_Response"
-        if route.encoding in RAW:
-            return Answer(response, response_type, CONTENT_TYPE[route.encoding])
-        return Answer(self._converters.get(response_type).to_json(response), response_type)
+        payload = from_ros(self._converters, response_type, response, call.encoding)
+        return Answer(payload, call.encoding, response_type)
 
     def keys(self) -> Iterable[Key]:
         """The services that a client should be ready for."""
@@ -230,7 +236,7 @@ class ServiceRoutes:
                 route,
                 counters,
                 [name for name, (of, _) in self._offered.items() if of is route]
-                + ([route.ros] if route in self._provided else []),
+                + (list(route.names) if route in self._provided else []),
             )
             for route, counters in self._counters.items()
         ]
@@ -243,9 +249,24 @@ class ServiceRoutes:
             if name in self._requests.services
         ]
         return entries + [
-            _entry("provided", route.ros, f"{route.base(route.ros)}/_request", route.type, route)
+            _entry("provided", name, f"{route.base(name)}/_request", route.type, route)
             for route in self._provided
+            for name in route.names
         ]
+
+    def skips(self) -> list[Skip]:
+        """The services that routes speak of and cannot be called, or are not offered."""
+        skips = list(self._refused)
+        for name, (route, _) in self._offered.items():
+            type_name = self._type(name, route) or ""
+            problem = self._requests.problem(name, type_name)
+            if problem is not None:
+                skips.append(Skip(name, "service", type_name, "problem", problem))
+            elif name not in self._requests.services:
+                skips.append(Skip(name, "service", type_name, "absent", "no node offers it"))
+        for provided in self._provided.values():
+            skips += provided.skips()
+        return skips
 
     def stop(self) -> None:
         """The bus has been left: nothing is offered any more."""
@@ -253,6 +274,7 @@ class ServiceRoutes:
             provided.stop()
         self._provided.clear()
         self._offered.clear()
+        self._refused.clear()
 
     # The ROS thread
 
@@ -265,6 +287,18 @@ class ServiceRoutes:
         """The bus is gone, and with it the services."""
         for provided in list(self._provided.values()):
             provided.lost()
+
+
+def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[Why, str] | None:
+    """Why a pattern of the route does not take a service of these types; None when it does."""
+    if route.type is not None:
+        if any(map(compile_pattern(route.type).fullmatch, types)):
+            return None
+        return "other_type", f"the route takes {route.type}"
+    takes_all = any("*" in name.rpartition("/")[2] for name in route.names if name[0] != "!")
+    if takes_all and _OF_EVERY_NODE.fullmatch(min(types)):
+        return "of_every_node", "every node has one; patterns take it only where they name it"
+    return None
 
 
 def _entry(
@@ -308,11 +342,14 @@ class Provided:
         self._node = node
         self._loop = loop
         self._post = post
-        self._base = route.base(route.ros)
+        (self._ros,) = route.names
+        self._base = route.base(self._ros)
         self._request_type = f"{route.type}_Request"
         self._response_type = f"{route.type}_Response"
         self._asked: dict[str, _Asked] = {}
         self._report_at = 0.0
+        #: Why ROS does not have it.
+        self._problem: str | None = None
         self._board.listen(f"{self._base}/_response/+", self._on_response)
         # The ROS thread's.
         self._service: RosService | None = None
@@ -329,21 +366,26 @@ class Provided:
         route = self._route
         assert route.type is not None
         try:
-            self._service = self._node.create_service(route.ros, route.type, self._on_request)
+            self._service = self._node.create_service(self._ros, route.type, self._on_request)
         except (BusError, UnknownTypeError) as error:
-            self._post(log.error, "%s is not offered: %s", route.ros, error)
-            self._counters.last_error = str(error)
+            self._post(log.error, "%s is not offered: %s", self._ros, error)
+            self._counters.last_error = self._problem = str(error)
             return
-        self._post(log.info, "%s is offered, and answered at %s", route.ros, self._base)
+        self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
+
+    def skips(self) -> list[Skip]:
+        """Why it is not offered, where it is not; from any thread."""
+        if self._problem is None:
+            return []
+        return [Skip(self._ros, "provided", self._route.type or "", "problem", self._problem)]
 
     def _on_request(self, cdr: bytes, respond: Respond) -> None:
         try:
-            if self._route.encoding == "json":
-                cdr = self._converters.get(self._request_type).to_json(cdr)
+            payload = from_ros(self._converters, self._request_type, cdr, self._route.encoding)
         except (ConversionError, UnknownTypeError) as error:
             self._post(self._fail, respond, f"a request cannot be converted: {error}")
             return
-        self._post(self._ask, cdr, respond)
+        self._post(self._ask, payload, respond)
 
     def _close(self) -> None:
         self._is_over = True
@@ -384,18 +426,22 @@ class Provided:
     def _on_response(self, origin: Session, message: Message) -> None:
         asked = self._forget(message.topic.rpartition("/")[2])
         if asked is None:
-            log.debug("%s: a response to nothing under way", self._route.ros)
+            log.debug("%s: a response to nothing under way", self._ros)
             return
-        told = (message.properties or {}).get(Property.USER_PROPERTY)
+        size, most = len(message.payload), self._board.limits.payload
+        if size > most:
+            self._fail(asked.respond, f"too_large: {too_large(size, most)}")
+            return
+        properties = message.properties or {}
+        told = properties.get(Property.USER_PROPERTY)
+        encoding = named_encoding(properties.get(Property.CONTENT_TYPE)) or self._route.encoding
         if isinstance(told, list) and ("status", "error") in told:
             self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
             return
         try:
-            cdr = to_request(
-                self._converters, self._response_type, message.payload, self._route.encoding
-            )
+            cdr = to_request(self._converters, self._response_type, message.payload, encoding)
         except CallError as error:
-            is_error = _is_error(message.payload)
+            is_error = _is_error(message.payload, encoding)
             what = f"rejected: {message.payload[:200]!r}" if is_error else f"bad response: {error}"
             self._fail(asked.respond, what)
             return
@@ -423,7 +469,7 @@ class Provided:
         if now >= self._report_at:
             self._report_at = now + REPORT_INTERVAL
             count = sum(self._counters.errors.values())
-            log.warning("a call of %s failed (%d so far): %s", self._route.ros, count, problem)
+            log.warning("a call of %s failed (%d so far): %s", self._ros, count, problem)
         cdr = None
         if self._route.on_error is not None:
             try:
@@ -431,7 +477,7 @@ class Provided:
                     self._route.on_error.encode()
                 )
             except (ConversionError, UnknownTypeError) as error:
-                log.warning("on_error of %s cannot be used: %s", self._route.ros, error)
+                log.warning("on_error of %s cannot be used: %s", self._ros, error)
         self._respond(respond, cdr)
 
     def _respond(self, respond: Respond, cdr: bytes | None) -> None:
@@ -439,20 +485,18 @@ class Provided:
             try:
                 respond(cdr)
             except BusError as error:
-                self._post(log.warning, "%s: no response could be sent: %s", self._route.ros, error)
+                self._post(log.warning, "%s: no response could be sent: %s", self._ros, error)
 
         try:
             self._node.call_soon(send)
         except BusError:
-            log.debug("%s: the bus has gone", self._route.ros)
+            log.debug("%s: the bus has gone", self._ros)
 
     def stop(self) -> None:
-        """Offer it no longer; what is under way gets no response."""
+        """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
         self._board.ignore(f"{self._base}/_response/+")
-        for asked in self._asked.values():
-            asked.timer.cancel()
-        self._counters.under_way -= len(self._asked)
-        self._asked.clear()
+        for token in list(self._asked):
+            self._give_up(token, "stopping: the service is offered no longer")
         try:
             self._node.call_soon(self._close)
         except BusError:
@@ -461,11 +505,12 @@ class Provided:
     def lost(self) -> None:
         """The bus is gone, and with it the service; on the ROS thread."""
         self._service = None
+        self._is_tried = False
 
 
-def _is_error(payload: bytes) -> bool:
+def _is_error(payload: bytes, encoding: CallEncoding) -> bool:
     try:
-        value = orjson.loads(payload)
-    except orjson.JSONDecodeError:
+        value = loads(payload, encoding)
+    except ConversionError:
         return False
     return isinstance(value, dict) and isinstance(value.get("error"), dict)

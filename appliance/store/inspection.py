@@ -8,18 +8,20 @@ import os
 import sqlite3
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 from appliance.store import database
+from appliance.store.clock import KEY, Clocks, boot_id, stamp_of
 from appliance.store.database import Rows
 from appliance.store.schema import (
     DamagedError,
     Row,
     StoreError,
     Table,
+    Value,
     connect,
     connect_to_read,
     select,
@@ -64,9 +66,13 @@ def read(path: Path) -> Rows:
         raise StoreError(f"{path} is not there: nothing has been stored yet")
     try:
         with contextlib.closing(connect_to_read(path)) as connection:
-            version(connection)
+            # What an older appliance wrote has fewer tables until this one runs.
+            tables = [*Table] if version(connection) > 1 else [*Table][: Table.CLOCK]
             connection.execute("BEGIN")
-            return [{row[0]: row for row in connection.execute(select(table))} for table in Table]
+            rows: Rows = [{} for _ in Table]
+            for table in tables:
+                rows[table] = {row[0]: row for row in connection.execute(select(table))}
+            return rows
     except (sqlite3.Error, DamagedError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from None
 
@@ -75,6 +81,7 @@ def summarise(path: Path) -> Summary:
     """What is kept in the database. Raises StoreError."""
     rows = read(path)
     messages = rows[Table.MESSAGE]
+    dated = _dates(rows)
 
     def payload_size(key: object) -> int:
         row = messages.get(cast(int, key))
@@ -95,8 +102,8 @@ def summarise(path: Path) -> Summary:
                 len(subscriptions[key]),
                 len(owed),
                 sum(map(payload_size, owed)),
-                min(stored, default=None),
-                cast("float | None", ends_at),
+                dated(min(stored, default=None)),
+                dated(ends_at),
             )
         )
     retained = [row[1] for row in rows[Table.RETAINED].values()]
@@ -110,6 +117,13 @@ def summarise(path: Path) -> Summary:
     )
 
 
+def _dates(rows: Rows) -> Callable[[Value], float | None]:
+    """What makes a time of the wall clock out of one of the store's."""
+    stamp = stamp_of(rows[Table.CLOCK].get(KEY))
+    shift = stamp.shift if stamp is not None else 0.0
+    return lambda moment: moment + shift if isinstance(moment, float) else None
+
+
 def _by_session(rows: Rows, table: Table) -> defaultdict[object, list[Row]]:
     """The rows of a table that belongs to sessions, by the session's key."""
     found: defaultdict[object, list[Row]] = defaultdict(list)
@@ -121,6 +135,7 @@ def _by_session(rows: Rows, table: Table) -> defaultdict[object, list[Row]]:
 def export(path: Path) -> Iterator[dict[str, object]]:
     """Every session and every retained message as what JSON can say. Raises StoreError."""
     rows = read(path)
+    dated = _dates(rows)
 
     def message(key: object) -> dict[str, object]:
         row = rows[Table.MESSAGE].get(cast(int, key))
@@ -128,7 +143,7 @@ def export(path: Path) -> Iterator[dict[str, object]]:
             return {}
         _, topic, payload, qos, retain, _, _, expires_at, stored_at = row
         told: dict[str, object] = {"topic": topic, "qos": qos, "retain": bool(retain)}
-        told |= {"stored_at": stored_at, "expires_at": expires_at}
+        told |= {"stored_at": dated(stored_at), "expires_at": dated(expires_at)}
         try:
             told["payload"] = cast(bytes, payload).decode()
         except UnicodeDecodeError:
@@ -144,8 +159,10 @@ def export(path: Path) -> Iterator[dict[str, object]]:
             "session": client_id,
             "user": username,
             "expiry": expiry,
-            "ends_at": ends_at,
-            "will": message(will) | {"delay": will_delay, "due_at": will_at} if will else None,
+            "ends_at": dated(ends_at),
+            "will": message(will) | {"delay": will_delay, "due_at": dated(will_at)}
+            if will
+            else None,
             "subscriptions": [
                 {"filter": row[2], "qos": row[3], "identifier": row[7]}
                 for row in subscriptions[key]
@@ -158,6 +175,13 @@ def export(path: Path) -> Iterator[dict[str, object]]:
         }
     for row in rows[Table.RETAINED].values():
         yield {"retained": message(row[1])}
+
+
+def _now(rows: Rows) -> float:
+    """The store's time."""
+    stamp = stamp_of(rows[Table.CLOCK].get(KEY))
+    clocks = Clocks(time.time(), time.monotonic(), boot_id())
+    return clocks.wall if stamp is None else stamp.later(clocks)
 
 
 def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[int, int]:
@@ -184,7 +208,7 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
     try:
         batch = Batch(0, 1 << 62)
         messages = rows[Table.MESSAGE]
-        limit = None if older_than is None else time.time() - older_than
+        limit = None if older_than is None else _now(rows) - older_than
         gone = 0
         for key, row in rows[Table.OWED].items():
             stored = messages.get(cast(int, row[2])) if row[2] is not None else None

@@ -28,11 +28,11 @@ _T = TypeVar("_T")
 LARGEST_KEY = 1 << 53
 
 
-# --- to rows: `offset` is what the wall clock is ahead of the broker's clock, in seconds ---------
+# --- to rows: `offset` is what the store's time is ahead of the broker's, in seconds --------------
 
 
 def message_row(key: int, message: Message, offset: float, now: float) -> Row:
-    """The row of a message that is stored at `now`, by the wall clock."""
+    """The row of a message that is stored at `now`, by the store's time."""
     properties = message.properties
     return (
         key,

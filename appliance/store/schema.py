@@ -2,7 +2,7 @@
 
 Every table has an integer key that is given out once and never again; rows refer to each other by
 it. There are no indices and no foreign keys: all is read at the start, and then found in memory.
-Times are seconds of the wall clock.
+Times are seconds of the store's own clock, see `clock`.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ class Table(IntEnum):
     OWED = 3
     RECEIVED = 4
     RETAINED = 5
+    CLOCK = 6
 
 
 COLUMNS: dict[Table, tuple[str, ...]] = {
@@ -59,6 +60,7 @@ COLUMNS: dict[Table, tuple[str, ...]] = {
     ),
     Table.RECEIVED: ("id", "session", "packet_id", "message", "no_room"),
     Table.RETAINED: ("id", "message"),
+    Table.CLOCK: ("id", "time", "wall", "counted", "boot"),
 }
 
 #: What makes each version out of the one before; a database of an older version gets the rest.
@@ -118,6 +120,15 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE retained (
         id INTEGER PRIMARY KEY,
         message INTEGER NOT NULL
+    );
+    """,
+    """
+    CREATE TABLE clock (          -- one row
+        id INTEGER PRIMARY KEY,
+        time REAL NOT NULL,       -- the store's, when the computer's clocks said:
+        wall REAL NOT NULL,
+        counted REAL NOT NULL,
+        boot TEXT NOT NULL
     );
     """,
 )

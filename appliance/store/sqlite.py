@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import cast
 
 from appliance.broker.broker import Broker
+from appliance.broker.kept import restore
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Held, Session
+from appliance.clock import NUDGE, StepWatch
 from appliance.mqtt.packets import Subscription
 from appliance.store import database
+from appliance.store.clock import KEY, Clocks, Stamp, boot_id, stamp_of
 from appliance.store.loader import (
     Loaded,
     load,
@@ -39,10 +42,8 @@ LINGER = 1.0
 #: Seconds until a batch that could not be written is tried again.
 RETRY = 1.0
 
-#: Seconds between two looks at the wall clock, and by how many it is wrong when it was set anew.
-#: What is too old is looked for as often.
+#: Seconds between two looks at the wall clock. What is too old is looked for as often.
 CLOCK_CHECK = 10.0
-CLOCK_STEP = 2.0
 
 #: Bytes that a message takes in the database beside topic and payload, roughly, with what it is
 #: owed to.
@@ -93,6 +94,7 @@ class SqliteStore:
         size: int = 1 << 30,
         age: float | None = None,
         wall: Callable[[], float] = time.time,
+        boot: Callable[[], str] = boot_id,
     ) -> None:
         self.path = path
         self.size = size
@@ -109,7 +111,11 @@ class SqliteStore:
         self.largest_group = 0
         self._durability: Durability = durability
         self._wall = wall
+        self._boot = boot
+        #: What the store's own time is ahead of the loop's.
         self._offset = 0.0
+        self._steps = StepWatch(0.0, wall)
+        self._stamped = 0
         self._lock: int | None = None
         self._contents: database.Contents | None = None
         self._loop: asyncio.AbstractEventLoop
@@ -131,6 +137,11 @@ class SqliteStore:
         #: Whether somebody waits for what is in the open batch.
         self._urgent = False
         self._outcome: asyncio.Future[None] | None = None
+
+    @property
+    def failing(self) -> bool:
+        """Whether nothing can be written now."""
+        return self._failing
 
     # --- start and end -------------------------------------------------------------------------
 
@@ -174,7 +185,7 @@ class SqliteStore:
         contents, self._contents = self._contents, None
         assert contents is not None
         self._loop = asyncio.get_running_loop()
-        self._offset = self._wall() - self._loop.time()
+        self._set_clock(stamp_of(contents.rows[Table.CLOCK].get(KEY)))
         loaded = load(contents.rows, self._offset)
         self._keys = itertools.count(loaded.last_key + 1)
         self._open.first_id = loaded.last_key + 1
@@ -182,6 +193,7 @@ class SqliteStore:
             self._open.first_id = 1  # nothing is in the new database
             for table in Table:
                 self._open.rows[table].update(contents.rows[table])
+        self._put_stamp()
         for key, message in loaded.messages.items():
             self._messages[message] = stored = _Stored(key, message, 0.0)
             stored.stored_at = float(contents.rows[Table.MESSAGE][key][8] or 0.0)
@@ -216,8 +228,10 @@ class SqliteStore:
             )
 
     def _adopt(self, broker: Broker, loaded: Loaded, rows: database.Rows) -> None:
-        broker.restore(
-            [session.kept for session in loaded.sessions.values()], list(loaded.retained.values())
+        restore(
+            broker,
+            [session.kept for session in loaded.sessions.values()],
+            list(loaded.retained.values()),
         )
         for key, message in loaded.retained.items():
             before = self._retained.get(message.topic)
@@ -264,6 +278,7 @@ class SqliteStore:
             while self._writing:
                 await self._next_outcome()
             if self._failed is not None or self._open:
+                self._put_stamp()
                 self._hand_over()
                 await self._next_outcome()
             await self._loop.run_in_executor(None, self._writer.stop)
@@ -369,21 +384,35 @@ class SqliteStore:
             RETRY,
         )
 
+    def _clocks(self) -> Clocks:
+        return Clocks(self._wall(), self._loop.time(), self._boot())
+
+    def _set_clock(self, stamp: Stamp | None) -> None:
+        """Let the store's time go on from what was stored."""
+        clocks = self._clocks()
+        self._steps = StepWatch(clocks.counted, self._wall)
+        self._offset = (clocks.wall if stamp is None else stamp.later(clocks)) - clocks.counted
+        if stamp is not None and clocks.wall < stamp.clocks.wall - NUDGE:
+            log.warning(
+                "this computer's clock is behind that of the last run by %.0f s: sessions and "
+                "messages expire as if it had not been switched off since",
+                stamp.clocks.wall - clocks.wall,
+            )
+
+    def _put_stamp(self) -> None:
+        clocks = self._clocks()
+        stamp = Stamp(clocks.counted + self._offset, clocks)
+        self._open.put(Table.CLOCK, KEY, stamp.row())
+        self._stamped = self.batch
+
     def _check_clock(self) -> None:
-        """Store the times anew when the wall clock was set, as it is on a robot after its boot."""
+        """Keep what the clocks say: with what is written anyway, and when the wall clock was set,
+        as it is on a robot after its boot."""
         self._clock = self._loop.call_later(CLOCK_CHECK, self._check_clock)
         self._drop_old()
-        offset = self._wall() - self._loop.time()
-        if abs(offset - self._offset) < CLOCK_STEP:
-            return
-        self._offset = offset
-        for session, known in self._sessions.items():
-            if session.ends_at is not None:
-                self._put_session(session, known)
-        for message, stored in self._messages.items():
-            if message.expires_at is not None:
-                self._put_message(message, stored)
-        self._stage_lazily()
+        if self._steps.look(self._loop.time()) or self._stamped < self.batch - 1:
+            self._put_stamp()
+            self._stage_lazily()
 
     def _drop_old(self) -> None:
         """Drop what has waited for longer than `age`."""

@@ -28,6 +28,8 @@ from appliance.bench.load import Flow, Load, Publisher, Result, Subscriber
 from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
 from appliance.mqtt.topics import check_filter, matches
 
+pytestmark = pytest.mark.timed
+
 MOSQUITTO = find_mosquitto(None)
 needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
 

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.broker.broker import Broker, retained_size
+from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
+from appliance.broker.retained import retained_size
 from appliance.broker.session import Delivery, Held, Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
@@ -370,11 +371,11 @@ class Peer:
 
     def slow(self) -> None:
         """The network takes nothing more."""
-        self.client.writable = False
+        self.client.output.writable = False
 
     def fast(self) -> None:
         """The network takes bytes again."""
-        self.client.resume_writing()
+        self.client.output.resume_writing()
         self.broker.flush()
 
     def farewell(self) -> ReasonCode:
@@ -423,7 +424,7 @@ def check_accounts(broker: Broker) -> None:
     assert broker.ledger.queued_bytes == total + broker.ledger.input_bytes
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
-    assert broker.retained_bytes == sum(retained_size(message) for message in retained)
+    assert broker.retained.bytes == sum(retained_size(message) for message in retained)
 
 
 @pytest.fixture

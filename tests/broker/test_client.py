@@ -5,6 +5,9 @@ Statements of the standards are named as `[MQTT-…]`, those of 5.0 with `v5` wh
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 
 from appliance.broker.broker import Broker
@@ -772,3 +775,29 @@ def test_a_topic_alias_is_resolved_for_the_receivers(join: Join):
     peer.send(Publish("", b"2", properties={P.TOPIC_ALIAS: 1}))
     assert [(m.topic, m.properties) for m in watcher.messages()] == [("a/long/topic", None)] * 2
     assert not watcher.wire.closed
+
+
+@pytest.mark.parametrize("end", ["lost", "disconnected", "taken over", "refused"])
+def test_the_memory_of_a_client_is_free_at_once(broker: Broker, end: str):
+    """However it ends, and not only when garbage is looked for."""
+    gc.disable()
+    try:
+        peer = Peer(broker)
+        if end == "refused":
+            peer.say_connect()
+            peer.client.refuse(ReasonCode.NOT_AUTHORIZED, "the test says so")
+        else:
+            peer.connect(**lasting(5))
+            peer.subscribe("a", 1)
+        if end == "lost":
+            peer.lose()
+        elif end == "disconnected":
+            peer.disconnect()
+        elif end == "taken over":
+            Peer(broker).connect(**lasting(5))
+        broker.flush()
+        wire = weakref.ref(peer.wire)  # which is held by the client
+        del peer
+        assert wire() is None
+    finally:
+        gc.enable()

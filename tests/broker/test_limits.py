@@ -7,8 +7,8 @@ import logging
 import pytest
 
 from appliance.broker.broker import ENDINGS_A_TURN, Broker
-from appliance.broker.client import EFFORT_A_TURN
 from appliance.broker.complaints import BURST, INTERVAL
+from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.session import REPLAYED_A_TURN, subscription_size
@@ -16,10 +16,14 @@ from appliance.mqtt.codec import MAXIMUM_PAIRS, Property
 from appliance.mqtt.packets import (
     MAXIMUM_FILTERS,
     Connect,
+    Pingreq,
+    Pingresp,
     Publish,
     Suback,
     Subscribe,
     Subscription,
+    Unsuback,
+    Unsubscribe,
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
@@ -190,6 +194,18 @@ def test_long_topics(join: Join, broker: Broker):
 # --- turns
 
 
+def take_turns(broker: Broker, peer: Peer, most: int = 1000) -> list[int]:
+    """Give the peer its turns until it wants no more; returns the effort of each."""
+    efforts: list[int] = []
+    while peer.wire.laters and len(efforts) < most:
+        peer.wire.laters -= 1
+        begun = broker.counters.effort
+        peer.client.send_on()
+        broker.flush()
+        efforts.append(broker.counters.effort - begun)
+    return efforts
+
+
 def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
     publisher = join("publisher")
     count = 3 * REPLAYED_A_TURN + 5
@@ -199,10 +215,7 @@ def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
     subscriber.subscribe("r/#")
     heard = subscriber.payloads()
     assert 0.9 * REPLAYED_A_TURN < len(heard) <= REPLAYED_A_TURN
-    while subscriber.wire.laters:
-        subscriber.wire.laters -= 1
-        subscriber.client.send_on()
-        broker.flush()
+    take_turns(broker, subscriber)
     assert len(heard + subscriber.payloads()) == count
 
 
@@ -211,7 +224,7 @@ def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access
     publisher = join("publisher")
     for number in range(REPLAYED_A_TURN + 5):
         publisher.publish(f"r/{number}", b"", 0)
-        broker.retained.set(f"r/{number}", Message(f"r/{number}", b"x", retain=True))
+        broker.retained.keep(Message(f"r/{number}", b"x", retain=True))
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
     assert subscriber.payloads() == [] and subscriber.wire.laters == 1
@@ -228,12 +241,69 @@ def test_what_one_client_sends_takes_turns(join: Join, broker: Broker):
     heard = len(subscriber.payloads())
     assert 0 < heard < count and peer.client.connection.paused
     peer.send(Publish("a", b"last").encode(5))  # what comes meanwhile waits its turn
-    while peer.wire.laters:
-        peer.wire.laters -= 1
-        peer.client.send_on()
-        broker.flush()
+    take_turns(broker, peer)
     payloads = subscriber.payloads()
     assert heard + len(payloads) == count + 1 and payloads[-1] == b"last"
+
+
+@pytest.mark.parametrize("limits", [Limits(subscriptions=MAXIMUM_FILTERS)])
+def test_a_packet_of_thousands_of_filters_takes_turns(
+    join: Join, broker: Broker, access: FakeAccess
+):
+    """Its answers come in their order nevertheless, and what is retained behind them."""
+    access.deny("user", Action.SUBSCRIBE, "f/7")
+    publisher, peer = join("publisher"), join("peer")
+    publisher.publish("f/1", b"kept", retain=True)
+    filters = [f"f/{number}" for number in range(MAXIMUM_FILTERS)]
+    wanted = [Subscription(name, 1) for name in filters]
+    packets = Subscribe(1, wanted), Pingreq(), Subscribe(2, [Subscription("f/7", 0)])
+    begun = broker.counters.effort
+    peer.send(*packets)
+    efforts = [broker.counters.effort - begun, *take_turns(broker, peer, 30)]
+    assert peer.received() == [] and 0 < len(peer.session.subscriptions) < MAXIMUM_FILTERS - 1
+    publisher.publish("f/0", b"meanwhile")
+    assert peer.payloads() == [b"meanwhile"]
+    efforts += take_turns(broker, peer)
+    assert len(efforts) > 80 and max(efforts) < 1.5 * EFFORT_A_TURN
+    answer, *rest = peer.received()
+    assert isinstance(answer, Suback) and answer.packet_id == 1
+    assert answer.reason_codes == [0x87 if name == "f/7" else 1 for name in filters]
+    assert sorted(type(packet).__name__ for packet in rest) == ["Pingresp", "Publish", "Suback"]
+
+    peer.send(Unsubscribe(3, filters), Pingreq())
+    assert peer.received() == []
+    assert len(take_turns(broker, peer)) > 20
+    answer, pong = peer.received()
+    assert isinstance(answer, Unsuback) and isinstance(pong, Pingresp)
+    assert answer.reason_codes == [0x11 if name == "f/7" else 0 for name in filters]
+    assert not peer.session.subscriptions
+
+
+def test_a_wrong_filter_behind_thousands_leaves_them_without_effect(join: Join, broker: Broker):
+    peer = join("peer", **lasting(5))
+    filters = [f"f/{number}" for number in range(1000)]
+    session = peer.session
+    peer.send(Subscribe(1, [Subscription(name, 1) for name in (*filters, "a/#/b")]))
+    take_turns(broker, peer)
+    assert peer.farewell() == ReasonCode.MALFORMED_PACKET
+    assert not session.subscriptions
+
+
+@pytest.mark.parametrize("end", ["lost", "taken over"])
+def test_who_goes_in_the_middle_of_a_long_packet_is_answered_nothing(
+    join: Join, broker: Broker, end: str
+):
+    peer = join("peer", **lasting(5))
+    peer.send(Subscribe(1, [Subscription(f"f/{number}", 1) for number in range(1000)]))
+    take_turns(broker, peer, 6)
+    assert 0 < len(peer.session.subscriptions) < 1000
+    if end == "lost":
+        peer.lose()
+        assert peer.received() == []
+    else:
+        join("peer", **lasting(5))
+        assert peer.farewell() == ReasonCode.SESSION_TAKEN_OVER
+    assert take_turns(broker, peer) == [0]
 
 
 @pytest.mark.parametrize("limits", [Limits(memory=200_000)])

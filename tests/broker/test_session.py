@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from appliance.broker.broker import Broker
+from appliance.broker.ledger import Ledger
 from appliance.broker.message import OVERHEAD, Message, Watched
 from appliance.broker.ports import Identity, Limits
-from appliance.broker.session import Held, Ledger, Session
+from appliance.broker.session import Held, Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, Will
 from appliance.mqtt.topics import matches
@@ -513,7 +514,7 @@ def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_
     assert peer.payloads() == [b"s"]
     assert counted.skipped == broker.counters.publish_dropped == 1
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE + b"2"]
 
@@ -534,7 +535,7 @@ def test_large_messages_go_one_by_one_and_behind_small_ones(broker: Broker, join
     peer.fast()
     assert peer.payloads() == []
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE, LARGE]
 
@@ -548,7 +549,7 @@ def test_retained_messages_that_are_large_are_all_sent(broker: Broker, join: Joi
     peer.subscribe("map/#")
     assert peer.payloads() == []
     peer.wire.behind = False
-    peer.client.caught_up()
+    peer.client.output.caught_up()
     broker.flush()
     assert len(peer.payloads()) == 20
     assert broker.counters.publish_dropped == 0

@@ -25,6 +25,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from appliance import certs
 from appliance.certs import CertificateError, addresses, authority, files
+from appliance.clock import RELEASED
 
 
 def load(path: Path) -> x509.Certificate:
@@ -91,7 +92,8 @@ def test_the_certificates(made: Path, file: str, purpose: x509.ObjectIdentifier)
     assert certificate.serial_number.bit_length() > 100
     now = datetime.now(timezone.utc)
     assert certificate.not_valid_before_utc < now - timedelta(hours=23)
-    assert certificate.not_valid_after_utc - now <= timedelta(days=825)
+    whole = certificate.not_valid_after_utc - certificate.not_valid_before_utc
+    assert whole == timedelta(days=825)  # Apple's systems count all of it
 
 
 def test_the_servers_names(made: Path) -> None:
@@ -185,16 +187,29 @@ def test_a_server_needs_a_name(made: Path) -> None:
         certs.issue_server(made, [], [])
 
 
-def test_a_clock_that_was_never_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_was_never_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What is made in 1970 is good when the clock is set, and for as long as any other."""
+
     class Clock(datetime):
         @classmethod
         def now(cls, tz=None) -> datetime:
             return datetime(1970, 1, 1, tzinfo=tz)
 
-    monkeypatch.setattr(authority, "datetime", Clock)
-    with pytest.raises(CertificateError, match="clock says 1970-01-01"):
-        certs.create_authority(tmp_path)
-    assert not list(tmp_path.iterdir())
+    for module in (authority, files):
+        monkeypatch.setattr(module, "datetime", Clock)
+    authority._tell_unset.cache_clear()
+    certs.create_authority(tmp_path)
+    certs.issue_server(tmp_path, NAMES, ADDRESSES)
+    monkeypatch.undo()
+    [told] = caplog.messages
+    assert "clock says 1970-01-01" in told and f"{RELEASED:%Y-%m-%d}" in told
+    ca, server = load(tmp_path / "ca.crt"), load(tmp_path / "server.crt")
+    for certificate in (ca, server):
+        assert certificate.not_valid_before_utc == RELEASED - timedelta(days=1)
+    assert server.not_valid_after_utc == RELEASED + timedelta(days=824)
+    assert ca.not_valid_after_utc == RELEASED + timedelta(days=3650)
 
 
 def test_a_write_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -342,9 +342,9 @@ def test_the_list(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [row[:3] for row in rows] == [
         ["ca", "authority", "3649"],
-        ["server", "server", "824"],
+        ["server", "server", "823"],
         ["lost", "client", "revoked"],
-        ["tablet", "client", "824"],
+        ["tablet", "client", "823"],
     ]
     assert run("cert", "list", "--all", "--json") == 0
     entries = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

@@ -7,7 +7,7 @@ import contextlib
 import random
 import ssl
 from collections.abc import Callable
-from datetime import timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
@@ -426,6 +426,64 @@ def test_renewal_without_the_authoritys_key_is_told(own: Path) -> None:
     (own / "ca.key").unlink()
     with pytest.raises(CertificateError, match=r"there is no .*ca\.key: only with"):
         certs.keep_server_certificate(files_of(own))
+
+
+# A clock that is not set yet, or was ahead
+
+
+def clock_at(monkeypatch: pytest.MonkeyPatch, moment: datetime) -> None:
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz=None) -> datetime:
+            return moment.astimezone(tz)
+
+    for module in (certs.authority, certs.contexts, certs.files, certs.renewal):
+        monkeypatch.setattr(module, "datetime", Clock)
+
+
+def test_client_certificates_in_1970(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until the clock is set, nobody is too early; who is too late, still is."""
+    company = Company()
+    company.issue(own / "late", "late", days=-30)
+    company.issue(own / "stranger", "stranger")
+    clock_at(monkeypatch, NOW + timedelta(days=3))
+    certs.issue_client(own, "early")
+    monkeypatch.undo()
+    ca = (own / "ca.crt").read_bytes()
+    (own / "ca.crt").write_bytes(ca + company.pem())
+    contexts = TlsContexts(files_of(own), ASKING)
+    early, late = client_of(ca, own / "clients/early"), client_of(ca, own / "late")
+    for client, why in ((early, "not yet valid"), (late, "expired")):
+        with pytest.raises(ssl.SSLError, match=why):
+            shake_hands(contexts, client)
+    clock_at(monkeypatch, datetime(1970, 1, 1, tzinfo=timezone.utc))
+    server, _ = shake_hands(contexts, early)
+    assert contexts.refusal(server) == ""
+    assert "expired on " in refusal_of(contexts, late)
+    other = Company("Other")
+    other.issue(own / "other", "other")
+    with pytest.raises(ssl.SSLError, match="certificate verify failed"):
+        shake_hands(contexts, client_of(ca, own / "other"))
+    clock_at(monkeypatch, NOW)
+    assert "is not valid before " in contexts.refusal(server)
+    clock_at(monkeypatch, NOW + timedelta(days=4))
+    assert contexts.refusal(server) == ""
+
+
+def test_a_certificate_made_by_a_clock_that_was_ahead(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = files_of(own)
+    certs.keep_server_certificate(files)
+    clock_at(monkeypatch, NOW + timedelta(days=1000))
+    assert certs.keep_server_certificate(files).startswith("it would have ended on ")
+    clock_at(monkeypatch, datetime(1970, 1, 1, tzinfo=timezone.utc))
+    assert certs.keep_server_certificate(files) == ""  # what is wrong is the clock
+    monkeypatch.undo()
+    assert certs.keep_server_certificate(files).startswith("it was not valid before ")
+    [certificate] = certs.load_certificates(files.certificate)
+    assert certificate.not_valid_before_utc < NOW < certificate.not_valid_after_utc
+    assert certs.keep_server_certificate(files) == ""
 
 
 # Bytes that nobody meant

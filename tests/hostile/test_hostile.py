@@ -9,6 +9,8 @@ from arena import Arena
 from attacks import ATTACKS
 from combat import Attack
 
+pytestmark = pytest.mark.timed
+
 SECONDS = 0.7
 SHORT = [attack for attack in ATTACKS.values() if attack.short]
 

@@ -178,15 +178,19 @@ def call_routes(*routes, **more):
 
 
 def service(ros, **kw):
-    return ServiceSettings(ros, kw.pop("mqtt", "r2d2{ros}"), **kw)
+    return ServiceSettings(names(ros), kw.pop("mqtt", "r2d2{ros}"), **kw)
 
 
 def action(ros, **kw):
-    return ActionSettings(ros, kw.pop("mqtt", "r2d2{ros}"), **kw)
+    return ActionSettings(names(ros), kw.pop("mqtt", "r2d2{ros}"), **kw)
 
 
-def parameters(node, name="*", **kw):
-    return ParameterSettings(node, name, kw.pop("mqtt", "r2d2{node}/_param"), **kw)
+def parameters(ros, **kw):
+    return ParameterSettings(names(ros), kw.pop("mqtt", "r2d2{node}/_param"), **kw)
+
+
+def names(ros):
+    return (ros,) if isinstance(ros, str) else tuple(ros)
 
 
 async def until(condition, what, deadline=DEADLINE):

@@ -8,6 +8,7 @@ SOURCE has `msg/*.msg`; PREFIX is what a workspace's `install` folder is. It tak
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -39,6 +40,7 @@ def build(source: Path, prefix: Path, name: str, dependencies: list[str]) -> Non
     definitions = sorted(source.glob("msg/*.msg"))
     for definition in definitions:
         convert_msg_to_idl(source, name, definition.relative_to(source), share / "msg")
+        shutil.copy(definition, share / "msg")
     index = prefix / "share/ament_index/resource_index/rosidl_interfaces"
     index.mkdir(parents=True)
     (index / name).write_text("".join(f"msg/{path.name}\n" for path in definitions))
@@ -51,6 +53,8 @@ def build(source: Path, prefix: Path, name: str, dependencies: list[str]) -> Non
     seen = [str(ROS / "share" / dependency) for dependency in dependencies]
     seen.append(str(prefix / "share" / name))
     hashes = HashTypeDescription("").generate_type_hashes(name, files, seen, package)
+    for description in package.glob("msg/*.json"):
+        shutil.copy(description, share / "msg")
     GenerateC("").generate(name, files, seen, package, hashes)
     implementation = ["rosidl_typesupport_fastrtps_c"]
     GenerateCTypesupport("", typesupport_implementations=implementation).generate(

@@ -7,12 +7,14 @@ import asyncio
 import pytest
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, until
+from call_house import AllTypes, House, action, call_routes, until
 
 from appliance.ros import actions as module
+from appliance.ros import requests
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
-from appliance.ros.node import FakeNode
+from appliance.ros.goals import STATUS, id_of
+from appliance.ros.node import Durability, FakeNode, QosProfile
 
 FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
 CONVERTERS = Converters(load_description)
@@ -33,7 +35,7 @@ class Walks:
             self._serve("get_result", f"{FIBONACCI}_GetResult", self.on_result),
             self._serve("cancel_goal", CANCEL, self.on_cancel),
         ]
-        self.status = house.node.add_publisher("/walk/_action/status", module.STATUS)
+        self.status = house.node.add_publisher("/walk/_action/status", STATUS)
 
     def _serve(self, name, type_name, handle):
         def on_request(cdr, respond):
@@ -57,6 +59,9 @@ class Walks:
 
     def on_cancel(self, request, answer):
         self.cancelled.append(request["goal_info"]["goal_id"]["uuid"])
+        if self.late:
+            answer({"return_code": 2})
+            return
         answer({"goals_canceling": [request["goal_info"]]})
 
     def finish(self, status=4):
@@ -115,7 +120,7 @@ async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
     await until(lambda: walks.results, "the result is asked for")
     walks.results.clear()
     # Another takes its place at once: its services were never seen to be away.
-    house.node.add_publisher("/walk/_action/status", module.STATUS)
+    house.node.add_publisher("/walk/_action/status", STATUS)
     await until(lambda: walks.results, "the other is asked")
     walks.finish(status=0)
     await until(lambda: results(client), "the result")
@@ -160,4 +165,58 @@ async def test_the_appliance_stops_with_goals_under_way(house):
     walks, client = await begin(house, cancel_on_disconnect=True)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await house.bridge.stop()
-    assert [module._id({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+    assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: walks.results, "the result is asked for")
+    changed = action("/walk", cancel_on_disconnect=True, keep_result=1)
+    house.bridge.calls.replace(call_routes(changed))
+    client.leave()
+    await until(lambda: walks.cancelled, "the goal is cancelled")
+    assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
+
+
+async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(house):
+    walks, client = await begin(house, cancel_on_disconnect=True)
+    await client.call(GOAL, {"order": 3})
+    house.bridge.calls.replace(call_routes())
+    await house.bridge.stop()
+    assert len(walks.cancelled) == 1
+
+
+async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(house):
+    """A server that is busy with accepting it knows of no such goal yet."""
+    walks, client = await begin(house, timeout=0.05)
+    walks.accepting = False
+    assert (await client.error(GOAL, {"order": 3}))[0] == "timeout"
+    await until(lambda: walks.cancelled, "the goal is cancelled, in vain")
+    latched = house.node.add_publisher(
+        "/walk/_action/status", STATUS, QosProfile(durability=Durability.TRANSIENT_LOCAL)
+    )
+    walks.late.pop()({"accepted": True})
+    status = {
+        "goal_info": {"goal_id": {"uuid": walks.cancelled[0]}},
+        "status": 2,
+    }
+    latched.publish(CONVERTERS.get(STATUS).from_dict({"status_list": [status]}))
+    await until(lambda: len(walks.cancelled) == 2, "the goal is cancelled")
+    latched.publish(CONVERTERS.get(STATUS).from_dict({"status_list": [status]}))
+    await asyncio.sleep(0.01)
+    assert len(set(walks.cancelled)) == 1 and len(walks.cancelled) == 2
+
+
+async def test_the_server_of_a_goal_vanishes_after_the_last_route(house, monkeypatch):
+    monkeypatch.setattr(requests, "IDLE_LOOKS", 2)
+    walks, client = await begin(house)
+    await client.call(GOAL, {"order": 3})
+    await until(lambda: walks.results, "the result is asked for")
+    house.bridge.calls.replace(call_routes())
+    walks.vanish()
+    await until(lambda: results(client), "the result")
+    assert client.payloads(results(client)[0].topic)[0]["error"]["code"] == "vanished"
+    for _ in range(4):
+        house.node.spin()
+    assert house.node.clients == []

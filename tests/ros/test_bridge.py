@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
 import struct
 import time
 
 import pytest
+from house import until
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -644,7 +646,7 @@ def test_echo_knows_padding_and_forgets(monkeypatch):
 
 
 async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
-    house.node.start = lambda poll, failed: None
+    house.node.start = lambda poll, failed, loop: None
     house.start(to_ros("/cmd_vel", type=TWIST))
     assert house.routes() == []
     house.client.send("r2d2/cmd_vel", b"{}")
@@ -653,14 +655,62 @@ async def test_start_returns_before_ros_is_there_and_stop_may_come_twice(house):
     await house.bridge.stop()
 
 
-async def test_ros_missing_is_one_clear_line(house, caplog):
-    house.node.start = lambda poll, failed: failed("there is no ROS 2 here")
+async def test_ros_missing_is_one_clear_line_and_tried_again(house, caplog, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.01)
+    start, attempts = house.node.start, []
+
+    def fail(poll, failed, loop):
+        attempts.append(asyncio.get_running_loop().time())
+        if len(attempts) < 5:
+            failed("there is no ROS 2 here")
+        else:
+            start(poll, failed, loop)
+
+    house.node.start = fail
     bridge = house.start(to_mqtt("/a"), to_ros("/b"))
     await house.settle()
-    assert [r.getMessage() for r in caplog.records] == [
-        "there is no bridge to ROS: there is no ROS 2 here"
+    assert bridge.problem == "there is no ROS 2 here" and bridge.state == "waiting"
+    await until(lambda: bridge.state == "joined")
+    assert [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING] == [
+        "there is no bridge to ROS: there is no ROS 2 here (it is tried again, at least every 60 s)"
     ]
-    assert bridge.problem == "there is no ROS 2 here"
+    pauses = [later - earlier for earlier, later in itertools.pairwise(attempts)]
+    assert all(pause > 0.009 * 2**number for number, pause in enumerate(pauses))
+    assert bridge.problem is None
+
+
+async def test_a_stop_ends_the_attempts(house, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.001)
+    house.node.start = lambda poll, failed, loop: failed("there is no ROS 2 here")
+    await house.start(to_mqtt("/a")).stop()
+    house.node.start = None
+    await asyncio.sleep(0.01)
+
+
+async def test_a_bus_that_comes_back_is_joined_again(house, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.001)
+    node = house.node
+    bridge = house.start(to_mqtt("/a"), to_mqtt("/many/*"), to_ros("/b", type=TWIST))
+    peer, match = node.add_publisher("/a", STRING), node.add_publisher("/many/x", STRING)
+    await house.settle()
+    assert len(house.routes()) == 3
+    for _ in range(2):
+        node.fail("the daemon died")
+        await house.settle()
+        assert bridge.state == "lost" and bridge.peers is None and house.routes() == []
+        await until(lambda: bridge.state == "joined")
+        node.spin()
+        await house.settle()
+        assert len(house.routes()) == 3
+        house.client.received.clear()
+        for sender in (peer, match):
+            sender.publish(string("again"))
+        house.client.send("r2d2/b", b"{}")
+        await house.settle()
+        for topic in ("r2d2/a", "r2d2/many/x"):
+            assert house.client.payloads(topic) == [b'{"data":"again"}']
+        assert house.status("to_ros").errors == 0
+    assert bridge.peers == 1
 
 
 async def test_when_the_node_ends_nothing_is_bridged(house):
@@ -810,3 +860,25 @@ def test_a_closed_loop_is_no_error():
     bridge.start()
     loop.close()
     node.add_publisher("/a", STRING).publish(string("late"))
+
+
+async def test_what_is_taken_on_the_loops_thread_is_on_mqtt_at_once_and_behind_what_waits(house):
+    publisher = house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", keep=10, encoding="text"))
+    publisher.publish(string("in the mailbox"))
+    house.node.takes_on_loop = True
+    publisher.publish(string("behind it"))
+    assert house.client.payloads("r2d2/a") == []
+    await house.settle()
+    publisher.publish(string("at once"))
+    assert house.client.payloads("r2d2/a") == [b"in the mailbox", b"behind it", b"at once"]
+    assert house.status().messages == 3
+
+
+async def test_what_there_was_no_room_for_on_ros_is_counted(house):
+    house.node.add_publisher("/a", STRING)
+    house.start(to_mqtt("/a", encoding="text"))
+    (subscription,) = house.node.subscriptions
+    subscription.on_loop([(string("x"), 0)], 3)
+    assert house.status().dropped == 3
+    assert house.client.payloads("r2d2/a") == [b"x"]

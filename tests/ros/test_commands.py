@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import struct
 import time
 
@@ -11,13 +12,16 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
-from appliance.broker.message import Late
+from appliance.broker.message import Late, Message
 from appliance.broker.ports import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Disconnect, Publish, Pubrel, Will
+from appliance.ros.backlog import EXPECTED, Backlog
 from appliance.ros.bridge import RouteSettings
+from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import Converter
+from appliance.ros.node import Durability, Endpoint, FakePeer, QosProfile
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
@@ -360,7 +364,11 @@ async def test_who_drives_and_falls_silent_is_disconnected(house):
     assert driver.wire.written == Disconnect(0x98).encode(5)
     driver.drive()
     assert house.robot.received == [twist(0.5), STOP]
-    Driver(house.broker, "a").drive()
+    driver = Driver(house.broker, "a")
+    driver.drive()  # what it had queued, perhaps
+    assert house.robot.received == [twist(0.5), STOP]
+    await asyncio.sleep(AFTER + 0.02)
+    driver.drive()
     assert house.robot.received[-1] == twist(0.5)
 
 
@@ -599,3 +607,147 @@ def test_limits_reach_into_arrays_of_messages():
 def test_limits_that_a_type_cannot_have(type_name, rules, problem):
     with pytest.raises(ConversionError, match=problem):
         limits(type_name, **rules)
+
+
+async def test_no_answer_to_a_call_is_a_command(house):
+    """It would come late, as the appliance's own, and outlive the client that asked for it."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    board = house.bridge.calls.board
+
+    async def slow(call):
+        return Answer(GO)
+
+    offer = Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), slow)
+    board.offer(offer)
+    driver = Driver(house.broker, "a")
+    properties = {Property.RESPONSE_TOPIC: TOPIC}
+    driver.say(Publish("r2d2/slow/_call", b"", properties=properties))
+    await asyncio.sleep(0.02)
+    board.withdraw(offer)
+    assert house.robot.received == []
+
+
+class TestBacklog:
+    """On times of its own."""
+
+    NEW = Message(TOPIC, GO)
+
+    def begin(self):
+        backlog = Backlog()
+        assert backlog.has(Late(self.NEW, math.inf), self, 0.5, 100.0)
+        return backlog
+
+    def test_it_takes_longer_than_a_command_may(self):
+        """Bursts of it, as the acknowledgements let them through, over a slow network."""
+        backlog, now = self.begin(), 100.0
+        for burst in range(20):
+            now = 100.0 + 0.4 * burst
+            assert all(backlog.has(self.NEW, self, 0.5, now + 0.001 * n) for n in range(5))
+        # Commands as they are made, of which one or the other pair comes together.
+        assert backlog.has(self.NEW, self, 0.5, now + 0.4)
+        assert backlog.has(self.NEW, self, 0.5, now + 0.401)
+        assert not backlog.has(self.NEW, self, 0.5, now + 0.52)
+        assert not backlog.has(self.NEW, self, 0.5, now + 0.521)
+
+    def test_who_is_always_fast_is_heard_again(self):
+        backlog = self.begin()
+        times = [100.0 + 0.002 * n for n in range(40_000)]
+        heard = next(now for now in times if not backlog.has(self.NEW, self, 0.5, now))
+        assert 150 < heard < 161
+
+    def test_clients_whose_return_is_expected_are_bounded(self):
+        backlog = Backlog()
+        for number in range(2 * EXPECTED):
+            backlog.expect(str(number))
+        assert len(backlog._expected) == EXPECTED
+
+
+async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
+    """Libraries queue what is said without a connection, and send it as if it were new."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    driver.cut()
+    assert house.robot.received == [twist(0.5), STOP]
+    driver = Driver(house.broker, "a")
+    for _ in range(50):
+        driver.drive(qos=1)
+    assert house.robot.received == [twist(0.5), STOP]
+    await asyncio.sleep(1.2 * AFTER)
+    driver.drive(b"{}")  # it stops by itself, and is trusted when it comes back
+    assert house.robot.received == [twist(0.5), STOP, STOP]
+    driver.cut()
+    Driver(house.broker, "a").drive()
+    assert house.robot.received == [twist(0.5), STOP, STOP, twist(0.5)]
+
+
+async def test_a_stop_message_that_may_have_been_lost_is_published_again(house):
+    """A publisher that was made anew has not found the robot yet: what it sends goes nowhere."""
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    house.node.spin()
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    latched = QosProfile(durability=Durability.TRANSIENT_LOCAL)
+    house.node.add_subscriber("/cmd_vel", TWIST, latched)  # for which the publisher is made anew
+    house.robot.received.clear()
+    driver.cut()
+    assert house.robot.received == [STOP]
+    for _ in range(3):
+        house.node.spin()
+        await asyncio.sleep(0.01)
+    assert house.robot.received == [STOP, STOP]
+
+
+async def test_retained_commands_of_more_topics_than_one_turn_is_for(house):
+    """A network client goes on in its next turn; the bridge has to be given one."""
+    rules = CommandRules(take_retained=True)
+    names = [f"/arm/joint_{number}" for number in range(300)]
+    for name in names:
+        house.client.send(f"r2d2{name}", GO, retain=True)
+    robots = [FakePeer(house.node, name, Endpoint("/robot", TWIST, QosProfile())) for name in names]
+    house.node.remote_subscribers += robots
+    House.start(
+        house, *(RouteSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
+    )
+    for _ in range(3):
+        house.node.spin()
+        await house.settle()
+    assert [robot.received for robot in robots] == [[twist(0.5)]] * 300
+    house.client.send(f"r2d2{names[-1]}", b"{}")  # nothing is left that others would wait behind
+    assert robots[-1].received == [twist(0.5), STOP]
+
+
+@pytest.mark.parametrize(("low", "high"), [(1e-50, 1.0), (-1.0, -1e-50)])
+def test_a_bound_that_is_next_to_zero(low, high):
+    converter = Converter(load_description("std_msgs/msg/Float32"), time.time_ns)
+    limits = FieldLimits(CommandRules(clamp=(("data", low, high),)), converter)
+    for number in (0.0, -0.0, -5.0, 5.0, 1e-45, -1e-45):
+        limited, _ = limits.apply(converter.from_dict({"data": number}))
+        assert low <= converter.to_dict(limited)["data"] <= high
+
+
+@pytest.mark.parametrize("now", [b"", b'{"linear":{"x":0.1}}'])
+async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(house, now):
+    house.client.send(TOPIC, GO, retain=True)
+    rules = CommandRules(take_retained=True)
+    House.start(house, RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
+    await house.settle()
+    house.client.send(TOPIC, now, retain=True)
+    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    robot.received.clear()
+    for _ in range(3):
+        house.node.spin()
+        await house.settle()
+    assert robot.received == ([twist(0.1)] if now else [])
+
+
+async def test_what_a_driver_had_queued_while_the_appliance_was_away(house):
+    away = Driver(house.broker, "a", clean=False, expiry=60)
+    away.cut()
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    for _ in range(50):
+        driver.drive(qos=1)
+    assert house.robot.received == []
+    Driver(house.broker, "b").drive()
+    assert house.robot.received == [twist(0.5)]

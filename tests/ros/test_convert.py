@@ -7,6 +7,7 @@ import json
 import math
 import random
 import struct
+import sys
 
 import orjson
 import pytest
@@ -682,3 +683,33 @@ def test_a_large_payload_must_be_exact():
     assert len(converter.to_dict(converter.from_json(exact))["poses"]) == 3100
     with pytest.raises(ConversionError, match="has not exactly the fields of"):
         converter.from_json(b'{"poses":[' + b"{}," * 100_000 + b"{}]}")
+
+
+def test_text_that_rclpy_cannot_read_is_not_handed_on_in_cdr():
+    converter = Converters(load_description).get("test_msgs/msg/WStrings")
+    cdr = converter.from_json(b'{"wstring_value": "ab"}')
+    lone = cdr.replace(b"b\0\0\0", b"\x00\xd8\0\0", 1)
+    assert converter.to_dict(lone)["wstring_value"] == "a\ufffd"
+    with pytest.raises(ConversionError, match="wstring_value: not UTF-16"):
+        converter.checked(lone)
+
+
+def test_text_in_cdr_keeps_to_its_bound():
+    converters = Converters(load_description)
+    cdr = b"\0\1\0\0" + struct.pack("<I24s", 24, b"x" * 23)
+    bounded = compile_converter(TypeDescription("a/msg/B", (Field("data", String(22)),)))
+    assert bounded.to_dict(cdr) == {"data": "x" * 23}
+    with pytest.raises(ConversionError, match="data: 23 bytes of UTF-8, at most 22"):
+        bounded.checked(cdr)
+    assert converters.get("std_msgs/msg/String").checked(cdr) == cdr
+
+
+def test_a_type_name_does_not_get_just_anything_imported(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "broken_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "broken_msgs" / "msg" / "__init__.py").write_text("1 / 0")
+    with pytest.raises(UnknownTypeError, match="broken_msgs is broken: ZeroDivisionError"):
+        import_message("broken_msgs/msg/A")
+    with pytest.raises(UnknownTypeError, match="this is not a package of messages"):
+        import_message("this/msg/A")
+    assert "this" not in sys.modules

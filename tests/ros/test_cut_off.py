@@ -18,6 +18,8 @@ pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
 from test_ros2 import TWIST, Peer, domain, until
 
+pytestmark = pytest.mark.timed
+
 __all__ = ["domain"]  # a fixture for all tests here
 
 AFTER = 0.3

@@ -44,9 +44,9 @@ VALUE = {
 }
 
 
-@pytest.fixture
-def workspace(tmp_path):
-    source, prefix = tmp_path / "rover_msgs", tmp_path / "install"
+def build_workspace(folder):
+    """Build the package rover_msgs; returns what a workspace's `install` folder is."""
+    source, prefix = folder / "rover_msgs", folder / "install"
     (source / "msg").mkdir(parents=True)
     for name, text in DEFINITIONS.items():
         (source / f"msg/{name}.msg").write_text(text)
@@ -60,6 +60,11 @@ def workspace(tmp_path):
     )
     assert built.returncode == 0, built.stdout + built.stderr
     return prefix
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    return build_workspace(tmp_path)
 
 
 @pytest.fixture

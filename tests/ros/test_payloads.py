@@ -244,7 +244,8 @@ def test_every_encoding_can_be_compressed(encoding):
 @pytest.mark.parametrize(
     ("payload", "properties", "problem"),
     [
-        (b"{}", {Property.USER_PROPERTY: [("ros-type", TWIST)]}, f"says to be {TWIST}"),
+        (b"{}", {Property.USER_PROPERTY: [("ros-type", TWIST)]}, f"says to be '{TWIST}'"),
+        (b"{}", {Property.USER_PROPERTY: [("ros-type", "x\n" * 999)]}, "x\\n'…, /chatter carries"),
         (b"\xa0", {Property.CONTENT_TYPE: "application/cbor"}, "the route takes json"),
     ],
 )
@@ -334,3 +335,25 @@ async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
     # What was saved before the first, and what came in since; one may have been too large.
     assert 59 <= len(house.client.payloads("r2d2/chatter")) <= 61
     assert house.status().throttled == 500 - len(house.client.payloads("r2d2/chatter"))
+
+
+def test_what_is_too_large_is_not_converted():
+    text = unpacker(CONVERTERS.get(STRING), "json", "none", 100)
+    assert text(b'{"data": "x"}' + b" " * 87) == string("x")
+    with pytest.raises(ConversionError, match=r"it has 101 bytes, at most 100 .*limits.payload"):
+        text(b'{"data": "x"}' + b" " * 88)
+    small = zstandard.compress(b'{"data": "x"}' + b" " * 88)
+    with pytest.raises(ConversionError, match="it has 101 bytes"):
+        unpacker(CONVERTERS.get(STRING), "json", "zstd", 100)(small)
+
+
+async def test_what_takes_long_ends_the_turn_of_its_sender(house):
+    """However few bytes it is: others are served in between."""
+    house.start(both("/chatter", type=STRING, compression="zstd"))
+    counters = house.broker.counters
+    before = counters.effort
+    house.client.send("r2d2/chatter", b'{"data": "x"}')
+    little = counters.effort - before
+    payload = b'{"data": "' + b"x" * 1_000_000 + b'"}'
+    house.client.send("r2d2/chatter", zstandard.compress(payload))
+    assert counters.effort - before - little > 200 > little

@@ -13,6 +13,7 @@ import threading
 import uuid
 from pathlib import Path
 
+import cbor2
 import pytest
 import yaml
 from appliance_process import ApplianceProcess, eventually
@@ -56,6 +57,9 @@ topic readwrite answers/#
 
 user mallory
 topic write r2d2/turtle/pen/_call/#
+topic write r2d2/turtle/walk/_goal/#
+topic write r2d2/turtle/walk/_cancel/#
+pattern read r2d2/turtle/walk/_reply/%c/#
 topic readwrite answers/#
 """
 
@@ -143,8 +147,10 @@ class Client:
             self._changed.notify_all()
 
     def _on_message(self, client, userdata, message):
-        payload = json.loads(message.payload) if message.payload else None
         about = message.properties if self.version == V5 else None
+        is_cbor = getattr(about, "ContentType", None) == "application/cbor"
+        loads = cbor2.loads if is_cbor else json.loads
+        payload = loads(message.payload) if message.payload else None
         self._put(("message", message.topic, payload, message.retain, about))
 
     def _wait(self, condition, what):
@@ -316,6 +322,9 @@ def test_the_command_shows_what_can_be_called(appliance):
         ],
     ):
         assert line in lines
+    (counts,) = (line for line in done.stdout.splitlines() if line.startswith("skipped: "))
+    assert "1 not there" in counts
+    assert ["/turtle/absent", "service", "no", "node", "offers", "it"] in lines
 
 
 @both
@@ -466,6 +475,53 @@ def test_a_goal_cancelled_half_way(client_of, robot, version):
     assert 2 < len(result["result"]["sequence"]) < 100
     code, message = client.error(f"{WALK}/_cancel", {"goal_id": goal})
     assert (code, message) == ("unknown_goal", "the goal has ended already")
+
+
+def test_a_robot_that_is_driven_in_cbor(client_of, robot, appliance):
+    client = client_of(V5)
+
+    def call(topic, payload):
+        properties = {
+            "ResponseTopic": f"answers/{client.name}",
+            "ContentType": "application/cbor",
+        }
+        assert client.publish(topic, cbor2.dumps(payload), **properties) == 0
+        payload, _, about = client._take("message", f"answers/{client.name}")
+        assert about.ContentType == "application/cbor"
+        return payload
+
+    assert call(f"{TURTLE}/pen/_call", {"data": True}) == {"success": True, "message": "down"}
+    assert call(f"{PARAM}/speed/set", 1.25) == {"successful": True, "reason": ""}
+    error = call(f"{WALK}/_goal", {"order": "far"})["error"]
+    assert error["code"] == "bad_request" and error["message"].startswith("order: ")
+    client.subscribe(f"{WALK}/_feedback/+", f"{WALK}/_result/+")
+    accepted = call(f"{WALK}/_goal", {"order": 200})
+    goal = accepted["goal_id"]
+    other = call(f"{WALK}/_goal", {"order": 201})["goal_id"]
+    assert client.next(f"{WALK}/_feedback/{goal}")["sequence"][:1] == [0]  # the route's own: JSON
+    # What the goal's answer gave cancels that goal, and no other.
+    assert call(f"{WALK}/_cancel", accepted) == {"goals_canceling": [goal]}
+    assert client.next(f"{WALK}/_result/{goal}")["status"] == "canceled"
+    assert client.payloads(f"{WALK}/_result/{other}") == []
+    # Up to the time of the first: the second is later. Then up to now.
+    assert call(f"{WALK}/_cancel", {"stamp": accepted["stamp"]}) == {"goals_canceling": []}
+    assert call(f"{WALK}/_cancel", {"stamp": "now"}) == {"goals_canceling": [other]}
+    assert client.next(f"{WALK}/_result/{other}")["status"] == "canceled"
+
+
+def test_only_one_s_own_goals_are_cancelled_by_who_may_no_more(client_of):
+    alice, mallory = client_of(V5), client_of(V311, "mallory")
+    alice.subscribe(f"{WALK}/_result/+")
+    hers = alice.call(f"{WALK}/_goal", {"order": 300})["goal_id"]
+    his = mallory.call(f"{WALK}/_goal", {"order": 301})["goal_id"]
+    for payload in ({"goal_id": hers}, {"all": True}, {"goal_id": "00" * 16}):
+        code, message = mallory.error(f"{WALK}/_cancel", payload)
+        assert code == "not_authorized" and f"{WALK}/_cancel_any" in message
+    assert mallory.call(f"{WALK}/_cancel", {"goal_id": his}) == {"goals_canceling": [his]}
+    assert alice.next(f"{WALK}/_result/{his}")["status"] == "canceled"
+    assert alice.payloads(f"{WALK}/_result/{hers}") == []
+    assert alice.call(f"{WALK}/_cancel", {"all": True}) == {"goals_canceling": [hers]}
+    assert alice.next(f"{WALK}/_result/{hers}")["status"] == "canceled"
 
 
 def test_goals_that_are_refused(client_of):

@@ -122,6 +122,39 @@ async def test_no_request_ends_the_thread():
     await asyncio.to_thread(node.stop)
 
 
+async def test_names_that_only_dds_takes_are_passed_over():
+    """Of another vendor's tools, or by a stranger: asking ROS about one ended the bridge."""
+    node = ros2.Ros2Node()
+    looked, failures = [], []
+    odd = ["/a//b", "/a/", "/1a", "/a+b", "/" + "x" * 300]
+
+    def look():
+        own, node._node = node._node, Odd(node._node)
+        looked.append((node.topics(), node.services()))
+        node._node = own
+
+    class Odd:
+        def __init__(self, own):
+            self.own = own
+
+        def get_topic_names_and_types(self):
+            return [(name, ["std_msgs/msg/String"]) for name in ("/fine", *odd)]
+
+        def get_node_names_and_namespaces(self):
+            return [("no name", "/"), *self.own.get_node_names_and_namespaces()]
+
+        def get_service_names_and_types_by_node(self, *of):
+            self.own.get_service_names_and_types_by_node(*of)
+            return [(name, ["std_srvs/srv/Trigger"]) for name in ("/fine", *odd)]
+
+    node.start(look, failures.append)
+    await until(lambda: looked or failures, "a look")
+    await asyncio.to_thread(node.stop)
+    assert failures == []
+    topics, services = looked[0]
+    assert set(topics) == set(services) == {"/fine"}
+
+
 class House:
     """Broker, bridge and an MQTT client, as in test_bridge.py, on a real node."""
 
@@ -281,7 +314,7 @@ async def test_images_pass_through_the_larger_shared_memory(house):
     await until(lambda: house.bridged(), "the node")
     assert max(size for name, size in shared_memory().items() if name not in before) > 32 << 20
     profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
-    assert list(profile.values()) == [str(Path(ros2.__file__).parent.parent / "fastdds.xml")]
+    assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent.parent]
     peer = await Peer().start("camera", **profile)
     try:
         await peer.do("advertise", "/image", BYTES)
@@ -404,13 +437,22 @@ def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
         {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
         {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
         {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
-        {"ROS_LOCALHOST_ONLY": "1"},
     ],
 )
 def test_the_users_own_settings_of_fast_dds_go_first(environment):
     before = dict(environment)
     assert not ros2.use_fastdds_profile(environment)
     assert environment == before
+
+
+def test_fast_dds_2_has_a_variable_of_its_own_and_goes_nowhere_else(tmp_path, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    (tmp_path / "share" / "fastrtps").mkdir(parents=True)
+    environment = {"ROS_LOCALHOST_ONLY": "1"}
+    assert not ros2.use_fastdds_profile(environment)
+    environment["ROS_LOCALHOST_ONLY"] = "0"
+    assert ros2.use_fastdds_profile(environment)
+    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
 def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
@@ -420,6 +462,15 @@ def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
     assert [Path(value).is_file() for value in environment.values()] == [True]
     Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
     assert not ros2.use_fastdds_profile({})
+
+
+def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(monkeypatch):
+    environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    assert not ros2.use_fastdds_profile(environment)
+    monkeypatch.setattr(ros2, "_resources", lambda kind: ["fastrtps"])
+    assert ros2.use_fastdds_profile(environment)
+    profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "UDPv4" in profile and "SHM" not in profile
 
 
 # The demo robot

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 import yaml
 
+from appliance import config
+from appliance.doctor import ros as doctor
 from appliance.environment import for_other_programs
 from appliance.ros import ros2
 from appliance.ros.bridge import Bridge
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import STRING, House, Peer, domain, route, until
+from test_ros2 import STRING, House, Peer, domain, route, string, until
 
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
 from appliance.ros.diagnostics import TYPE
+from appliance.ros.graph import CallRoutes, ServiceSettings
+from appliance.ros.reach import Reach, reach
 
 __all__ = ["domain"]  # a fixture for all tests here
 
@@ -112,6 +120,119 @@ async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
     assert "not a remapping" in house.bridge.problem
 
 
+def test_latency_is_that_of_a_clock_that_was_set_meanwhile(monkeypatch):
+    """What is measured is what has come since the subscription, whatever the clock says now."""
+    wall, counted = 2_000 * 10**9, 500 * 10**9
+    since = counted - 10 * 10**9
+    monkeypatch.setattr(ros2.time, "monotonic_ns", lambda: counted)
+    for jump in (0, 3600, -3600, 10**9, -(10**9)):
+        now = wall + jump * 10**9
+        monkeypatch.setattr(ros2.time, "time_ns", lambda now=now: now)
+        for age, is_timed in ((10**6, True), (9 * 10**9, True), (11 * 10**9, False)):
+            published_at = ros2._published_at({"source_timestamp": now - age}, since)
+            assert published_at == (now - age if is_timed else 0)
+
+
+async def test_the_doctor_sees_who_is_there(start, peer):
+    settings = config.loads("bridge: {topics: []}", Path("appliance.yaml"))
+    found = await asyncio.to_thread(lambda: list(doctor.ros(settings, None)))
+    by_subject = {finding.subject: finding for finding in found}
+    assert by_subject["ROS nodes"].text.startswith("seen: 1 (/peer), with ")
+    assert by_subject["ROS"].level == by_subject["ROS network"].level == "ok"
+    house = start()
+    await until(lambda: house.bridge.peers == 1, "the peer")
+    running = {"ros": {"state": "joined", "node": "/appliance"}}
+    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    assert [finding.text.partition(",")[0] for finding in found] == ["seen: 1 (/peer)"]
+    running["ros"]["node"] = "/elsewhere"
+    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    assert [finding.level for finding in found] == ["problem"]
+    assert "/elsewhere, is not seen" in found[0].text
+
+
+async def test_a_bus_that_is_late_is_joined_when_it_is_there(start, peer, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_of_tomorrow")
+    house = start(route("/a", "mqtt", "text"))
+    await until(lambda: house.bridge.problem, "the problem")
+    assert "rmw_of_tomorrow, which is not installed here" in house.bridge.problem
+    assert house.bridge.state == "waiting"
+    monkeypatch.delenv("RMW_IMPLEMENTATION")
+    await until(lambda: house.bridge.state == "joined", "the bus")
+    await peer.do("advertise", "/a", STRING)
+    await peer.do("matched", "/a")
+    await peer.do("publish", "/a", (b"\0\1\0\0\x02\0\0\0x\0").hex())
+    await until(lambda: house.payloads("r2d2/a") == [b"x"], "the message from ROS")
+    await until(lambda: house.bridge.peers == 1, "the peer")
+
+
+async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
+    """All is set up again: topics both ways, services, what is told on /diagnostics."""
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    house = start(
+        route("/a", "mqtt", "text"), route("/b", "ros", "text", type=STRING), diagnostics=0.1
+    )
+    offered = ServiceSettings(ros="/ask", mqtt="r2d2{ros}", to="mqtt", type="std_srvs/srv/Trigger")
+    house.bridge.calls.replace(CallRoutes(services=(offered,)))
+    await peer.do("advertise", "/a", STRING)
+    await peer.do("subscribe", "/b", STRING)
+    await peer.do("subscribe", "/diagnostics", TYPE)
+    await until(lambda: len(house.bridged()) == 2, "both")
+    for word in ("before", "after"):
+        await peer.do("matched", "/a")
+        await peer.do("publish", "/a", string(word).hex())
+        await until(lambda word=word: house.payloads("r2d2/a")[-1:] == [word.encode()], word)
+
+        def arrives(word=word):
+            house.send("r2d2/b", word.encode())
+            return any(topic == "/b" and word.encode().hex() in cdr for topic, cdr in peer.received)
+
+        await until(arrives, f"{word} on ROS")
+        peer.received.clear()
+        await until(lambda: any(topic == "/diagnostics" for topic, _ in peer.received), "health")
+        seen = {}
+        house.node.call_soon(lambda seen=seen: seen.update(house.node.services()))
+        await until(lambda seen=seen: "/ask" in seen, "the service")
+        if word == "before":
+            house.node._rclpy.shutdown(context=house.node._context)
+            await until(lambda: house.bridge.state == "lost", "the loss")
+            await until(lambda: house.bridge.state == "joined", "the return")
+            await until(lambda: len(house.bridged()) == 2, "both again")
+
+
+async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
+    monkeypatch.setattr(ros2, "reach", lambda: found)
+    found = Reach.THIS_COMPUTER
+    house = start(route("/a", "mqtt", "text"))
+    await until(lambda: house.bridge.peers == 1, "the peer")
+    await asyncio.sleep(0.5)
+    assert house.bridge.state == "joined"
+    first, found = house.node._context, Reach.NETWORK
+    await until(lambda: house.bridge.state == "lost", "the new start")
+    assert house.bridge.problem == "there was no network yet when it was joined, and is now"
+    await until(lambda: house.bridge.peers == 1, "the peer again")
+    assert house.node._context is not first
+
+
+def test_how_far_one_can_be_heard(monkeypatch):
+    up, down = SimpleNamespace(isup=True), SimpleNamespace(isup=False)
+    states = {"lo": up, "eth0": down}
+    ends = {
+        name: [SimpleNamespace(family=socket.AF_INET, address=address)]
+        for name, address in (("lo", "127.0.0.1"), ("eth0", "10.0.0.1"), ("gone", "10.0.0.2"))
+    }
+    monkeypatch.setattr(psutil, "net_if_stats", lambda: states)
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: ends)
+    assert reach({}) is Reach.THIS_COMPUTER
+    states["eth0"] = up
+    assert reach({}) is Reach.NETWORK
+    assert reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is Reach.THIS_COMPUTER
+    states["lo"] = states["eth0"] = down
+    assert reach({}) is Reach.NOBODY
+
+
 @pytest.mark.parametrize(
     "node", [{"use_sim_time": True}, {"arguments": ["-p", "use_sim_time:=true"]}]
 )
@@ -184,8 +305,10 @@ async def test_the_appliance_tells_how_it_is_on_ros_on_mqtt_and_at_its_door(tmp_
         )
         assert topic["messages"] > 0
         assert topic["latency_ms"]["p50"] > 0
-        heading, row = (await ask()).stdout.splitlines()
+        heading, row, *skipped = (await ask()).stdout.splitlines()
         assert heading.split()[:3] == ["ROS", "MQTT", "TYPE"]
         assert row.split()[:4] == ["/some/text", "→", f"{ROBOT}/some/text", STRING]
+        assert skipped[:2] == ["", "skipped: 1 left out"]
+        assert skipped[2].split() == ["/some/raw", "→", STRING, "left", "out", "by", "!/some/raw"]
     finally:
         appliance.stop()

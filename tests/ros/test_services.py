@@ -15,6 +15,7 @@ from appliance.broker.message import Late, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros import calls
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls import CallLimits
 from appliance.ros.convert import Converters
@@ -306,7 +307,10 @@ async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(hous
 
 
 async def test_patterns_follow_the_bus(house):
-    house.start(service("/arm/*", type="std_srvs/srv/*"), service("/**"), service("!/arm/secret"))
+    house.start(
+        service(["/arm/*", "!/arm/secret"], type="std_srvs/srv/*"),
+        service(["/absent", "/**", "!/arm/secret"]),
+    )
     node = house.node
     Switch(house, "/arm/grip")
     other = Switch(house, "/other")
@@ -317,7 +321,7 @@ async def test_patterns_follow_the_bus(house):
     await asyncio.sleep(0)
     first, second = house.bridge.calls.status()
     assert first.names == ("/arm/grip",)
-    assert second.names == ("/other",)
+    assert set(second.names) == {"/absent", "/other"}
     client = house.client("alice")
     assert (await client.call("r2d2/arm/grip/_call"))[0] == "ok"
     routes = house.retained("r2d2/_appliance/routes")
@@ -331,7 +335,7 @@ async def test_patterns_follow_the_bus(house):
     other.service.remove()
     node.spin()
     await asyncio.sleep(0)
-    assert house.bridge.calls.status()[1].names == ()
+    assert house.bridge.calls.status()[1].names == ("/absent",)
     assert [r["ros"] for r in house.retained("r2d2/_appliance/routes")] == ["/arm/grip"]
 
 
@@ -493,3 +497,94 @@ async def test_bridges_without_calls_ask_nothing_of_the_graph(house):
     bridge = house.start()
     assert isinstance(bridge, Bridge)
     house.node.spin()
+
+
+async def test_a_client_id_with_a_slash_gives_no_way_into_the_answers_of_another(house):
+    house.start(service("/switch"))
+    switch = Switch(house)
+    house.rules.deny("alice/1", "publish", "r2d2/switch/_reply")
+    alice = house.client("alice", "r2d2/switch/_reply/alice/+")
+    mallory = house.client("alice/1")
+    for topic in ("r2d2/switch/_reply/alice/1", "r2d2/switch/_reply/alice/1/2"):
+        mallory.send(CALL, {"data": True}, response_topic=topic)
+    plus = house.client("a/+")
+    plus.send(CALL, {"data": True}, response_topic="r2d2/switch/_reply/a/+")
+    await until(lambda: house.counters().errors.total() == 3, "the refusals")
+    await asyncio.sleep(0.02)
+    assert house.counters().errors == {"not_authorized": 2, "bad_request": 1}
+    assert switch.asked == [] and alice.received == []
+    status, _ = await mallory.call(CALL, {"data": True})  # where it may publish, it has answers
+    assert status == "ok"
+
+
+async def test_of_two_services_at_one_topic_the_second_waits_for_it(house, caplog):
+    first, second = service("/switch"), service("/other", mqtt="r2d2/switch")
+    house.start(first)
+    switch, other = Switch(house), Switch(house, "/other")
+    client = house.client("alice")
+    house.bridge.calls.replace(call_routes(first, second))
+    assert "/other cannot be called: calls at r2d2/switch/_call are for /switch" in caplog.text
+    await client.call(CALL, {"data": True})
+    assert (switch.asked, other.asked) == ([True], [])
+    house.bridge.calls.replace(call_routes(second))
+    await client.call(CALL, {"data": False})
+    assert (switch.asked, other.asked) == ([True], [False])
+    house.bridge.calls.replace(call_routes())
+    assert house.bridge.calls.board._offers == {}
+
+
+async def test_a_call_that_is_too_large(house):
+    house.start(service("/switch"), service("/ask", to="mqtt", type=SET_BOOL, on_error="{}"))
+    house.bridge.calls.board.limits = CallLimits(payload=100)
+    switch = Switch(house)
+    client = house.client("alice", "r2d2/ask/_request/+")
+    before = house.broker.counters.effort
+    code, text = await client.error(CALL, b'{"data": true}' + b" " * 87)
+    assert (code, switch.asked) == ("too_large", [])
+    assert "101 bytes" in text and "bridge.limits.payload" in text
+    assert house.broker.counters.effort > before + 101 // 16
+    said = []
+    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    await until(lambda: client.received[1:], "the request")
+    request = client.received[-1].topic
+    client.send(request.replace("_request", "_response"), b'{"success": true}' + b" " * 100)
+    await until(lambda: said, "the response")
+    assert value(f"{SET_BOOL}_Response", said[0])["success"] is False
+
+
+async def test_calls_are_bounded_in_bytes(house, monkeypatch):
+    monkeypatch.setattr(calls, "TOTAL_BYTES", 100)
+    house.start(service("/switch"))
+    switch = Switch(house)
+    switch.holds = True
+    client = house.client("alice")
+    for token in (1, 2):
+        client.send(f"{CALL}/{token}", b'{"data": true}' + b" " * 26)
+    code, _ = await client.error(CALL, b'{"data": true}' + b" " * 26)
+    assert code == "too_many"
+    await until(lambda: len(switch.asked) == 2, "the calls")
+    switch.answer()
+    await until(lambda: house.counters().under_way == 0, "the answers")
+    switch.holds = False
+    assert (await client.call(CALL, {"data": True}))[0] == "ok"
+
+
+async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(house):
+    on_error = '{"success": false, "message": "gone"}'
+    house.start(service("/ask", to="mqtt", type=SET_BOOL, on_error=on_error))
+    house.client("alice", "r2d2/ask/_request/+")
+    said = []
+    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    await until(lambda: house.counters().under_way, "the request")
+    house.bridge.calls.replace(call_routes())
+    await until(lambda: said, "the response")
+    assert value(f"{SET_BOOL}_Response", said[0])["message"] == "gone"
+
+
+async def test_a_service_of_another_type_than_the_route_says(house):
+    house.start(service("/switch", type=TRIGGER, timeout=1.0))
+    Switch(house)
+    client = house.client("alice")
+    code, text = await client.error(CALL)
+    assert code == "unavailable"
+    assert text == f"/switch is a {SET_BOOL} on the bus, not a {TRIGGER}"

@@ -10,6 +10,8 @@ pytest.importorskip("rclpy")
 from slow_link import IMAGE_SIZE, LINK, at, report, trial
 from test_ros2 import domain
 
+pytestmark = pytest.mark.timed
+
 __all__ = ["domain"]  # a fixture for all tests here
 
 #: The 99th percentile of the texts' age at the fast client is 5 ms on a computer of its own.

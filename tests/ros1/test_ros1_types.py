@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from appliance.ros.actions import STATES
+from appliance.ros.goals import STATES
 from appliance.ros.bridge import Bridge  # noqa: F401  (it knows all modules that it needs)
 from appliance.ros.convert import ConversionError, compile_converter
 from appliance.ros.definitions import PACKED, UnknownTypeError

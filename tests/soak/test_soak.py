@@ -8,6 +8,8 @@ import pytest
 
 from soak.run import Report, Soak
 
+pytestmark = pytest.mark.timed
+
 
 @pytest.mark.timeout(180)
 def test_random_clients_get_what_they_are_owed(tmp_path: Path) -> None:

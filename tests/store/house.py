@@ -80,7 +80,7 @@ def state(broker: Broker) -> dict[str, Any]:
             if session.identity is not None and session.persistent
         },
         "retained": {topic: _message(message) for topic, message in broker.retained.find("#")},
-        "bytes": broker.retained_bytes,
+        "bytes": broker.retained.bytes,
     }
 
 
@@ -89,7 +89,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         if owed is None:
             return None
         message, qos, retain, ids, share = owed
-        group = share.filter if share and share.filter in broker._shares else None
+        group = share.filter if share and share.filter in broker.router.shares else None
         return _message(message), qos, retain, ids or None, group
 
     will = session.will
@@ -109,7 +109,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
                 {
                     each.filter
                     for each in held.full
-                    if isinstance(each, Share) and each.filter in broker._shares
+                    if isinstance(each, Share) and each.filter in broker.router.shares
                 }
                 | {
                     each.client_id

@@ -79,7 +79,7 @@ async def test_a_newer_database_is_left_alone(
     await house.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
     before = house.path.read_bytes()
-    with pytest.raises(StoreError, match=r"newer appliance \(version 1 .* knows 0\)"):
+    with pytest.raises(StoreError, match=r"newer appliance \(version 2 .* knows 0\)"):
         SqliteStore(house.path).open()
     assert house.path.read_bytes() == before
 
@@ -176,15 +176,15 @@ async def test_what_is_too_much_for_it_is_refused(tmp_path: Path) -> None:
 
 
 async def test_what_is_too_old_is_dropped(tmp_path: Path) -> None:
-    clock = 1_000_000.0
-    house = House(tmp_path / "first", age=3600, wall=lambda: clock).start()
+    clock, boot = 1_800_000_000.0, "one"
+    house = House(tmp_path / "first", age=3600, wall=lambda: clock, boot=lambda: boot).start()
     client = await house.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 1)]))
     client.lose()
     publisher = await house.join("publisher")
     publisher.send(Publish("a", b"old", 1, packet_id=1))
     await house.written()
-    clock += 3000  # as after a restart
+    clock, boot = clock + 3000, "two"  # as after a restart
     twin = house.twin(tmp_path / "twin")
     publisher = await twin.join("publisher")
     publisher.send(Publish("a", b"new", 1, packet_id=1))

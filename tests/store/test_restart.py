@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
+import sqlite3
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -25,7 +27,11 @@ from appliance.mqtt.packets import (
     Unsubscribe,
     Will,
 )
+from appliance.store.inspection import summarise
 from store.house import House, difference, state
+
+#: By a clock that is right.
+YEAR_2030 = 1_900_000_000.0
 
 
 @pytest_asyncio.fixture
@@ -178,8 +184,8 @@ async def test_a_clean_stop_keeps_sessions_and_sends_no_will(house: House, tmp_p
 
 async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
     """What expired while the robot was switched off is gone."""
-    clock = 1_000_000.0
-    house = House(tmp_path / "first", wall=lambda: clock).start()
+    clock, boot = 1_800_000_000.0, "one"
+    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
     for name, seconds in (("short", 100), ("long", 1000)):
         client = await house.join(name, **lasting(5, seconds))
         client.send(Subscribe(1, [Subscription("a", 1)]))
@@ -189,7 +195,7 @@ async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
     publisher.send(Publish("a", b"short", 1, True, packet_id=1, properties=dict(expiry)))
     publisher.send(Publish("a", b"long", 1, packet_id=2))
     await house.written()
-    clock += 300
+    clock, boot = clock + 300, "other"
     twin = house.twin(tmp_path / "twin")
     twin.tick()
     assert set(twin.broker.sessions) == {"long"}
@@ -201,21 +207,75 @@ async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
     await house.stop()
 
 
-async def test_the_clock_is_set_after_the_boot(tmp_path: Path) -> None:
-    """A robot without a clock of its own learns the time from the network, later."""
-    clock = 1000.0
-    house = House(tmp_path / "first", wall=lambda: clock).start()
+@pytest.mark.parametrize(
+    ("before", "after", "boots", "expired"),
+    [
+        pytest.param(YEAR_2030, YEAR_2030 + 3600, ("one", "one"), False, id="set while it ran"),
+        pytest.param(YEAR_2030, 1000.0, ("one", "one"), False, id="set back while it ran"),
+        pytest.param(YEAR_2030, 1000.0, ("one", "two"), False, id="started in 1970"),
+        pytest.param(1000.0, YEAR_2030, ("one", "two"), False, id="was in 1970"),
+        pytest.param(YEAR_2030, YEAR_2030 + 3600, ("", ""), True, id="who knows"),
+        pytest.param(YEAR_2030, YEAR_2030 + 3600, ("one", "two"), True, id="was switched off"),
+    ],
+)
+async def test_nothing_expires_early_by_a_wrong_clock(
+    tmp_path: Path, before: float, after: float, boots: tuple[str, str], expired: bool
+) -> None:
+    """The store's time goes on with the time that the computer was on, and known to be off."""
+    clock, boot = before, boots[0]
+    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
     client = await house.join("client", **lasting(5, 100))
     client.lose()
     await house.written()
-    clock = 1_800_000_000.0
+    clock, boot = after, boots[1]
+    twin = house.twin(tmp_path / "twin")
+    twin.tick()
+    assert ("client" in twin.broker.sessions) is not expired
+    twin.tick(ahead=101)  # nor too late, as far as it was on
+    assert "client" not in twin.broker.sessions
+    await twin.stop()
+    await house.stop()
+
+
+async def test_the_clock_is_set_after_the_boot(tmp_path: Path) -> None:
+    """A robot without a clock of its own learns the time from the network, later; that is no time
+    that has passed, also when the power fails right after it."""
+    clock, boot = 1000.0, "one"
+    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
+    client = await house.join("client", **lasting(5, 100))
+    client.lose()
+    await house.written()
+    clock = YEAR_2030
     house.store._check_clock()
     await house.written()
+    boot, clock = "two", clock + 50
+    twin = house.twin(tmp_path / "twin")
+    twin.tick()
+    assert "client" in twin.broker.sessions
+    [session] = summarise(twin.path).sessions
+    assert session.ends_at == pytest.approx(YEAR_2030 + 100, abs=1)
+    twin.tick(ahead=51)
+    assert "client" not in twin.broker.sessions
+    await twin.stop()
+    await house.stop()
+
+
+async def test_a_store_of_before_there_was_a_clock_in_it(tmp_path: Path) -> None:
+    house = House(tmp_path / "first").start()
+    client = await house.join("client", **lasting(5, 100))
+    client.lose()
+    await house.written()
+    await house.stop()
+    with contextlib.closing(sqlite3.connect(house.path)) as connection:
+        connection.execute("DROP TABLE clock")
+        connection.execute("UPDATE about SET version = 1")
+        connection.execute("PRAGMA user_version = 1")
+        connection.commit()
+    assert [session.client_id for session in summarise(house.path).sessions] == ["client"]
     twin = house.twin(tmp_path / "twin")
     twin.tick()
     assert "client" in twin.broker.sessions
     await twin.stop()
-    await house.stop()
 
 
 async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:

@@ -6,15 +6,13 @@ import asyncio
 import os
 import threading
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import pytest
-from test_scram import ScramClient
 
-from appliance.access import FileAccess, Passwords, check_password
+from appliance.access import FileAccess, Passwords
 from appliance.access import checks as checks_module
 from appliance.access import guesses as guesses_module
 from appliance.access import passwords as passwords_module
@@ -22,35 +20,10 @@ from appliance.access.guesses import Guesses, Recent
 from appliance.broker.ports import Accepted, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 
+from .conftest import count_checks
+from .test_scram import ScramClient
+
 ALICE_C = Identity("alice", "c")
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
-    users = Passwords(tmp_path / "users.passwd")
-    users.set("alice", "geheim")
-    users.save()
-    acl = tmp_path / "acl.conf"
-    acl.write_text("user alice\ntopic read a/#\n")
-    return users.path, acl
-
-
-@pytest.fixture
-def access(files: tuple[Path, Path]) -> Iterator[FileAccess]:
-    access = FileAccess(*files, "r2d2")
-    yield access
-    access.close()
-
-
-def count_checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    checks: list[str] = []
-
-    def check(stored: str, password: bytes) -> bool:
-        checks.append(stored)
-        return check_password(stored, password)
-
-    monkeypatch.setattr(passwords_module, "check_password", check)
-    return checks
 
 
 class Clock:

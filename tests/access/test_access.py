@@ -35,6 +35,8 @@ from appliance.broker.ports import Action, Identity
 from appliance.mqtt.reason import ReasonCode
 from appliance.mqtt.topics import matches
 
+from .conftest import count_checks, write
+
 # Made by mosquitto_passwd 2.0.11; the password is "geheim".
 SHA512 = (
     "$6$lJVgcY017kDyVj1Z$uUXEGwuVuGMZ9AO0gKfvzWRL6kObeFmzbn2+9Ds9tFlq6GuzIEPmtvd31sTspaazXhspiUMg"
@@ -52,12 +54,6 @@ PBKDF2 = (
 @pytest.fixture
 def users_file(tmp_path: Path) -> Path:
     return tmp_path / "users.passwd"
-
-
-def write(path: Path, text: str) -> Path:
-    path.write_text(text)
-    path.chmod(0o600)
-    return path
 
 
 def problems_of(path: Path) -> list[str]:
@@ -858,33 +854,6 @@ def test_decisions_are_those_of_the_real_mosquitto(
 
 
 # FileAccess
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
-    users = Passwords(tmp_path / "users.passwd")
-    users.set("alice", "geheim")
-    users.save()
-    acl = write(tmp_path / "acl.conf", "user alice\ntopic read a/#\n")
-    return users.path, acl
-
-
-@pytest.fixture
-def access(files: tuple[Path, Path]) -> Iterator[FileAccess]:
-    access = FileAccess(*files, "r2d2")
-    yield access
-    access.close()
-
-
-def count_checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    checks: list[str] = []
-
-    def check(stored: str, password: bytes) -> bool:
-        checks.append(stored)
-        return check_password(stored, password)
-
-    monkeypatch.setattr(passwords_module, "check_password", check)
-    return checks
 
 
 async def test_logins(access: FileAccess) -> None:

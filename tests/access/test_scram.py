@@ -36,6 +36,8 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
+from .conftest import write
+
 # RFC 7677, section 3.
 RFC_NONCE = "%hvYDpWUa2RaTCAfuxFIlj)hNlF$k0"
 RFC_FIRST = b"n,,n=user,r=rOprNGfwEbeRWgbNEkqO"
@@ -124,12 +126,6 @@ def access(users: Path) -> Iterator[FileAccess]:
     access = FileAccess(users, None, "r2d2")
     yield access
     access.close()
-
-
-def write(path: Path, text: str) -> Path:
-    path.write_text(text)
-    path.chmod(0o600)
-    return path
 
 
 def content(path: Path) -> str:

@@ -1,0 +1,97 @@
+"""What all sessions share: the limits in force, the counters, the clock, and the memory in use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from appliance.broker.message import Message
+from appliance.broker.ports import Limits, Store
+
+if TYPE_CHECKING:
+    from appliance.broker.session import Session
+
+#: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
+EFFORT_A_TURN = 1000
+
+
+@dataclass(slots=True)
+class Counters:
+    """What the broker counts; `$SYS` and the metrics are made of it. All grow from its start."""
+
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    control_received: int = 0
+    control_sent: int = 0
+    publish_received: int = 0
+    publish_sent: int = 0
+    publish_dropped: int = 0
+    publish_refused: int = 0
+    publish_bytes_received: int = 0
+    publish_bytes_sent: int = 0
+    connects: int = 0
+    connects_refused: int = 0
+    connections_refused: int = 0
+    sockets: int = 0
+    #: Work done, in units of about a microsecond; what takes long counts itself here, so that one
+    #: client's turn can be ended without a look at the clock.
+    effort: int = 0
+    sessions_expired: int = 0
+    clients_maximum: int = 0
+
+    @property
+    def messages_received(self) -> int:
+        """Packets of all kinds that came in: `control_received` are those that are no PUBLISH."""
+        return self.publish_received + self.control_received
+
+    @property
+    def messages_sent(self) -> int:
+        """Packets of all kinds that went out."""
+        return self.publish_sent + self.control_sent
+
+
+@dataclass(slots=True)
+class Ledger:
+    """What all sessions share: the limits, the counters, the clock and the bytes queued in all."""
+
+    limits: Limits
+    store: Store
+    counters: Counters = field(default_factory=Counters)
+    #: Seconds of the clock that `Broker.tick` was last given.
+    now: float = 0.0
+    #: Bytes that the queues, subscriptions and wills of all sessions hold, and the output buffers.
+    queued_bytes: int = 0
+    #: Among these, what came from clients and is not done with: parts of packets, topic aliases.
+    input_bytes: int = 0
+    #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
+    overflowed: list[Session] = field(default_factory=list)
+    #: The limits that every message is measured against, out of `limits` for speed.
+    queue_bytes: int = field(init=False)
+    memory: int = field(init=False)
+    #: And what a connected client may hold when all the memory is taken by others, in bytes.
+    reserve: int = field(init=False)
+    #: Nothing can be kept: the store's last commit failed.
+    failing: bool = False
+    #: And who publishes now can be told so.
+    refusing: bool = False
+    #: Whether the rules in force still let a session receive what waits for it under a topic.
+    may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
+
+    def __post_init__(self) -> None:
+        self.use(self.limits)
+
+    def use(self, limits: Limits) -> None:
+        """Measure by these limits from now on."""
+        self.limits = limits
+        self.queue_bytes = limits.queue_bytes
+        # An eighth is set apart, so that those who hold much do not starve those who hold little.
+        self.memory = limits.memory * 7 // 8
+        self.reserve = limits.memory // 8 // limits.connections
+
+    def has_expired(self, message: Message) -> bool:
+        """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""
+        if message.expires_at is None or message.expires_at > self.now:
+            return False
+        self.counters.publish_dropped += 1
+        return True

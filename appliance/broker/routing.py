@@ -1,0 +1,235 @@
+"""Where a topic's messages go: all subscriptions, and what the rules say to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from appliance.broker.ledger import Ledger
+from appliance.broker.ports import Access, Action, Decision, Guard
+from appliance.broker.session import Session
+from appliance.broker.shared import Share, Target
+from appliance.mqtt.codec import decode_string
+from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import SubscriptionTree, check_topic, parse_shared
+
+#: Topics a session's routes are cached for; a client that publishes to more starts over, so that
+#: a stranger's invented topics cannot grow the cache.
+CACHED_ROUTES = 1024
+
+#: And the longest of these topics, in bytes.
+CACHED_TOPIC = 512
+
+#: Entries and targets in the caches of all sessions together, some 80 bytes each.
+CACHED_IN_ALL = 500_000
+
+#: The effort to find a route, see `Counters.effort`; each match comes on top.
+ROUTE_EFFORT = 20
+
+_ALLOWED = Decision(True, "the appliance itself")
+
+
+@dataclass(slots=True)
+class Route:
+    """What is known about one topic for one publishing session, until the epoch changes."""
+
+    topic: str
+    allowed: bool
+    #: The rule that decided.
+    reason: str
+    targets: list[Target]
+    #: Shared subscriptions, and those of their members that may receive the topic.
+    shares: list[tuple[Share, list[Target]]]
+    #: Whether there is any subscription to the topic, be it of a client that gets nothing.
+    subscribed: bool
+
+
+class Router:
+    """Finds the route of a topic, and keeps it a session until the epoch changes.
+
+    `sessions` are all there are, by client id: what is known of topics is kept in them.
+    """
+
+    def __init__(self, access: Access, ledger: Ledger, sessions: dict[str, Session]) -> None:
+        #: The rules in force.
+        self.access = access
+        #: By topic, what parts of the appliance have to say about who publishes to it.
+        self.guards: dict[str, list[Guard]] = {}
+        #: Grows whenever a cached route may be wrong.
+        self.epoch = 0
+        #: Shared subscriptions by their whole filter.
+        self.shares: dict[str, Share] = {}
+        self._ledger = ledger
+        self._counters = ledger.counters
+        self._sessions = sessions
+        self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
+            SubscriptionTree()
+        )
+        #: Entries and targets that went into the sessions' caches since these were last cleared.
+        self._cached = 0
+
+    def __len__(self) -> int:
+        """Subscriptions of all sessions; a shared one counts once."""
+        return len(self._subscriptions)
+
+    def changed(self) -> None:
+        """Let every route be found anew: what decides about them is not what it was."""
+        self.epoch += 1
+
+    def join(self, session: Session, subscription: Subscription) -> None:
+        """Put a subscription into the tree, or a member into its group."""
+        self.epoch += 1
+        topic_filter = subscription.filter
+        shared = parse_shared(topic_filter)
+        if shared is None:
+            self._subscriptions.add(topic_filter, session, (session, subscription))
+            return
+        share = self.shares.get(topic_filter)
+        if share is None:
+            share = self.shares[topic_filter] = Share(topic_filter)
+            self._subscriptions.add(shared[1], topic_filter, share)
+        share.members[session] = subscription
+
+    def leave(self, session: Session, topic_filter: str) -> None:
+        """Take a subscription out of the tree, or a member out of its group."""
+        self.epoch += 1
+        share = self.shares.get(topic_filter)
+        if share is None:
+            self._subscriptions.remove(topic_filter, session)
+            return
+        share.members.pop(session, None)
+        if not share.members:
+            del self.shares[topic_filter]
+            _, inner = parse_shared(topic_filter) or ("", "")
+            self._subscriptions.remove(inner, topic_filter)
+
+    def route(self, session: Session, topic_wire: bytes) -> Route:
+        """Where messages of the session to the topic go, looked up once an epoch.
+
+        Raises:
+            ProtocolError: the topic is not valid; the connection has to end.
+        """
+        if session.epoch != self.epoch or len(session.routes) >= CACHED_ROUTES:
+            session.routes.clear()
+            session.epoch = self.epoch
+        route = session.routes.get(topic_wire)
+        if route is None:
+            route = self._find_route(session, topic_wire)
+            if len(topic_wire) <= CACHED_TOPIC:
+                session.routes[topic_wire] = route
+                self._cached += 1 + len(route.targets)
+                if self._cached > CACHED_IN_ALL:
+                    self._clear_caches()
+        return route
+
+    def _clear_caches(self) -> None:
+        self._cached = 0
+        for session in self._sessions.values():
+            session.routes.clear()
+            session.readable.clear()
+
+    def _find_route(self, session: Session, topic_wire: bytes) -> Route:
+        topic, _ = decode_string(topic_wire, 0)
+        try:
+            check_topic(topic)
+        except ValueError as error:
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+        decision = self._may_publish(session, topic)
+        if decision and topic in self.guards:
+            verdicts = [guard.decide(session) for guard in self.guards[topic]]
+            decision = next((verdict for verdict in verdicts if not verdict), decision)
+        matches = self._subscriptions.match(topic) if decision else []
+        self._counters.effort += ROUTE_EFFORT + len(matches)
+        targets, shares = self._targets(session, topic, matches)
+        return Route(topic, decision.allowed, decision.reason, targets, shares, bool(matches))
+
+    def _may_publish(self, session: Session, topic: str) -> Decision:
+        if session.identity is None:
+            return _ALLOWED
+        excess = self.excess(topic)
+        if excess:  # [MQTT-4.13.1-1]; as mosquitto does
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic with {excess}")
+        if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
+            reason = "topics that begin with $ are the broker's own"
+            return Decision(False, reason)
+        return self.access.decide(session.identity, Action.PUBLISH, topic)
+
+    def excess(self, topic: str) -> str:
+        """What the topic or filter has too much of, if anything."""
+        limits = self._ledger.limits
+        if topic.count("/") >= limits.topic_levels:
+            return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
+        if len(topic) > limits.topic_length // 4 and len(topic.encode()) > limits.topic_length:
+            return f"more than {limits.topic_length} bytes (broker.limits.topic_length)"
+        return ""
+
+    def _targets(
+        self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
+    ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
+        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1].
+
+        Shared subscriptions come on top: a session gets a message once more for each that chooses
+        it (5.0 section 4.8.2).
+        """
+        merged: dict[str, Target] = {}
+        shares: list[tuple[Share, list[Target]]] = []
+        for match in matches:
+            if isinstance(match, Share):
+                shares.append((match, self.members(match, topic)))
+                continue
+            session, subscription = match
+            if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
+                continue
+            known = merged.get(session.client_id)
+            receiver, qos, as_published, ids = known or (session.hearing(origin), 0, False, None)
+            if subscription.identifier:  # [MQTT-3.3.4-4]
+                ids = [*(ids or []), subscription.identifier]
+            merged[session.client_id] = (
+                receiver,
+                max(qos, subscription.qos),
+                as_published or subscription.retain_as_published,
+                ids,
+            )
+        targets = [target for target in merged.values() if self.may_receive(target[0], topic)]
+        return targets, shares
+
+    def members(self, share: Share, topic: str) -> list[Target]:
+        """The members of the group that may receive the topic."""
+        return [
+            (
+                session,
+                subscription.qos,
+                subscription.retain_as_published,
+                [subscription.identifier] if subscription.identifier else None,
+            )
+            for session, subscription in share.members.items()
+            if self.may_receive(session, topic)
+        ]
+
+    def may_receive(self, session: Session, topic: str) -> bool:
+        """Whether the rules in force let the session receive the topic's messages."""
+        if session.identity is None:
+            return True
+        # Kept beside the routes: those are made anew with every subscription of anybody, which
+        # would ask the rules about all receivers of a topic again.
+        readable = session.readable
+        if session.readable_epoch != self.access.epoch or len(readable) >= CACHED_ROUTES:
+            readable.clear()
+            session.readable_epoch = self.access.epoch
+        allowed = readable.get(topic)
+        if allowed is None:
+            decision = self.access.decide(session.identity, Action.RECEIVE, topic)
+            allowed = decision.allowed
+            if len(topic) <= CACHED_TOPIC and not decision.pending:
+                readable[topic] = allowed
+                self._cached += 1
+        return allowed
+
+    def may_keep(self, session: Session, topic: str) -> bool:
+        """Whether a message that waits may still be sent.
+
+        It was allowed when it came: while plugins make up their minds anew it stays so.
+        """
+        if session.identity is None or self.may_receive(session, topic):
+            return True
+        return self.access.decide(session.identity, Action.RECEIVE, topic).pending

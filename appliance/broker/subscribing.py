@@ -1,0 +1,124 @@
+"""SUBSCRIBE and UNSUBSCRIBE: packets of thousands of filters, worked on in portions.
+
+Between two portions it is the turn of other clients. The packet's own client is not read meanwhile,
+so that its answers keep their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from appliance.broker.broker import Broker
+from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.topics import check_filter, parse_shared
+
+#: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE.
+MAXIMUM_LEVELS = 20_000
+
+#: The effort of a subscription, in and out; its levels come on top.
+SUBSCRIBE_EFFORT = 20
+
+#: The effort to check a filter, and to look for its retained messages.
+CHECK_EFFORT = 3
+RETAINED_EFFORT = 3
+
+
+def subscribe(broker: Broker, session: Session, packet: Subscribe) -> Iterator[Packet | None]:
+    """Do what the packet asks for; gives its SUBACK, and None where others are to have their turn.
+
+    Raises:
+        ProtocolError: a filter is none, or they are too many; none of them has any effect then.
+    """
+    turn = _Turn(broker)
+    subscriptions = packet.subscriptions
+    for _ in _check(broker, [subscription.filter for subscription in subscriptions], turn):
+        yield None
+    identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
+    identifier = identifiers[0] if isinstance(identifiers, list) else 0
+    codes: list[int] = []
+    granted: list[tuple[Subscription, bool]] = []
+    for subscription in subscriptions:
+        if isinstance(identifier, int):
+            subscription.identifier = identifier
+        is_new = subscription.filter not in session.subscriptions
+        code = broker.subscribe(session, subscription)
+        codes.append(code)
+        if code <= ReasonCode.GRANTED_QOS_2:
+            granted.append((subscription, is_new))
+        if turn.is_over(SUBSCRIBE_EFFORT + subscription.filter.count("/")):
+            yield None
+    yield Suback(packet.packet_id, codes)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
+    for subscription, is_new in granted:
+        effort = RETAINED_EFFORT
+        if subscription.filter in session.replays:  # the packet has it twice: so it is sent twice
+            effort += len(session.replays) // 10
+            session.pump()
+        broker.replay_retained(session, subscription, is_new)
+        if turn.is_over(effort):
+            yield None
+    session.pump()
+
+
+def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterator[Packet | None]:
+    """Do what the packet asks for; gives its UNSUBACK, and None as `subscribe` does.
+
+    Raises:
+        ProtocolError: a filter is none, or they are too many; none of them has any effect then.
+    """
+    turn = _Turn(broker)
+    for _ in _check(broker, packet.filters, turn):
+        yield None
+    codes: list[int] = []
+    for name in packet.filters:
+        codes.append(broker.unsubscribe(session, name))
+        if turn.is_over(SUBSCRIBE_EFFORT + name.count("/")):
+            yield None
+    yield Unsuback(packet.packet_id, codes)  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
+
+
+class _Turn:
+    """Counts the effort, and says when it was as much as one turn is for."""
+
+    def __init__(self, broker: Broker) -> None:
+        self._counters = broker.counters
+        self._left = EFFORT_A_TURN
+
+    def is_over(self, effort: int) -> bool:
+        """Count so much more; the next turn begins when this one is over."""
+        self._counters.effort += effort
+        self._left -= effort
+        if self._left > 0:
+            return False
+        self._left = EFFORT_A_TURN
+        return True
+
+
+def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None]:
+    """Raises a ProtocolError when one is no topic filter, or all are too much; in portions."""
+    if sum(name.count("/") + 1 for name in filters) > MAXIMUM_LEVELS:
+        raise ProtocolError(
+            ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_LEVELS} levels in one packet"
+        )
+    for name in filters:
+        _check_filter(broker, name)
+        if turn.is_over(CHECK_EFFORT):
+            yield
+
+
+def _check_filter(broker: Broker, topic_filter: str) -> None:
+    """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+    try:
+        check_filter(topic_filter)
+    except ValueError as error:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+    try:
+        shared = parse_shared(topic_filter)
+    except ValueError as error:
+        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, str(error)) from None
+    excess = broker.router.excess(shared[1] if shared else topic_filter)
+    if excess:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic filter with {excess}")

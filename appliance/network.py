@@ -1,0 +1,216 @@
+"""All network connections together: whose turn it is, and what their output takes in all."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Protocol, TypeAlias
+
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.farewell import Farewell
+from appliance.mqtt.packets import Connect
+
+#: Messages that are few: after more than these it is checked whether who sends them has to wait.
+FEW_MESSAGES = 64
+
+#: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
+LARGEST_PORTION = 256 * 1024
+
+#: What all clients that send much may cause in one round of the event loop, see
+#: `Counters.effort`: some five milliseconds.
+EFFORT_A_ROUND = 5000
+
+#: Seconds that a client may publish ahead of `limits.publish_rate`.
+PUBLISH_BURST = 1.0
+
+#: Closed connections that are listened to at a time, see `Farewell`.
+FAREWELLS = 256
+
+#: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
+Authenticate: TypeAlias = Callable[
+    [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
+]
+
+
+class Certificates(Protocol):
+    """What is to be known of a client's certificate, of a connection with TLS."""
+
+    def refusal(self, tls: ssl.SSLObject) -> str:
+        """Why the client is not, or no longer, let in with it; empty when it is."""
+
+    def username(self, tls: ssl.SSLObject) -> str | None:
+        """The user that it names; None when that is not asked for. ValueError: it names none."""
+
+
+class Member(Protocol):
+    """One of the connections."""
+
+    #: What all connections of one computer share; empty for a Unix socket.
+    host: str
+
+    def check_certificate(self) -> None:
+        """Close the connection when the client's certificate is not, or no longer, accepted."""
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+
+    def close(self) -> None:
+        """Write out what waits, then close."""
+
+    def abort(self) -> None:
+        """Close at once."""
+
+
+class Network:
+    """All connections, and what they share; `ended` is told of each that ends, once.
+
+    `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        authenticate: Authenticate,
+        exchange: Callable[[str, str | None], Exchange | None],
+        ended: Callable[[Member], None],
+        *,
+        connect_timeout: float,
+        publish_rate: float,
+        certificates: Certificates | None = None,
+    ) -> None:
+        self.broker = broker
+        self.certificates = certificates
+        self.authenticate = authenticate
+        self.exchange = exchange
+        self.use(connect_timeout, publish_rate)
+        self.open: set[Member] = set()
+        #: What runs in the background for a connection: TLS handshakes and logins.
+        self.tasks: set[asyncio.Task[None]] = set()
+        #: Bytes in the output of all clients, as far as they are counted.
+        self.output = 0
+        self._ended = ended
+        #: For how many clients a large chunk waits, by its id.
+        self._shared: dict[int, int] = {}
+        #: Who has more to do than there was time for; in turn, with all others in between.
+        self._turns: deque[Member] = deque()
+        self._effort_begun = 0
+        self._counting = False
+        self._farewells: set[Farewell] = set()
+        self._all_closed: asyncio.Event | None = None
+
+    def use(self, connect_timeout: float, publish_rate: float) -> None:
+        """Let these limits hold from now on, and those that the broker has now."""
+        self.connect_timeout = connect_timeout
+        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
+        #: Messages of a client after which it is checked.
+        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
+        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
+        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
+        #: `Ledger.queued_bytes` from which on publishers are slowed.
+        self.short_of_memory = self.broker.limits.memory * 3 // 4
+        #: Bytes in the output of all clients from which on less is allowed to each of them.
+        self.much_output = self.broker.limits.memory // 4
+
+    def is_busy(self) -> bool:
+        """Whether as much was done in this round of the event loop as one round is for.
+
+        Who sends much then waits. Who sends little does not, whatever the others do.
+        """
+        if not self._counting:
+            self._counting = True
+            self._effort_begun = self.broker.counters.effort
+            asyncio.get_running_loop().call_soon(self._new_round)
+        effort = self.broker.counters.effort - self._effort_begun
+        return effort > EFFORT_A_ROUND or bool(self._turns)
+
+    def _new_round(self) -> None:
+        self._counting = False
+
+    def queue_turn(self, member: Member) -> None:
+        """Call `take_turn` when it is the member's."""
+        self._turns.append(member)
+        if len(self._turns) == 1:
+            asyncio.get_running_loop().call_soon(self._run_turns)
+
+    def _run_turns(self) -> None:
+        end = self.broker.counters.effort + EFFORT_A_ROUND
+        left = len(self._turns)
+        while left:
+            left -= 1
+            # Taken out after its turn, so that no entry meanwhile is the first, to be scheduled.
+            self._turns[0].take_turn()
+            self._turns.popleft()
+            if self.broker.counters.effort > end:
+                break
+        if self._turns:
+            asyncio.get_running_loop().call_soon(self._run_turns)
+
+    def in_background(self, work: Coroutine[object, object, None]) -> None:
+        """Run a connection's handshake or login beside everything else."""
+        task = asyncio.get_running_loop().create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+
+    def count_output(self, size: int) -> None:
+        """So many bytes more, or less, wait to be read by a client."""
+        self.output += size
+        self.broker.ledger.queued_bytes += size
+
+    def share(self, chunk: bytes) -> None:
+        """Count a large chunk that waits for a client: once, for however many it waits."""
+        clients = self._shared.get(id(chunk), 0)
+        if not clients:
+            self.count_output(len(chunk))
+        self._shared[id(chunk)] = clients + 1
+
+    def unshare(self, chunk: bytes) -> None:
+        """It waits for one client less."""
+        clients = self._shared.pop(id(chunk)) - 1
+        if clients:
+            self._shared[id(chunk)] = clients
+        else:
+            self.count_output(-len(chunk))
+
+    def closed(self, member: Member) -> None:
+        """A connection ended."""
+        if member in self.open:
+            self.open.discard(member)
+            self._ended(member)
+        self._tell_when_all_closed()
+
+    def part(self, connection: socket.socket) -> None:
+        """Close a connection whose last bytes are on their way, see `Farewell`."""
+        if len(self._farewells) < FAREWELLS:
+            farewell = Farewell(connection, self._parted)
+            self._farewells.add(farewell)
+            farewell.listen()
+        else:
+            connection.close()
+
+    def _parted(self, farewell: Farewell) -> None:
+        self._farewells.discard(farewell)
+        self._tell_when_all_closed()
+
+    def _tell_when_all_closed(self) -> None:
+        if self._all_closed is not None and not self.open and not self._farewells:
+            self._all_closed.set()
+
+    async def close(self, timeout: float) -> None:
+        """Close everything; who does not read the last bytes in so many seconds is cut off."""
+        for member in list(self.open):
+            member.close()
+        for task in list(self.tasks):
+            task.cancel()
+        if self.open or self._farewells:
+            self._all_closed = asyncio.Event()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._all_closed.wait(), timeout)
+        for member in list(self.open):
+            member.abort()
+        for farewell in list(self._farewells):
+            farewell.end()

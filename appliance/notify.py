@@ -1,0 +1,121 @@
+"""What systemd is told of the service: sd_notify(3) and sd_watchdog_enabled(3), by a socket.
+
+A message is a datagram of `NAME=value` lines to the Unix socket that NOTIFY_SOCKET names. Nothing
+here ever fails: without systemd nobody is told, and what systemd does not take is left out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at what STATUS= is to say.
+STATUS_INTERVAL = 10.0
+
+#: Seconds that a change of state may wait for systemd to take it; a sign of life never waits.
+PATIENCE = 1.0
+
+
+class Notifier:
+    """Tells systemd that the service is ready, reloads, stops, is alive, and how it is.
+
+    Belongs to the event loop's thread. `watchdog` is the silence in seconds after which systemd
+    takes the service for hung and restarts it, None when it does not.
+    """
+
+    def __init__(self, address: str | None = None, watchdog: float | None = None) -> None:
+        """`address` is a path, or a name behind `@` of an abstract socket; None tells nobody."""
+        self.watchdog = watchdog if address else None
+        self._socket = _connect(address) if address else None
+        self._timer: asyncio.TimerHandle | None = None
+        self._status = ""
+
+    @classmethod
+    def from_environment(cls, environment: MutableMapping[str, str]) -> Notifier:
+        """As systemd has set the variables, which are taken out: they are not for our children."""
+        address = environment.pop("NOTIFY_SOCKET", "")
+        microseconds = environment.pop("WATCHDOG_USEC", "")
+        watched = environment.pop("WATCHDOG_PID", "")
+        # The single file's main process, which systemd knows, is the parent that unpacked it.
+        pids = (os.getpid(), os.getppid()) if hasattr(sys, "frozen") else (os.getpid(),)
+        for_us = not watched or watched in map(str, pids)
+        watchdog = int(microseconds) / 1e6 if microseconds.isdecimal() and for_us else 0.0
+        return cls(address or None, watchdog or None)
+
+    def start(self, loop: asyncio.AbstractEventLoop, status: Callable[[], str]) -> None:
+        """Tell that the service is ready; from now on, that it is alive, and what `status` says."""
+        self._status = status()
+        self._tell("READY=1", f"STATUS={self._status}")
+        if self._socket is None:
+            return
+        interval = min(STATUS_INTERVAL, self.watchdog / 2 if self.watchdog else STATUS_INTERVAL)
+        looked = loop.time()
+
+        def beat() -> None:
+            nonlocal looked
+            lines = ["WATCHDOG=1"] if self.watchdog else []
+            if loop.time() >= looked + STATUS_INTERVAL:
+                looked = loop.time()
+                if (text := status()) != self._status:
+                    self._status = text
+                    lines.append(f"STATUS={text}")
+            if lines:
+                self._tell(*lines, wait=False)
+            self._timer = loop.call_later(interval, beat)
+
+        self._timer = loop.call_later(0, beat)
+
+    @contextmanager
+    def reloading(self) -> Iterator[None]:
+        """Tell that files are being taken over, and when that is done, well or not."""
+        # With Type=notify-reload (systemd 253) it waits for a RELOADING=1 later than its signal.
+        self._tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        try:
+            yield
+        finally:
+            self._tell("READY=1")
+
+    def stopping(self) -> None:
+        """Tell that the service ends because it was asked to."""
+        self._tell("STOPPING=1", "STATUS=stopping")
+
+    def close(self) -> None:
+        """Tell nothing any more; may be called twice."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _tell(self, *lines: str, wait: bool = True) -> None:
+        if self._socket is None:
+            return
+        # A line's end in a value would begin another one.
+        text = "\n".join(line.replace("\n", " ") for line in lines)
+        try:
+            self._socket.settimeout(PATIENCE if wait else 0)
+            self._socket.send(text.encode(errors="replace"))
+        except OSError as error:
+            log.debug("systemd was not told %s: %s", lines[0], error)
+
+
+def _connect(address: str) -> socket.socket | None:
+    if address[0] not in "/@":  # vsock:…, which tells a hypervisor
+        log.warning("NOTIFY_SOCKET is %s: only Unix sockets are told anything", address)
+        return None
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        sock.connect("\0" + address[1:] if address[0] == "@" else address)
+    except OSError as error:
+        log.warning("NOTIFY_SOCKET is %s, which cannot be used: %s", address, error)
+        sock.close()
+        return None
+    return sock

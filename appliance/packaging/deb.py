@@ -1,0 +1,140 @@
+"""Makes the Debian package of the single file: `make deb`.
+
+It does what `appliance install` does, and with the same code: dpkg owns the command, the unit and
+/etc/default/appliance, and `postinst` has the command make the rest. Keys and users are made on the
+robot, and are never in the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from email.utils import formatdate
+from importlib.metadata import metadata, version
+from pathlib import Path
+
+from appliance.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
+from appliance.unit import ENVIRONMENT, VARIABLES, Unit
+
+PACKAGE = "appliance"
+DOCUMENTS = Path("/usr/share/doc", PACKAGE)
+PROJECT = Path(__file__).resolve().parents[2]
+SCRIPTS = Path(__file__).parent / "debian"
+
+DESCRIPTION = """\
+ One process on the robot's computer: an MQTT 3.1.1 and 5 broker with the bridge
+ to ROS 2 inside it. It needs no Python and no ROS; a sourced ROS is used where
+ there is one. Certificates, a first user and access rules are made when it is
+ installed."""
+
+
+def build(command: Path, directory: Path) -> Path:
+    """The package of that executable, written to the directory."""
+    architecture = _said("dpkg", "--print-architecture")
+    release = version("ros-mqtt-appliance").replace(".dev", "~dev").replace("rc", "~rc")
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        root.chmod(0o755)
+        _stage(root, command)
+        _documents(root, release)
+        (root / "DEBIAN").mkdir()
+        for script in SCRIPTS.iterdir():
+            _write(root, Path("/DEBIAN", script.name), script.read_text(), 0o755)
+        _write(root, Path("/DEBIAN/conffiles"), f"{ENVIRONMENT}\n")
+        _write(root, Path("/DEBIAN/control"), _control(root, release, architecture))
+        directory.mkdir(exist_ok=True)
+        package = directory / f"{PACKAGE}_{release}_{architecture}.deb"
+        # Its contents are compressed already, and unpacked at each start: gzip is quick.
+        options = ("--root-owner-group", "-Zgzip", "-z1", "--build")
+        subprocess.run(["dpkg-deb", *options, root, package], check=True, stdout=sys.stderr)
+    return package
+
+
+def _stage(root: Path, command: Path) -> None:
+    place = root / PACKAGED_COMMAND.relative_to("/")
+    place.parent.mkdir(parents=True)
+    shutil.copyfile(command, place)
+    place.chmod(0o755)
+    unit = Unit(PACKAGED_COMMAND, single_file=True, systemd=systemd_version())
+    _write(root, PACKAGED_UNIT, str(unit).replace("`appliance install`, which", "a package that"))
+    _write(root, ENVIRONMENT, VARIABLES.format(settings=""))
+
+
+def _documents(root: Path, release: str) -> None:
+    license_file = "/usr/share/common-licenses/Apache-2.0"
+    _write(
+        root,
+        DOCUMENTS / "copyright",
+        "Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/\n"
+        f"Upstream-Name: {metadata('ros-mqtt-appliance')['Name']}\n\n"
+        "Files: *\nCopyright: 2026 the authors of ros-mqtt-appliance\nLicense: Apache-2.0\n"
+        f" The licence's text is in {license_file}.\n",
+    )
+    entry = (
+        f"{PACKAGE} ({release}) unstable; urgency=medium\n\n"
+        "  * See CHANGELOG.md.\n\n"
+        f" -- {_maintainer()}  {formatdate(_moment())}\n"
+    )
+    changes = {"changelog": entry, "CHANGELOG.md": (PROJECT / "CHANGELOG.md").read_text()}
+    for name, text in changes.items():
+        place = root / DOCUMENTS.relative_to("/") / f"{name}.gz"
+        place.write_bytes(gzip.compress(text.encode(), mtime=0))
+        place.chmod(0o644)
+
+
+def _control(root: Path, release: str, architecture: str) -> str:
+    size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) // 1024
+    # What was linked on this computer runs with its C library and with later ones.
+    libc = _said("getconf", "GNU_LIBC_VERSION").split()[-1]
+    return (
+        f"Package: {PACKAGE}\nVersion: {release}\nArchitecture: {architecture}\n"
+        f"Maintainer: {_maintainer()}\nInstalled-Size: {size}\n"
+        f"Depends: libc6 (>= {libc}), passwd, init-system-helpers (>= 1.54)\n"
+        "Recommends: systemd\nSection: net\nPriority: optional\n"
+        f"Description: MQTT broker of a robot, with the bridge to ROS\n{DESCRIPTION}\n"
+    )
+
+
+def _maintainer() -> str:
+    name = os.environ.get("DEBFULLNAME", "ros-mqtt-appliance")
+    return f"{name} <{os.environ.get('DEBEMAIL', 'maintainers@ros-mqtt-appliance.invalid')}>"
+
+
+def _moment() -> float:
+    """When the newest commit was made, so that the same sources make the same package."""
+    try:
+        return float(_said("git", "-C", str(PROJECT), "log", "-1", "--format=%ct"))
+    except (OSError, ValueError, subprocess.CalledProcessError):
+        return (PROJECT / "CHANGELOG.md").stat().st_mtime
+
+
+def _said(*command: str) -> str:
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def _write(root: Path, path: Path, text: str, mode: int = 0o644) -> None:
+    place = root / path.relative_to("/")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(text)
+    place.chmod(mode)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser.add_argument("command", type=Path, help="the executable, dist/appliance")
+    parser.add_argument("--directory", type=Path, default=PROJECT / "dist", help="default: dist")
+    options = parser.parse_args()
+    if not options.command.is_file():
+        parser.error(f"there is no {options.command}: `make binary` makes it")
+    os.umask(0o022)
+    print(build(options.command, options.directory))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""What the one file runs first: it makes the environment that ROS wants, and calls the command.
+
+`appliance -m appliance.demo …` runs another of its programs, as Python's own option does, since for
+those that are started from within `sys.executable` is the one file.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import signal
+import sys
+from pathlib import Path
+
+from appliance.environment import LIBRARIES, ORIGINAL_LIBRARIES
+from appliance.ros import installation
+
+INSIDE = sys.prefix  # the folder that the file is unpacked to
+PREFIXES = "AMENT_PREFIX_PATH"
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+def main() -> None:
+    use_ros()
+    end_with_the_boot_loader()
+    if sys.argv[1:2] == ["-m"] and sys.argv[2:]:
+        module = sys.argv[2]
+        del sys.argv[1:3]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    else:
+        from appliance.cli import main as run
+
+        run()
+
+
+def end_with_the_boot_loader() -> None:
+    """It waits to clear up behind this process, and who kills it means this one."""
+    import ctypes  # needs a library that is found only with the environment that use_ros makes
+
+    parent = os.getppid()
+    try:
+        is_boot_loader = Path(f"/proc/{parent}/exe").samefile(sys.executable)
+    except OSError:
+        return
+    if is_boot_loader:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:
+            sys.exit(1)
+
+
+def use_ros() -> None:
+    """Let the bundled ROS be found before the sourced one, or the other way round."""
+    environment = os.environ
+    prefixes = [path for path in _paths(PREFIXES) if path != INSIDE]
+    libraries = _paths(ORIGINAL_LIBRARIES)
+    python = _paths("PYTHONPATH")
+    environment[PREFIXES] = os.pathsep.join(prefixes)
+    sourced = installation.is_wanted(environment)
+    if sourced is None:
+        prefixes.insert(0, INSIDE)
+        libraries.insert(0, INSIDE)
+        sys.path += python
+    else:
+        libraries.append(INSIDE)
+        sys.path[:0] = [*python, str(sourced.site)]
+        # What a distribution's ROS asks of its Python, numpy for one, and may be missing here.
+        version = f"/usr/lib/python{sys.version_info[0]}.{sys.version_info[1]}"
+        sys.path += [version, f"{version}/lib-dynload", "/usr/lib/python3/dist-packages"]
+    environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
+    environment[PREFIXES] = os.pathsep.join(prefixes)
+    if not os.access(environment.get("HOME", ""), os.W_OK):  # where ROS wants to put its logs
+        environment.setdefault("ROS_LOG_DIR", f"{INSIDE}/log")
+    if _paths(LIBRARIES) != libraries:  # which is read when a program starts
+        environment[LIBRARIES] = os.pathsep.join(libraries)
+        os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+
+
+def _paths(variable: str) -> list[str]:
+    return [path for path in os.environ.get(variable, "").split(os.pathsep) if path]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Which ROS 2 this process uses, which others there are, and what to do to use those.
+
+Nothing of ROS is imported here: `appliance doctor` asks before, and the one file decides by it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+#: Which ROS the one file uses: `system` (the sourced one) or `bundled` (its own). Unset, it is the
+#: sourced one when that has types that the bundled one has not, and both have the same Python.
+CHOICE = "ROS_FROM"
+
+DEFAULT_RMW = "rmw_fastrtps_cpp"
+
+_EXTENSION = re.compile(r"_rclpy_pybind11\.cpython-(\d)(\d+)")
+_SITES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages")
+
+PythonVersion = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Sourced:
+    """A ROS 2 that the environment names: the Python that its rclpy is for, the folder that this is
+    in, and its distribution where ROS_DISTRO says it."""
+
+    python: PythonVersion
+    site: Path
+    distribution: str
+
+    @property
+    def fits(self) -> bool:
+        """Whether this process can import it."""
+        return self.python == sys.version_info[:2]
+
+    def __str__(self) -> str:
+        name = f"ROS 2 {self.distribution}" if self.distribution else "the ROS 2"
+        return f"{name} in {self.site} (Python {_dotted(self.python)})"
+
+
+@dataclass(frozen=True)
+class Installation:
+    """The ROS 2 that is used, and `advice`, a sentence on what to do where there is something.
+
+    `source` is `sourced`, `bundled` (in the one file), `installed` (from PyPI) or `none`; `where`
+    is the folder of its Python packages. `rmw` and `domain` are as the environment has them.
+    """
+
+    source: Literal["sourced", "bundled", "installed", "none"]
+    where: Path | None
+    python: PythonVersion
+    rmw: str
+    domain: str
+    sourced: Sourced | None
+    advice: str
+
+    def __str__(self) -> str:
+        if self.source == "none":
+            return "no ROS 2"
+        name = str(self.sourced) if self.source == "sourced" else f"ROS 2, {self.source}"
+        return f"{name}, {self.rmw}, domain {self.domain}"
+
+
+def find(environment: Mapping[str, str] | None = None) -> Installation:
+    """What an import of rclpy finds in this process. Imports nothing."""
+    environment = os.environ if environment is None else environment
+    sourced = find_sourced(environment)
+    spec = find_spec("rclpy")
+    where = Path(spec.origin).parent.parent if spec is not None and spec.origin else None
+    is_sourced = sourced is not None and where is not None and where.samefile(sourced.site)
+    source: Literal["sourced", "bundled", "installed", "none"] = "installed"
+    if where is None or (is_sourced and sourced is not None and not sourced.fits):
+        source = "none"
+    elif is_sourced:
+        source = "sourced"
+    elif is_frozen():
+        source = "bundled"
+    return Installation(
+        source,
+        where if source != "none" else None,
+        sys.version_info[:2],
+        environment.get("RMW_IMPLEMENTATION") or DEFAULT_RMW,
+        environment.get("ROS_DOMAIN_ID") or "0",
+        sourced,
+        _advice(source, sourced, environment.get(CHOICE)),
+    )
+
+
+def find_sourced(environment: Mapping[str, str]) -> Sourced | None:
+    """The first ROS 2 that PYTHONPATH or AMENT_PREFIX_PATH leads to, as sourcing sets them."""
+    fitting: list[Sourced] = []
+    others: list[Sourced] = []
+    for site in _sites(environment):
+        for extension in sorted(Path(site, "rclpy").glob("_rclpy_pybind11.*.so")):
+            if match := _EXTENSION.match(extension.name):
+                python = int(match[1]), int(match[2])
+                found = Sourced(python, site, environment.get("ROS_DISTRO", ""))
+                (fitting if found.fits else others).append(found)
+    return next(iter([*fitting, *others]), None)
+
+
+def _sites(environment: Mapping[str, str]) -> Iterator[Path]:
+    yield from map(Path, _paths(environment, "PYTHONPATH"))
+    for prefix in map(Path, _paths(environment, "AMENT_PREFIX_PATH")):
+        if not _is_own(prefix):
+            for pattern in _SITES:
+                yield from sorted(prefix.glob(pattern))
+
+
+def is_wanted(environment: Mapping[str, str]) -> Sourced | None:
+    """The sourced ROS, when the one file shall use it in place of its own, see CHOICE."""
+    choice = environment.get(CHOICE, "")
+    sourced = find_sourced(environment) if choice != "bundled" else None
+    if sourced is None or not sourced.fits:
+        return None
+    prefixes = [Path(path) for path in _paths(environment, "AMENT_PREFIX_PATH")]
+    others = {name for prefix in prefixes if not _is_own(prefix) for name in _interfaces(prefix)}
+    return sourced if choice == "system" or others - set(_interfaces(Path(sys.prefix))) else None
+
+
+def is_frozen() -> bool:
+    """Whether this is the one file."""
+    return bool(getattr(sys, "frozen", False))
+
+
+def _advice(source: str, sourced: Sourced | None, choice: str | None) -> str:
+    if sourced is not None and not sourced.fits:
+        python = f"python{_dotted(sourced.python)}"
+        fits = (
+            f"{sourced} cannot be used by this appliance, which has Python "
+            f"{_dotted(sys.version_info[:2])}. To use it: {python} -m venv --system-site-packages "
+            "~/appliance && ~/appliance/bin/pip install ros-mqtt-appliance"
+        )
+        if source == "none" or choice == "system":
+            return fits
+        return (
+            f"topics of all its message packages are bridged; should services and actions of "
+            f"packages of your own be bridged too: {fits}"
+        )
+    if sourced is None and choice == "system":
+        return f"{CHOICE} is system, and no ROS 2 is sourced: source its setup file first"
+    if source == "none":
+        return (
+            "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
+            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
+        )
+    return ""
+
+
+def _interfaces(prefix: Path) -> Iterator[str]:
+    folder = prefix / "share/ament_index/resource_index/rosidl_interfaces"
+    if folder.is_dir():
+        yield from (entry.name for entry in folder.iterdir())
+
+
+def _is_own(prefix: Path) -> bool:
+    return prefix == Path(sys.prefix)
+
+
+def _paths(environment: Mapping[str, str], variable: str) -> list[str]:
+    return [path for path in environment.get(variable, "").split(os.pathsep) if path]
+
+
+def _dotted(version: PythonVersion) -> str:
+    return ".".join(map(str, version))

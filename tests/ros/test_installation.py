@@ -1,0 +1,83 @@
+"""Which ROS is found, and what is said of one that cannot be used; nothing of it is imported."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from appliance.ros import installation
+from appliance.ros.installation import find, find_sourced, is_wanted
+
+HERE = sys.version_info[:2]
+OTHER = (3, 99)
+
+
+def source(folder, python=HERE, packages=("std_msgs",), distribution="jazzy"):
+    """A distribution's folder, and the environment after its setup file was sourced."""
+    version = f"{python[0]}.{python[1]}"
+    site = folder / f"lib/python{version}/site-packages"
+    (site / "rclpy").mkdir(parents=True)
+    (site / "rclpy/__init__.py").touch()
+    (site / f"rclpy/_rclpy_pybind11.cpython-{version.replace('.', '')}-x86_64-linux-gnu.so").touch()
+    index = folder / "share/ament_index/resource_index/rosidl_interfaces"
+    index.mkdir(parents=True)
+    for package in packages:
+        (index / package).touch()
+    return {"AMENT_PREFIX_PATH": str(folder), "PYTHONPATH": str(site), "ROS_DISTRO": distribution}
+
+
+@pytest.fixture
+def inside(tmp_path, monkeypatch):
+    """What the one file is unpacked to, with std_msgs in it."""
+    source(tmp_path / "inside")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "inside"))
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+
+
+def test_a_sourced_ros_is_found_by_pythonpath_or_by_its_prefix(tmp_path):
+    environment = source(tmp_path / "jazzy")
+    by_path = find_sourced(environment)
+    assert by_path is not None
+    assert by_path.fits
+    assert str(by_path).startswith(f"ROS 2 jazzy in {tmp_path}/jazzy/lib")
+    del environment["PYTHONPATH"]
+    assert find_sourced(environment) == by_path
+    assert find_sourced({"AMENT_PREFIX_PATH": f":{tmp_path}/nothing", "PYTHONPATH": ""}) is None
+
+
+def test_of_two_the_one_that_fits_is_found(tmp_path):
+    other, fitting = source(tmp_path / "other", OTHER), source(tmp_path / "fitting")
+    both = {"AMENT_PREFIX_PATH": ":".join(e["AMENT_PREFIX_PATH"] for e in (other, fitting))}
+    found = find_sourced(both)
+    assert found is not None
+    assert found.python == HERE
+
+
+def test_the_one_file_takes_a_sourced_ros_for_types_that_it_has_not(tmp_path, inside):
+    same = source(tmp_path / "same")
+    more = source(tmp_path / "more", packages=("std_msgs", "rover_msgs"))
+    assert is_wanted(same) is None
+    assert is_wanted(same | {"ROS_FROM": "system"})
+    assert is_wanted(more)
+    assert is_wanted(more | {"ROS_FROM": "bundled"}) is None
+    other = source(tmp_path / "other", OTHER, packages=("rover_msgs",))
+    assert is_wanted(other | {"ROS_FROM": "system"}) is None
+
+
+def test_what_to_do_about_another_python(tmp_path, monkeypatch):
+    environment = source(tmp_path / "jazzy", OTHER)
+    monkeypatch.setattr(sys, "path", [environment["PYTHONPATH"]])
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
+    found = find(environment)
+    assert (found.source, found.where) == ("none", None)
+    assert f"cannot be used by this appliance, which has Python {HERE[0]}.{HERE[1]}" in found.advice
+    assert "python3.99 -m venv --system-site-packages" in found.advice
+
+
+def test_what_to_do_where_there_is_none(monkeypatch):
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
+    assert "Source a ROS 2 setup file first" in find({}).advice
+    assert "no ROS 2 is sourced" in find({"ROS_FROM": "system"}).advice
+    found = find({"ROS_DOMAIN_ID": "7", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    assert (found.domain, found.rmw, str(found)) == ("7", "rmw_cyclonedds_cpp", "no ROS 2")

@@ -1,0 +1,186 @@
+"""Messages that the event loop's thread takes itself, on real ROS 2."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+from test_ros2 import BYTES, STRING, domain, house, peer, route, string, until
+
+from appliance.ros import ros2, ros2_loop
+from appliance.ros.mailbox import LARGE
+from appliance.ros.node import QosProfile
+
+__all__ = ["domain", "house", "peer"]  # fixtures
+
+
+def open_files():
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+class Taker:
+    """A node with one subscription, and who was called with what of it."""
+
+    def __init__(self, type_name=STRING, depth=1000):
+        self.node = ros2.Ros2Node()
+        self.taken = []
+        self.lots = []
+        self.lost = 0
+        self.failures = []
+        self._type = type_name
+        self._qos = QosProfile(depth=depth)
+        self.subscription = None
+
+    def start(self):
+        self.node.start(self._look, self.failures.append, asyncio.get_running_loop())
+
+    def _look(self):
+        if self.subscription is None:
+            self.subscription = self.node.subscribe_raw(
+                "/a", self._type, self._qos, self._on_message, on_loop=self._on_lot
+            )
+
+    def _on_message(self, cdr, published_at=0):
+        self.taken.append((threading.current_thread().name, cdr))
+
+    def _on_lot(self, lot, lost):
+        self.lots.append(len(lot))
+        self.lost += lost
+        for cdr, _ in lot:
+            self._on_message(cdr)
+
+    async def advertised(self, peer):
+        """Both ends have found each other: the publisher alone knowing it is not enough."""
+        await peer.do("advertise", "/a", self._type)
+        await peer.do("matched", "/a")
+        probe = string("")
+
+        async def arrives():
+            await peer.do("publish", "/a", probe.hex())
+            return self.taken
+
+        for _ in range(200):
+            if await arrives():
+                break
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(0.1)
+        self.taken.clear()
+        self.lots.clear()
+
+
+@pytest.fixture
+async def taker():
+    takers = []
+
+    def start(*args, **kw):
+        takers.append(Taker(*args, **kw))
+        takers[-1].start()
+        return takers[-1]
+
+    yield start
+    for each in takers:
+        await asyncio.to_thread(each.node.stop)
+        assert each.failures == []
+
+
+async def test_small_messages_are_taken_on_the_loops_thread(taker, peer):
+    taker = taker()
+    await taker.advertised(peer)
+    for number in range(20):
+        await peer.do("publish", "/a", string(f"{number:03d}").hex())
+    await until(lambda: len(taker.taken) == 20, "all")
+    here = threading.current_thread().name
+    assert taker.taken == [(here, string(f"{number:03d}")) for number in range(20)]
+
+
+async def test_large_ones_are_left_to_the_ros_thread_and_all_stay_in_order(taker, peer):
+    taker = taker(BYTES)
+    await taker.advertised(peer)
+    small, large = 10, LARGE + 1
+    sizes = [small] * 3 + [large] + [small] * (ros2_loop.SMALL_IN_A_ROW + 3) + [large, large]
+    for number, size in enumerate(sizes):
+        await peer.do("publish_image", "/a", size, 1, 10_000)
+        if size == small:  # they are not taken in one go
+            await until(lambda number=number: len(taker.taken) == number + 1, "the message")
+    await until(lambda: len(taker.taken) == len(sizes), "all")
+    assert [len(cdr) > LARGE for _, cdr in taker.taken] == [size == large for size in sizes]
+    here, there = threading.current_thread().name, "ros"
+    names = [name for name, _ in taker.taken]
+    back = 4 + ros2_loop.SMALL_IN_A_ROW
+    assert names[:3] == [here] * 3
+    assert names[3:back] == [there] * (back - 3)
+    assert names[back:] == [here] * 3 + [there] * 2
+
+
+async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_for(taker, peer):
+    taker = taker(depth=1000)
+    await taker.advertised(peer)
+    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 300, 2000))
+    await asyncio.sleep(0.02)
+    time.sleep(0.3)  # noqa: ASYNC251 - the loop has other things to do
+    await publishing
+    await until(lambda: len(taker.taken) == 300, "all")
+    assert max(taker.lots) == ros2_loop.LOT
+    assert taker.lost == 0
+
+
+async def test_what_a_busy_loop_misses_is_counted(house, peer):
+    house.start(route("/a", "mqtt", "cdr"))
+    await peer.do("advertise", "/a", STRING)
+    await until(house.bridged, "/a")
+    await peer.do("matched", "/a")
+    for _ in range(5):
+        publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 100, 2000))
+        await asyncio.sleep(0.01)
+        time.sleep(0.1)  # noqa: ASYNC251 - as before
+        await publishing
+    await peer.do("publish", "/a", string("end").hex())
+    await until(lambda: string("end") in house.payloads("r2d2/a"), "the last")
+    arrived = len(house.payloads("r2d2/a"))
+    assert arrived < 400
+    assert house.bridge.status()[0].dropped == 501 - arrived
+
+
+async def test_subscriptions_come_and_go_while_messages_come(house, peer):
+    routes = [route("/a", "mqtt", "text"), route("/b", "mqtt", "text")]
+    house.start(*routes)
+    for topic in ("/a", "/b"):
+        await peer.do("advertise", topic, STRING)
+    await until(lambda: len(house.bridged()) == 2, "both")
+
+    def names():
+        return {topic for topic in ("/a", "/b") if house.node.count(topic)[1]}
+
+    files = open_files()
+    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 4000, 2000))
+    loops = 0
+    while not publishing.done():
+        house.bridge.replace(routes[1:])
+        await until(lambda: "/a" not in names(), "the end of /a")
+        seen = len(house.payloads("r2d2/a"))
+        await asyncio.sleep(0.05)
+        assert len(house.payloads("r2d2/a")) == seen
+        house.bridge.replace(routes)
+        await until(lambda: len(house.bridged()) == 2, "/a again")
+        loops += 1
+    await publishing
+    assert loops > 3
+    assert open_files() == files
+
+
+async def test_the_ros_thread_takes_all_where_it_cannot_be_otherwise(monkeypatch, taker, peer):
+    def refuse(pointer):
+        raise ros2_loop.UnavailableError("not here")
+
+    monkeypatch.setattr(ros2_loop, "Doorbell", refuse)
+    taker = taker()
+    await taker.advertised(peer)
+    await peer.do("publish", "/a", string("one").hex())
+    await until(lambda: taker.taken, "the message")
+    assert taker.taken == [("ros", string("one"))]
+    assert taker.lots == []

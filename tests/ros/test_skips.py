@@ -1,0 +1,226 @@
+"""What is not bridged, and why: on a FakeNode, and as `appliance routes` prints it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+
+pytest.importorskip("std_srvs.srv")
+from call_house import AllTypes, House, action, call_routes, parameters, service, until
+
+from appliance import cli, control
+from appliance.ros.bridge import RouteSettings
+from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.node import FakeNode
+from appliance.ros.skips import MOST_TOLD
+
+STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+TRIGGER = "std_srvs/srv/Trigger"
+
+
+class Bus(FakeNode):
+    """Knows which services' types are installed, as rclpy does."""
+
+    def create_client(self, service, type_name):
+        self._check(type_name)
+        return super().create_client(service, type_name)
+
+    def create_service(self, service, type_name, callback):
+        self._check(type_name)
+        return super().create_service(service, type_name, callback)
+
+    def _check(self, type_name):
+        if type_name.startswith("acme"):
+            raise UnknownTypeError(f"no {type_name}: the package is not installed here")
+
+
+@pytest.fixture
+async def house():
+    house = House(Bus(types=AllTypes()))
+    yield house
+    await house.stop()
+
+
+def topic(ros, to="mqtt", **kw):
+    names = (ros,) if isinstance(ros, str) else tuple(ros)
+    return RouteSettings(names[0] if len(names) == 1 else names, to, "r2d2{ros}", **kw)
+
+
+def skipped(house):
+    """Why, by name and direction."""
+    return {(skip.ros, skip.direction): skip.why for skip in house.bridge.skips()}
+
+
+def told(house):
+    return house.retained("r2d2/_appliance/skipped")
+
+
+async def look(house):
+    house.node.spin()
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+
+
+async def test_topics(house):
+    node = house.node
+    house.start(
+        topics=[
+            topic("/odom"),
+            topic("/cmd", "ros"),
+            topic("/lidar", "mqtt", type="acme_msgs/msg/Points"),
+            topic(["/arm/**", "!/arm/raw"]),
+            topic("/**", type="std_msgs/msg/*"),
+        ]
+    )
+    for name, kind in (
+        ("/lidar", "acme_msgs/msg/Points"),
+        ("/arm/joint", TWIST),
+        ("/arm/raw", TWIST),
+        ("/arm/_secret", TWIST),
+        ("/text", STRING),
+        ("/twist", TWIST),
+        ("/_text", STRING),
+        ("/walk/_action/feedback", STRING),
+    ):
+        node.add_publisher(name, kind)
+    await look(house)
+    assert skipped(house) == {
+        ("/lidar", "to_mqtt"): "problem",
+        ("/odom", "to_mqtt"): "absent",
+        ("/cmd", "to_ros"): "absent",
+        ("/arm/raw", "to_mqtt"): "left_out",
+        ("/arm/_secret", "to_mqtt"): "hidden",
+        ("/_text", "to_mqtt"): "hidden",
+        ("/twist", "to_mqtt"): "other_type",
+    }
+    by_name = {skip.ros: skip for skip in house.bridge.skips()}
+    assert by_name["/arm/raw"].reason == "left out by !/arm/raw"
+    assert by_name["/arm/raw"].type == TWIST
+    assert "acme_msgs is not installed" in by_name["/lidar"].reason
+    assert by_name["/twist"].reason == "the route takes std_msgs/msg/*"
+    assert [skip.why for skip in house.bridge.skips()][:3] == ["problem", "absent", "absent"]
+    # They come, and are skipped no longer.
+    node.add_publisher("/odom", "nav_msgs/msg/Odometry")
+    node.add_subscriber("/cmd", TWIST)
+    await look(house)
+    assert not {("/odom", "to_mqtt"), ("/cmd", "to_ros")} & skipped(house).keys()
+    assert told(house)["count"] == 6  # /cmd is of another type than patterns to MQTT take
+    assert told(house)["by_reason"] == {"problem": 1, "left_out": 1, "hidden": 2, "other_type": 2}
+    assert told(house)["skipped"][0] == {
+        "ros": "/lidar",
+        "direction": "to_mqtt",
+        "type": "acme_msgs/msg/Points",
+        "why": "problem",
+        "reason": by_name["/lidar"].reason,
+    }
+    # Another type on a topic that is bridged.
+    node.add_publisher("/text", TWIST)
+    for _ in range(6):
+        await look(house)
+    # Of two types that fit, one is carried.
+    node.add_publisher("/arm/joint", STRING)
+    for _ in range(6):
+        await look(house)
+    assert skipped(house)["/arm/joint", "to_mqtt"] == "two_types"
+    # And other routes.
+    house.bridge.replace([topic("/twist")])
+    await look(house)
+    assert skipped(house) == {}
+
+
+async def test_what_is_called(house):
+    node = house.node
+    house.start(
+        service(["/absent", "/arm/*", "!/arm/off", "/odd"]),
+        service("/**", type="std_srvs/srv/Set*"),
+        service("/ask", to="mqtt", type="acme_srvs/srv/Ask"),
+        action(["/fly", "/walk*"], type="test_msgs/action/Fib*"),
+        parameters(["/ghost/speed", "/node/*", "/mute/*"]),
+    )
+    for name, kind in (
+        ("/arm/grip", TRIGGER),
+        ("/arm/off", TRIGGER),
+        ("/arm/_grip", TRIGGER),
+        ("/odd", "acme_srvs/srv/Odd"),
+        ("/trigger", TRIGGER),
+        ("/arm/get_parameters", "rcl_interfaces/srv/GetParameters"),
+        ("/walk/_action/send_goal", "test_msgs/action/Fibonacci_SendGoal"),
+        ("/walk_far/_action/send_goal", "test_msgs/action/Far_SendGoal"),
+    ):
+        node.add_service(name, kind, lambda request, respond: None)
+    await look(house)
+    await look(house)
+    assert skipped(house) == {
+        ("/absent", "service"): "absent",
+        ("/odd", "service"): "problem",
+        ("/arm/off", "service"): "left_out",
+        ("/arm/_grip", "service"): "hidden",
+        ("/arm/get_parameters", "service"): "of_every_node",
+        ("/trigger", "service"): "other_type",
+        ("/ask", "provided"): "problem",
+        ("/fly", "action"): "absent",
+        ("/walk_far", "action"): "other_type",
+        ("/ghost", "parameters"): "absent",
+        ("/node", "parameters"): "absent",
+        ("/mute", "parameters"): "absent",
+    }
+
+    def refuse(request, respond):
+        pass
+
+    node.add_service("/mute/get_parameters", "rcl_interfaces/srv/GetParameters", refuse)
+    await look(house)  # and no list_parameters
+    mute = "/mute", "parameters"
+    await until(lambda: skipped(house).get(mute) == "problem", "it cannot be read")
+    house.bridge.calls.replace(call_routes())
+    assert skipped(house) == {}
+
+
+async def test_what_is_told_on_mqtt_is_bounded(house):
+    house.start(service("/arm/*"), topics=[topic(["/**", "!/a/**"])])
+    for number in range(MOST_TOLD + 50):
+        house.node.add_publisher(f"/a/topic_{number}", STRING)
+    await look(house)
+    assert told(house)["count"] == MOST_TOLD + 50
+    assert len(told(house)["skipped"]) == MOST_TOLD
+    await house.bridge.stop()
+    assert told(house)["count"] == 0
+
+
+def entry(number, why="left_out"):
+    return {
+        "ros": f"/arm/raw_{number}",
+        "direction": "to_mqtt",
+        "type": STRING,
+        "why": why,
+        "reason": "left out by !/arm/raw*",
+    }
+
+
+@pytest.mark.parametrize("arguments", [[], ["--all"], ["--json"], ["--json", "--all"]])
+def test_the_command(tmp_path, monkeypatch, capsys, arguments):
+    (tmp_path / "appliance.yaml").write_text("")
+    skips = [entry(1, "problem"), *map(entry, range(2, 33)), entry(40, "of_every_node")]
+    monkeypatch.setattr(control, "ask", lambda path, what: skips if what == "skipped" else [])
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["routes", "-c", str(tmp_path / "appliance.yaml"), *arguments])
+    assert ended.value.code == 0
+    output = capsys.readouterr().out
+    if "--json" in arguments:  # without --all there are those only that programs know
+        expected = skips if "--all" in arguments else []
+        assert [json.loads(line) for line in output.splitlines()] == expected
+        return
+    lines = output.splitlines()
+    assert lines[:3] == [
+        "nothing is bridged now",
+        "",
+        "skipped: 1 cannot be set up, 31 left out, 1 that every node has",
+    ]
+    assert lines[3].split() == ["/arm/raw_1", "→", STRING, "left", "out", "by", "!/arm/raw*"]
+    if arguments:
+        assert len(lines) == 3 + 33
+    else:
+        assert len(lines) == 3 + 20 + 1
+        assert lines[-1] == "and 13 more: appliance routes --all"

@@ -1,0 +1,224 @@
+"""`appliance install` into an image, the unit as systemd reads it, and the Debian package."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from appliance.config import load
+from appliance.init import Credentials
+from appliance.install import Installation, InstallError
+from appliance.unit import Unit
+
+PROJECT = Path(__file__).resolve().parent.parent.parent
+COMMAND = Path("usr/local/bin/appliance")
+UNIT = Path("etc/systemd/system/appliance.service")
+UID = 4321
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    """As much of a system as `useradd` wants."""
+    root = tmp_path / "image"
+    (root / "etc").mkdir(parents=True)
+    for name in ("passwd", "group", "shadow", "gshadow"):
+        (root / "etc" / name).touch()
+    (root / "etc/passwd").write_text(f"robot:x:{UID}:{UID}::/home/robot:/bin/sh\n")
+    (root / "etc/group").write_text(f"drivers:x:{UID}:\n")
+    return root
+
+
+def single_file(directory: Path, version: int = 1) -> Path:
+    path = directory / f"appliance-{version}"
+    path.write_text(f"#!/bin/sh\necho {version}\n")
+    return path
+
+
+def install(image: Path, source: Path, **options: object) -> dict[str, str]:
+    """What was done, by the thing that it was done to."""
+    steps = list(Installation(Path("/", COMMAND), source, image, **options).install())  # type: ignore[arg-type]
+    return {step.subject: step.verb for step in steps if not isinstance(step, Credentials)}
+
+
+def test_into_an_image_and_again(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    done = install(image, single_file(tmp_path), robot="r2d2")
+    assert set(done.values()) == {"made"}
+    uid = int(
+        next(
+            line.split(":")[2]
+            for line in (image / "etc/passwd").read_text().splitlines()
+            if line.startswith("appliance:")
+        )
+    )
+    home = image / "etc/appliance"
+    key = home / "certs/server.key"
+    for path in (home, key, home / "users.passwd", home / "appliance.yaml"):
+        assert path.stat().st_uid == uid, path
+    assert stat.S_IMODE(home.stat().st_mode) == 0o750 and stat.S_IMODE(key.stat().st_mode) == 0o600
+    assert (image / "var/lib/appliance").stat().st_uid == uid
+    settings = load(home / "appliance.yaml")
+    assert settings.robot == "r2d2"
+    assert settings.broker.store.path == Path("/var/lib/appliance/store.db")
+    assert settings.control == Path("/run/appliance/control.sock")
+    assert settings.crash_reports == Path("/var/lib/appliance/crashes")
+    enabled = image / "etc/systemd/system/multi-user.target.wants/appliance.service"
+    assert enabled.readlink() == Path("/", UNIT)
+
+    (home / "acl.conf").write_text("# mine\n")
+    (image / "etc/default/appliance").write_text("ROS_DOMAIN_ID=7\n")
+    before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
+    done = install(image, single_file(tmp_path, 2))
+    assert done.pop("/usr/local/bin/appliance") == "replaced"
+    assert set(done.values()) == {"kept"}
+    assert (image / COMMAND).read_text() == single_file(tmp_path, 2).read_text()
+    assert os.access(image / COMMAND, os.X_OK)
+    assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
+    assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
+
+    done = install(image, single_file(tmp_path, 2), user="robot")
+    assert done["/etc/systemd/system/appliance.service"] == "replaced"
+    unit = (image / UNIT).read_text()
+    assert "User=robot\nGroup=drivers\n" in unit and "FASTDDS_BUILTIN_TRANSPORTS" not in unit
+    assert {path.stat().st_uid for path in before} == {UID}
+    assert key.stat().st_uid == (image / "var/lib/appliance").stat().st_uid == UID
+    install(image, single_file(tmp_path, 3))
+    assert "User=robot" in (image / UNIT).read_text(), "an upgrade keeps the user"
+
+    list(Installation(Path("/", COMMAND), root=image).uninstall())
+    assert not (image / COMMAND).exists() and not (image / UNIT).exists()
+    assert not enabled.is_symlink()
+    assert {path: path.read_bytes() for path in before} == before
+    list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    assert not home.exists() and not (image / "var/lib/appliance").exists()
+    assert list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True)) == []
+
+
+def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
+    """What the service's user has put into its folder must not make root give anything away."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    secret = tmp_path / "shadow"
+    secret.touch()
+    home = image / "etc/appliance"
+    home.mkdir()
+    (home / "link").symlink_to(secret)
+    os.link(secret, home / "hard")
+    install(image, single_file(tmp_path))
+    assert secret.stat().st_uid == os.geteuid()
+
+
+def test_a_dry_run_changes_nothing(image: Path, tmp_path: Path) -> None:
+    before = sorted(image.rglob("*"))
+    done = install(image, single_file(tmp_path), dry_run=True)
+    assert done["appliance"] == done["/etc/appliance"] == "made"
+    assert sorted(image.rglob("*")) == before
+
+
+def test_for_several_robots_no_keys_are_made(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path), initialise=False)
+    assert (image / UNIT).exists() and not (image / "etc/appliance").exists()
+
+
+def test_what_is_in_the_way_is_told(image: Path, tmp_path: Path) -> None:
+    def error(*arguments: object, **options: object) -> str:
+        with pytest.raises(InstallError) as raised:
+            list(Installation(*arguments, dry_run=True, **options).install())  # type: ignore[arg-type]
+        return str(raised.value)
+
+    file = single_file(tmp_path)
+    assert "there is no user nobody-here" in error(
+        Path("/", COMMAND), file, image, user="nobody-here"
+    )
+    assert "there is no directory" in error(Path("/", COMMAND), file, image / "none")
+    assert "would not be there for the service" in error(Path("/tmp/venv/bin/appliance"))
+    assert "use the single file" in error(Path("/opt/venv/bin/appliance"), None, image)
+    packaged = image / "usr/lib/systemd/system/appliance.service"
+    packaged.parent.mkdir(parents=True)
+    packaged.touch()
+    assert "apt upgrades and removes it" in error(Path("/", COMMAND), file, image)
+
+
+def test_what_a_sourced_ros_says_is_taken_over(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    shell = {"ROS_DOMAIN_ID": "7", "ROS_DISTRO": "nowhere", "RMW_IMPLEMENTATION": "a\nb"}
+    install(image, single_file(tmp_path), environment=shell)
+    lines = (image / "etc/default/appliance").read_text().splitlines()
+    assert [line for line in lines if line and line[0] != "#"] == ["ROS_DOMAIN_ID=7"]
+
+
+def analyze(unit: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["systemd-analyze", *arguments, unit], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("user", ["appliance", "robot"])
+def test_systemd_understands_the_unit(tmp_path: Path, user: str) -> None:
+    command = tmp_path / "the 50% $HOME/appliance"
+    command.parent.mkdir()
+    command.write_text("#!/bin/sh\n")
+    command.chmod(0o755)
+    file = tmp_path / "appliance.service"
+    file.write_text(str(Unit(command, user, user)))
+    assert analyze(file, "verify") == ""
+    rated = analyze(file, "security", "--offline=true")
+    exposure = re.search(r"exposure level for appliance.service: ([\d.]+)", rated)
+    assert exposure is not None and float(exposure[1]) < 3.0, rated
+
+
+def test_the_debian_package(tmp_path: Path) -> None:
+    built = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "appliance.packaging.deb",
+            single_file(tmp_path),
+            "--directory",
+            tmp_path,
+        ],
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    package = Path(built.stdout.strip())
+    assert re.fullmatch(r"appliance_[\w.~]+_\w+\.deb", package.name)
+    subprocess.run(["dpkg-deb", "--raw-extract", package, tmp_path / "raw"], check=True)
+    raw = tmp_path / "raw"
+    files = {str(path.relative_to(raw)) for path in raw.rglob("*") if path.is_file()}
+    assert {"usr/bin/appliance", "usr/lib/systemd/system/appliance.service"} <= files
+    assert not [name for name in files if name.startswith("etc/appliance") or ".key" in name]
+    assert (raw / "DEBIAN/conffiles").read_text() == "/etc/default/appliance\n"
+    unit = (raw / "usr/lib/systemd/system/appliance.service").read_text()
+    assert '"/usr/bin/appliance" run --config /etc/appliance/appliance.yaml' in unit
+    assert "NotifyAccess=all" in unit, "the single file runs in a child of the main process"
+    for name in ("postinst", "prerm", "postrm"):
+        subprocess.run(["sh", "-n", raw / "DEBIAN" / name], check=True)
+
+
+def test_the_first_configuration_is_one(tmp_path: Path) -> None:
+    from appliance.init import CONFIGURATION
+    from appliance.install import _SERVICE_PATHS
+
+    text = CONFIGURATION.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1).format(robot="r2d2")
+    assert yaml.safe_load(text).keys() == {
+        "robot",
+        "broker",
+        "control",
+        "crash_reports",
+        "bridge",
+    }

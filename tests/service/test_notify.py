@@ -1,0 +1,137 @@
+"""The conversation with systemd, on a real notify socket and with a real process."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from appliance_process import eventually
+from raw_client import RawClient
+
+from appliance.control import ask
+from appliance.notify import Notifier
+from service.supervisor import NotifySocket, Supervised
+
+WATCHDOG = 1.0
+
+
+@pytest.fixture(params=["abstract", "path"])
+def notify(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[NotifySocket]:
+    with NotifySocket(tmp_path / "notify" if request.param == "path" else None) as notify:
+        yield notify
+
+
+def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
+    appliance = Supervised(tmp_path / "house")
+    appliance.supervise(notify, WATCHDOG)
+    appliance.start()
+    try:
+        with RawClient(appliance, 5, tls=True) as client:  # MQTT answers as soon as it is ready
+            client.connect("first")
+        assert notify.all("STATUS") == ["0 clients, without ROS"]
+
+        notify.wait(lambda: len(notify.all("WATCHDOG")) >= 4, "signs of life")
+        beats = [when for when, fields in notify.messages if "WATCHDOG" in fields]
+        assert all(b - a < 0.9 * WATCHDOG for a, b in itertools.pairwise(beats))
+
+        for reloading in (
+            lambda: ask(tmp_path / "house/state/control.sock", "reload"),
+            lambda: os.kill(appliance.pid, signal.SIGHUP),
+        ):
+            notify.messages.clear()
+            before = time.monotonic_ns() // 1000
+            reloading()
+            notify.wait(lambda: notify.all("READY"), "READY=1 after the reload")
+            first = next(fields for _, fields in notify.messages if "WATCHDOG" not in fields)
+            assert first["RELOADING"] == "1"
+            assert before < int(first["MONOTONIC_USEC"]) <= time.monotonic_ns() // 1000
+
+        appliance.config.write_text("robot: [")  # a reload that fails has an end, too
+        notify.messages.clear()
+        os.kill(appliance.pid, signal.SIGHUP)
+        notify.wait(lambda: notify.all("READY"), "READY=1 after the reload")
+        assert "not reloaded" in appliance.log
+    finally:
+        appliance.stop()
+    assert notify.messages[-1][1] == {"STOPPING": "1", "STATUS": "stopping"}
+
+
+def test_a_hung_one_leaves_all_threads_tracebacks(tmp_path: Path) -> None:
+    with NotifySocket() as notify:
+        _hang(tmp_path, notify)
+
+
+def _hang(tmp_path: Path, notify: NotifySocket) -> None:
+    appliance = Supervised(tmp_path)
+    appliance.supervise(notify, WATCHDOG)
+    appliance.start()
+    assert appliance.hang() == -signal.SIGABRT
+    appliance.start()
+    try:
+        (line,) = appliance.wait_for_log("the last run crashed on .*Fatal Python error: Aborted")
+        path = Path(line.rpartition(" ")[2])
+        assert notify.all("STATUS")[-1].endswith(f"; began after a crash, see {path}")
+    finally:
+        appliance.stop()
+    report = path.read_text()
+    assert path.parent == tmp_path / "state/crashes" and path.stat().st_mode & 0o777 == 0o600
+    assert "robot: r2d2" in report and "Current thread" in report
+    assert list(path.parent.iterdir()) == [path], "nothing else is left by a clean end"
+
+
+def test_a_watchdog_for_another_process_is_not_ours() -> None:
+    with NotifySocket() as notify:
+        for pid, watchdog in (("", 2.5), (str(os.getpid()), 2.5), (str(os.getppid()), None)):
+            environment = {
+                "NOTIFY_SOCKET": notify.address,
+                "WATCHDOG_USEC": "2500000",
+                "WATCHDOG_PID": pid,
+                "HOME": "/",
+            }
+            notifier = Notifier.from_environment(environment)
+            assert notifier.watchdog == watchdog
+            assert environment == {"HOME": "/"}, "children do not inherit them"
+            notifier.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["/nowhere/notify", "@nobody", "vsock:2:1", "relative", "", "@"]
+)
+async def test_nobody_listens(address: str) -> None:
+    notifier = Notifier.from_environment({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "many"})
+    notifier.start(asyncio.get_running_loop(), lambda: "fine")
+    with notifier.reloading():
+        notifier.stopping()
+    notifier.close()
+    notifier.close()
+
+
+async def test_systemd_does_not_read(tmp_path: Path) -> None:
+    """A sign of life that does not fit into the socket's queue holds up nothing."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    listening.bind(str(tmp_path / "notify"))
+    notifier = Notifier(str(tmp_path / "notify"), 0.002)
+    notifier.start(asyncio.get_running_loop(), lambda: "fine")
+    began = time.monotonic()
+    await asyncio.sleep(0.3)
+    assert time.monotonic() - began < 0.8
+    notifier.close()
+    listening.close()
+
+
+def test_a_status_is_one_line() -> None:
+    with NotifySocket() as notify:
+        notifier = Notifier(notify.address)
+        loop = asyncio.new_event_loop()
+        notifier.start(loop, lambda: "fine\nWATCHDOG=trigger")
+        eventually(lambda: notify.messages, "READY=1")
+        assert notify.messages[0][1] == {"READY": "1", "STATUS": "fine WATCHDOG=trigger"}
+        notifier.close()
+        loop.close()

@@ -1,0 +1,298 @@
+"""`appliance doctor`: what is wrong is found and said, with what to do; and nothing is changed."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from appliance_process import ApplianceProcess
+
+from appliance import certs, cli, config
+from appliance.config import Settings
+from appliance.doctor import computer, examination, ports, ros, secrets
+from appliance.doctor.examination import Part, examine
+from appliance.doctor.finding import Finding
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.fixture
+def here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A folder that was set up, for a broker alone on ports that the system chooses."""
+    assert run("init", "--dir", str(tmp_path), "--robot", "r2") == 0
+    capsys.readouterr()
+    write(tmp_path, broker={"listeners": [{"bind": "127.0.0.1:0", "tls": True}]})
+    return tmp_path
+
+
+def write(directory: Path, **sections: Any) -> Settings:
+    settings = {"robot": "r2", "bridge": {"bus": "none"}, **sections}
+    file = directory / "appliance.yaml"
+    file.write_text(yaml.safe_dump(settings))
+    return config.load(file)
+
+
+def by_subject(findings: Iterator[Finding]) -> dict[str, Finding]:
+    return {finding.subject: finding for finding in findings}
+
+
+def snapshot(directory: Path) -> dict[str, tuple[int, int, int]]:
+    found = {}
+    for path in directory.rglob("*"):
+        state = path.lstat()
+        found[str(path)] = (state.st_mode, state.st_size, state.st_mtime_ns)
+    return found
+
+
+# All of it
+
+
+def test_everything_is_looked_at_and_nothing_changed(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = snapshot(here)
+    code = run("doctor", "--json", "-c", str(here / "appliance.yaml"))
+    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert snapshot(here) == before
+    assert code == any(each["level"] == "problem" for each in found)
+    subjects = {each["subject"] for each in found}
+    assert {
+        *("appliance", "port 127.0.0.1:0", "clock", "the server's certificate", "the CA"),
+        *("permissions", "disk of the store", "memory", "open files", "ROS"),
+        str(here / "acl.conf"),  # what `check` finds
+    } <= subjects
+    for each in found:
+        assert each["level"] == "ok" or each["advice"] or each["text"]
+
+
+def test_it_is_told_to_people_too(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "certs/server.key").chmod(0o644)
+    assert run("doctor", "-c", str(here / "appliance.yaml")) == 1
+    lines = capsys.readouterr().out.splitlines()
+    key = here / "certs/server.key"
+    place = lines.index(f"problem {key}: others can read it (mode 0644)")
+    assert lines[place + 1] == f"        what to do: chmod go= {key}"
+    assert lines[-1].startswith("problems: ")
+
+
+@pytest.mark.parametrize("text", [None, "", "robbot: r2", "\tx: {", "broker: []", "\0"])
+def test_a_configuration_that_is_missing_or_broken(tmp_path: Path, text: str | None) -> None:
+    file = tmp_path / "appliance.yaml"
+    if text is not None:
+        file.write_text(text)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(examination, "ros", lambda settings, running: iter(()))
+        findings = list(examine(file))
+    assert {"clock", "memory", "port 0.0.0.0:8883"} <= {each.subject for each in findings}
+    problems = [each for each in findings if each.subject == "configuration"]
+    assert (problems == []) is (text == "")
+    if text is None:
+        assert "appliance init" in problems[0].text
+
+
+def test_one_part_that_fails_leaves_the_others_their_say(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
+        yield Finding("ok", "clock", "ticks")
+        raise RuntimeError("a gear broke")
+
+    monkeypatch.setattr(examination, "clock", clock)
+    found = list(examine(here / "appliance.yaml"))
+    texts = [each.text for each in found if each.subject == "clock"]
+    assert texts == ["ticks", "could not be looked at: RuntimeError: a gear broke"]
+    assert found[-1].subject == "ROS"
+
+
+# The running one, and ports
+
+
+def test_ports_of_the_running_one_are_its_own(appliance: ApplianceProcess, tmp_path: Path) -> None:
+    binds = [f"127.0.0.1:{port}" for port in (appliance.port, appliance.plain_port)]
+    settings = write(tmp_path, broker={"listeners": [{"bind": bind} for bind in binds]})
+    found = by_subject(ports.ports(settings, {"pid": appliance.pid, "listeners": []}))
+    for port in (appliance.port, appliance.plain_port):
+        finding = found[f"port 127.0.0.1:{port}"]
+        assert finding.level == "ok" and f"pid {appliance.pid}" in finding.text
+    told = by_subject(examine(appliance.config))
+    assert f"is running, pid {appliance.pid}" in told["appliance"].text
+
+
+def test_a_port_that_another_program_has(here: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        settings = write(here, broker={"listeners": [{"bind": f"0.0.0.0:{port}"}]})
+        [finding] = ports.ports(settings, None)
+        assert finding.level == "problem" and f"(pid {os.getpid()})" in finding.text
+        assert "broker.listeners" in finding.advice
+    [finding] = ports.ports(settings, None)
+    assert (finding.level, finding.text) == ("ok", "free")
+
+
+def test_places_where_nobody_can_listen(here: Path) -> None:
+    (here / "file").touch()
+    binds = ["203.0.113.7:18883", f"unix:{here}/none/mqtt.sock", f"unix:{here}/file"]
+    settings = write(here, broker={"listeners": [{"bind": bind} for bind in binds]})
+    texts = [(each.level, each.text) for each in ports.ports(settings, None)]
+    assert texts == [
+        ("problem", "this computer does not have the address 203.0.113.7 now"),
+        ("problem", f"{here}/none is no folder that can be written"),
+        ("problem", "there is another file"),
+    ]
+
+
+# The computer
+
+
+def test_a_clock_that_is_not_set(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = write(here)
+    assert computer.is_synchronised() in (True, False)
+    monkeypatch.setattr(computer, "is_unset", lambda now: True)
+    first = next(computer.clock(settings, None))
+    assert first.level == "problem" and "timedatectl" in first.advice
+    monkeypatch.undo()
+    monkeypatch.setattr(computer, "is_synchronised", lambda: False)
+    assert next(computer.clock(settings, None)).level == "warning"
+
+
+@pytest.mark.parametrize(
+    ("changed", "level", "text"),
+    [
+        ({"f_flag": os.ST_RDONLY}, "problem", "is read-only"),
+        ({"f_bavail": 10}, "problem", "MiB free"),
+        ({"f_bavail": 100_000}, "warning", "it may grow to 1 GiB"),
+        ({"f_favail": 3}, "problem", r"room for 3 more files"),
+        ({"f_files": 0, "f_favail": 0}, "ok", "MiB free"),  # as btrfs has it
+    ],
+)
+def test_a_disk_without_room(
+    here: Path, monkeypatch: pytest.MonkeyPatch, changed: dict[str, int], level: str, text: str
+) -> None:
+    values = {"f_flag": 0, "f_frsize": 4096, "f_bavail": 10**9, "f_files": 10**6, "f_favail": 10**6}
+    monkeypatch.setattr(computer.os, "statvfs", lambda path: SimpleNamespace(**(values | changed)))
+    monkeypatch.setattr(computer, "_kind", lambda folder: "ext4")
+    found = list(computer.disk(write(here), None))
+    assert found[-1].level == level and text in found[-1].text
+
+
+def test_a_disk_in_memory(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mounts = [
+        SimpleNamespace(mountpoint="/", fstype="ext4"),
+        SimpleNamespace(mountpoint=str(here), fstype="tmpfs"),
+    ]
+    monkeypatch.setattr(computer.psutil, "disk_partitions", lambda all: mounts)
+    *_, last = computer.disk(write(here), None)
+    assert last.level == "warning" and "is in memory (tmpfs)" in last.text
+
+
+def test_a_control_group_that_is_too_small(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = here / "cgroup"
+    for line in Path("/proc/self/cgroup").read_text().splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers in ("", "memory"):
+            group = root / controllers / path.lstrip("/")
+            group.mkdir(parents=True, exist_ok=True)
+            name = "memory.limit_in_bytes" if controllers else "memory.max"
+            for folder in (group, root / controllers):  # what holds one may hold it tighter
+                (folder / name).write_text("max\n" if folder is group else "134217728\n")
+    limit = computer.group_limit(os.getpid(), root)
+    assert limit == 128 << 20
+    assert computer.group_limit(os.getpid(), here / "nothing") is None
+    monkeypatch.setattr(computer, "group_limit", lambda pid: limit)
+    *_, last = computer.memory(write(here), None)
+    assert last.level == "problem" and "MemoryMax" in last.advice
+
+
+def test_too_few_open_files(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computer.resource, "getrlimit", lambda which: (100, 1024))
+    [finding] = computer.files(write(here), None)
+    assert finding.level == "problem" and "LimitNOFILE=" in finding.advice
+    [finding] = computer.files(write(here), {"pid": os.getpid()})  # of the running one, its own
+    assert "1024" not in finding.text
+
+
+# Secrets
+
+
+def test_what_others_can_read_or_change(here: Path) -> None:
+    settings = write(here)
+    assert [each.level for each in secrets.permissions(settings, None)] == ["ok"]
+    (here / "certs/ca.key").chmod(0o640)
+    (here / "users.passwd").chmod(0o604)
+    (here / "acl.conf").chmod(0o666)
+    found = by_subject(secrets.permissions(settings, None))
+    assert {Path(subject).name: each.advice.split()[:2] for subject, each in found.items()} == {
+        "ca.key": ["chmod", "go="],
+        "users.passwd": ["chmod", "go="],
+        "acl.conf": ["chmod", "go-w"],
+    }
+
+
+def test_days_that_are_left(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = here / "certs"
+    certs.issue_client(directory, "lost")
+    certs.revoke(directory, "lost")
+    monkeypatch.setattr(certs.authority, "CERTIFICATE_VALID", timedelta(days=20))
+    certs.issue_client(directory, "tablet")
+    certs.renew(directory, "server")
+    found = by_subject(secrets.certificates(config.load(here / "appliance.yaml"), None))
+    assert "18 days left" in found["the server's certificate"].text
+    assert "by itself" in found["the server's certificate"].advice
+    assert found["the CA"].level == found["the revocation list"].level == "ok"
+    assert "cert renew tablet" in found["certificate of tablet"].advice
+    monkeypatch.setattr(certs.authority, "_now", lambda: certs.files.RELEASED - timedelta(days=40))
+    monkeypatch.setattr(certs.authority, "out_of_time", lambda *_: "")
+    certs.renew(directory, "server")
+    found = by_subject(secrets.certificates(config.load(here / "appliance.yaml"), None))
+    assert found["the server's certificate"].level == "problem"
+    assert "it ran out on " in found["the server's certificate"].text
+
+
+# ROS
+
+
+def test_without_ros(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros, "available", lambda: (False, "there is no ROS 2 here. Source one"))
+    finding = ros.which_ros(is_needed=True)
+    assert finding == Finding("problem", "ROS", "there is no ROS 2 here", "Source one")
+    assert ros.which_ros(is_needed=False).level == "warning"
+    subjects = [each.subject for each in ros.ros(write(here, bridge={}), None)]
+    assert "ROS nodes" not in subjects and "shared memory" in subjects
+
+
+@pytest.mark.parametrize(("domain", "level"), [("7", "ok"), ("150", "warning"), ("x", "problem")])
+def test_domains(here: Path, monkeypatch: pytest.MonkeyPatch, domain: str, level: str) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    [finding] = ros._discovery(write(here, bridge={}))
+    assert finding.level == level and "nodes of this computer only" in finding.text
+
+
+def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = SimpleNamespace(free=1 << 30)
+    monkeypatch.setattr(ros.shutil, "disk_usage", lambda folder: usage)
+    assert [each.level for each in ros.shared_memory(tmp_path)] == ["ok"]
+    usage.free = 1 << 20
+    [finding] = ros.shared_memory(tmp_path)
+    assert finding.level == "warning" and "--shm-size" in finding.advice
+    [finding] = ros.shared_memory(tmp_path / "none")
+    assert finding.level == "warning"
+
+
+def test_a_bus_that_is_not_ros_2_is_left_alone(here: Path) -> None:
+    parts: list[Part] = [ros.ros]
+    [finding] = parts[0](write(here), None)
+    assert finding.text == "bridge.bus is none"

@@ -1,0 +1,97 @@
+"""`appliance status`: the running one is asked, and the answer is about it."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from appliance_process import ApplianceProcess
+from raw_client import RawClient
+
+from appliance import cli
+from appliance.mqtt.packets import Publish
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def status(appliance: ApplianceProcess, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    assert run("status", "--json", "-c", str(appliance.config)) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert isinstance(told, dict)
+    return told
+
+
+def test_the_running_one_tells_how_it_is(
+    appliance: ApplianceProcess, topic: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = status(appliance, capsys)
+    with RawClient(appliance, 5) as client:
+        client.connect("status-client")
+        client.send(*(Publish(topic, b"x", 1, packet_id=number) for number in range(1, 11)))
+        client.drain()
+        told = status(appliance, capsys)
+        assert told["clients"] == before["clients"] + 1
+        assert told["messages"]["received"] >= before["messages"]["received"] + 10
+    assert told["pid"] == appliance.pid
+    assert told["robot"] == "r2d2" and told["configuration"] == str(appliance.config)
+    assert 0 <= told["uptime"] < 3600
+    since = datetime.fromisoformat(told["since"])
+    assert abs((datetime.now(timezone.utc) - since).total_seconds() - told["uptime"]) < 5
+    assert told["listeners"] == [
+        {"bind": f"127.0.0.1:{appliance.port}", "tls": True, "protocol": "mqtt"},
+        {"bind": f"127.0.0.1:{appliance.plain_port}", "tls": False, "protocol": "mqtt"},
+    ]
+    assert told["store"]["path"] == str(appliance.directory / "state/store.db")
+    assert told["store"]["failing"] is False
+    assert told["memory"]["process"] > 1 << 20 and told["ros"] == {"bus": "none"}
+    ends = {each["what"]: each["days"] for each in told["certificates"]}
+    assert 820 <= ends["server"] <= 824 and ends["ca"] > 3600
+
+
+def test_it_is_told_to_people_too(
+    appliance: ApplianceProcess, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("reload", "-c", str(appliance.config)) == 0
+    assert run("status", "-c", str(appliance.config)) == 0
+    text = capsys.readouterr().out
+    for part in (
+        f"robot r2d2, pid {appliance.pid}",
+        f"listening on  127.0.0.1:{appliance.port} (TLS)",
+        "ROS           off: a broker alone",
+        "last reload   ",
+        "nothing has changed",
+        "certificates  the server's certificate: 82",
+    ):
+        assert part in text
+
+
+def test_when_none_is_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text("robot: r2")
+    assert run("status", "-c", str(file)) == 1
+    assert "no appliance is running (nobody listens on " in capsys.readouterr().err
+    file.write_text("robbot: r2")
+    assert run("status", "-c", str(file)) == 1
+    assert "did you mean" in capsys.readouterr().err
+
+
+def test_a_file_that_was_broken_since_is_no_reason_not_to_ask(
+    appliance: ApplianceProcess, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = appliance.config.read_text()
+    try:
+        appliance.config.write_text(f"{good}\nrobbot: r2\n")
+        assert run("reload", "-c", str(appliance.config)) == 1
+        told = status(appliance, capsys)
+    finally:
+        appliance.config.write_text(good)
+    assert told["pid"] == appliance.pid
+    assert any("robbot" in warning for warning in told["warnings"])
