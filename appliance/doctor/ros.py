@@ -15,6 +15,7 @@ import psutil
 
 from appliance.config import Settings
 from appliance.doctor.finding import Finding
+from appliance.doctor.ros1 import ros1
 from appliance.ros import installation
 from appliance.ros.ros2 import Ros2Node, available
 
@@ -41,8 +42,11 @@ _MIB = 1 << 20
 
 def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
     """Which ROS there is, how its nodes find each other here, and which are seen."""
-    if settings.bridge.bus != "ros2":
-        yield Finding("ok", "ROS", f"bridge.bus is {settings.bridge.bus}")
+    if settings.bridge.bus == "none":
+        yield Finding("ok", "ROS", "bridge.bus is none")
+        return
+    if settings.bridge.bus == "ros1":
+        yield from ros1(running, is_needed=_has_routes(settings))
         return
     yield which_ros(is_needed=_has_routes(settings))
     yield from _discovery(settings)

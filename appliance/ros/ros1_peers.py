@@ -53,12 +53,17 @@ class Master:
     def __init__(self, uri: str, caller: str) -> None:
         self.uri = uri
         self.caller = caller
-        self._proxy = xmlrpc.client.ServerProxy(uri, _Transport())
+        self._proxy: xmlrpc.client.ServerProxy | None = None
+
+    def _connection(self) -> xmlrpc.client.ServerProxy:
+        if self._proxy is None:  # which does not take all that may be called a URI
+            self._proxy = xmlrpc.client.ServerProxy(self.uri, _Transport())
+        return self._proxy
 
     def call(self, method: str, *arguments: Any) -> Any:
         """The value of an answer. Raises BusError, also when it says that it failed."""
         try:
-            return _value(getattr(self._proxy, method)(self.caller, *arguments))
+            return _value(getattr(self._connection(), method)(self.caller, *arguments))
         except (OSError, HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
             raise BusError(f"{self.uri}: {error}") from error
 
@@ -66,7 +71,7 @@ class Master:
         """The values of many answers at once, None for what failed. Raises BusError."""
         many = [{"methodName": method, "params": (self.caller, *arguments)} for arguments in calls]
         try:
-            answers: Any = self._proxy.system.multicall(many) if many else []
+            answers: Any = self._connection().system.multicall(many) if many else []
             return [
                 answer[0][2] if isinstance(answer, list) and answer[0][0] == 1 else None
                 for answer in answers
