@@ -38,7 +38,9 @@ def ros1(running: dict[str, Any] | None, *, is_needed: bool) -> Iterator[Finding
     try:
         graph = [dict(part) for part in master.call("getSystemState")]
     except (BusError, TypeError, ValueError) as error:
-        advice = "start roscore; if it is running, ROS_MASTER_URI is to say where"
+        advice = (
+            "start roscore; if it is running, ROS_MASTER_URI is to say where: http://robot:11311"
+        )
         yield Finding(missing, "ROS Master", f"it does not answer: {error} ({said})", advice)
         return
     yield Finding("ok", "ROS Master", f"{uri} answers ({said})")

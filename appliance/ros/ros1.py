@@ -247,16 +247,13 @@ class Ros1Node:
         return True
 
     def _check_name(self) -> None:
-        """The Master would end the other, and that, tried again, this one: neither came to rest."""
-        try:
-            uri = self._master.call("lookupNode", self.name)
-            Master(uri, self.name).call("getPid")
-        except BusError:  # there is none, or none any more
-            return
-        raise BusError(
-            f"another node, at {uri}, is called {self.name}: end it, or give this one another "
-            "name, bridge.node"
-        )
+        """The Master would end the other, and let that, tried again, end this one."""
+        uri = self._find_namesake()
+        if uri is not None:
+            raise BusError(
+                f"another node, at {uri}, is called {self.name}: end it, or give this one another "
+                "name, bridge.node"
+            )
 
     def _await_master(self) -> bool:
         while not self._stopping.is_set():
@@ -346,24 +343,35 @@ class Ros1Node:
         """Tell the Master what we have that it does not know of: it has come anew."""
         from rospy.impl.registration import get_service_manager, get_topic_manager
 
-        topics = get_topic_manager()
-        master, count = self._master, 0
-        for topic, type_name in topics.get_publications():
-            if self.name not in publishers.get(topic, ()):
-                master.call("registerPublisher", topic, type_name, self._uri)
-                count += 1
-        for topic, type_name in topics.get_subscriptions():
-            if self.name not in subscribers.get(topic, ()):
-                uris = master.call("registerSubscriber", topic, type_name, self._uri)
-                # As the Master tells it later, of others that come.
-                Master(self._uri, self.name).call("publisherUpdate", topic, uris)
-                count += 1
-        for service, uri in get_service_manager().get_services():
-            if service not in servers:
-                master.call("registerService", service, uri, self._uri)
-                count += 1
-        if count:
-            log.info("registered with the ROS Master anew: %d topics and services", count)
+        topics, master = get_topic_manager(), self._master
+        published = [own for own in topics.get_publications() if self._lacks(publishers, own[0])]
+        subscribed = [own for own in topics.get_subscriptions() if self._lacks(subscribers, own[0])]
+        served = [own for own in get_service_manager().get_services() if own[0] not in servers]
+        count = len(published) + len(subscribed) + len(served)
+        if not count or self._find_namesake():  # which the Master lets end this one, just now
+            return
+        for topic, type_name in published:
+            master.call("registerPublisher", topic, type_name, self._uri)
+        for topic, type_name in subscribed:
+            uris = master.call("registerSubscriber", topic, type_name, self._uri)
+            # As the Master tells it later, of others that come.
+            Master(self._uri, self.name).call("publisherUpdate", topic, uris)
+        for service, uri in served:
+            master.call("registerService", service, uri, self._uri)
+        log.info("registered with the ROS Master anew: %d topics and services", count)
+
+    def _lacks(self, graph: _Graph, topic: str) -> bool:
+        return self.name not in graph.get(topic, ())
+
+    def _find_namesake(self) -> str | None:
+        """The URI of another node with this one's name; None when there is none, or none any
+        more."""
+        with suppress(BusError):
+            uri = str(self._master.call("lookupNode", self.name))
+            if uri != self._uri:
+                Master(uri, self.name).call("getPid")
+                return uri
+        return None
 
     def _add_connected(self, publishers: _Graph, subscribers: _Graph) -> set[str]:
         """Add who is connected to us: a Master that has come anew does not know of nodes that do

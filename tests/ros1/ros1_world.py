@@ -16,15 +16,20 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+import time
+import uuid
+from collections.abc import Callable, Mapping
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
 from typing import cast
 from xmlrpc.client import ServerProxy
 
+import paho.mqtt.client as paho
 import psutil
 from appliance_process import ACL, PATIENCE, ApplianceProcess, eventually
 from packaging.requirements import Requirement
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -185,6 +190,17 @@ def end(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
+def output(process: subprocess.Popen[str], again: Callable[[], object]) -> str:
+    """What it writes until it ends, while something is done again: it does not tell when it has
+    subscribed."""
+    deadline = time.monotonic() + 2 * PATIENCE
+    while process.poll() is None:
+        assert time.monotonic() < deadline, f"{process.args} does not end"
+        again()
+        time.sleep(0.1)
+    return process.communicate()[0]
+
+
 class Node:
     """ros1_robot.py in a process of its own: what it is told to do is a line of JSON."""
 
@@ -234,3 +250,79 @@ class Ros1Appliance(ApplianceProcess):
         super().__init__(directory, acl=ACL, bridge={"bus": "ros1", **bridge})
         self.python = python.executable
         self.environment = world.environment | {"PYTHONPATH": python.path, "LD_LIBRARY_PATH": ""}
+
+
+class Mqtt:
+    """An MQTT 5 client, and what it has received."""
+
+    def __init__(self, appliance: Ros1Appliance, *topics: str) -> None:
+        self.name = f"test-{uuid.uuid4().hex[:6]}"
+        self.received: list[paho.MQTTMessage] = []
+        self._changed = threading.Condition()
+        self.paho = paho.Client(paho.CallbackAPIVersion.VERSION2, self.name, protocol=paho.MQTTv5)
+        self.paho.username_pw_set("alice", appliance.passwords["alice"])
+        self.paho.on_message = self._on_message
+        ready = threading.Event()
+        self.paho.on_connect = lambda *_: self.paho.subscribe(
+            [(topic, 1) for topic in (*topics, f"r2d2/+/+/_reply/{self.name}/#")]
+        )
+        self.paho.on_subscribe = lambda *_: ready.set()
+        self.paho.connect("127.0.0.1", appliance.plain_port)
+        self.paho.loop_start()
+        assert ready.wait(PATIENCE)
+
+    def __enter__(self) -> Mqtt:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.paho.disconnect()
+        self.paho.loop_stop()
+
+    def _on_message(self, client: object, userdata: object, message: paho.MQTTMessage) -> None:
+        with self._changed:
+            self.received.append(message)
+            self._changed.notify_all()
+
+    def until(self, condition: Callable[[paho.MQTTMessage], object]) -> paho.MQTTMessage:
+        """The first message that this holds for."""
+        found: list[paho.MQTTMessage] = []
+
+        def is_there() -> bool:
+            found[:] = [message for message in self.received if condition(message)]
+            return bool(found)
+
+        with self._changed:
+            self._changed.wait_for(is_there, PATIENCE)
+        assert found, [(m.topic, m.payload) for m in self.received]
+        return found[0]
+
+    def next(self, topic: str, payload: object = ...) -> paho.MQTTMessage:
+        """The first message on a topic, or with a payload, which is taken away."""
+
+        def fits(message: paho.MQTTMessage) -> bool:
+            return message.topic == topic and (
+                payload is ... or (json.loads(message.payload or "null") == payload)
+            )
+
+        message = self.until(fits)
+        self.received.remove(message)
+        return message
+
+    def call(self, topic: str, value: object, kind: str = "_call") -> object:
+        """The answer to a call, both in JSON."""
+        return json.loads(self.ask(f"{topic}/{kind}", json.dumps(value).encode()).payload)
+
+    def ask(self, topic: str, payload: bytes, content_type: str = "") -> paho.MQTTMessage:
+        """The answer to a call."""
+        properties = Properties(PacketTypes.PUBLISH)
+        if content_type:
+            properties.ContentType = content_type
+        token = uuid.uuid4().hex[:6].encode()
+        base = topic.rpartition("/")[0]
+        properties.ResponseTopic = f"{base}/_reply/{self.name}/answer"
+        properties.CorrelationData = token
+        self.paho.subscribe(properties.ResponseTopic, 1)
+        self.paho.publish(topic, payload, 1, properties=properties)
+        return self.until(
+            lambda m: m.topic == properties.ResponseTopic and m.properties.CorrelationData == token
+        )

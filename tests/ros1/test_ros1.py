@@ -8,16 +8,22 @@ import re
 import subprocess
 import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator
 from functools import partial
 
-import paho.mqtt.client as paho
 import pytest
 from appliance_process import PATIENCE, eventually
-from paho.mqtt.packettypes import PacketTypes
-from paho.mqtt.properties import Properties
-from ros1_world import HERE, SYSTEM_PYTHON, Node, Python, Ros1Appliance, World, end, is_installed
+from ros1_world import (
+    HERE,
+    SYSTEM_PYTHON,
+    Mqtt,
+    Node,
+    Python,
+    Ros1Appliance,
+    World,
+    end,
+    is_installed,
+    output,
+)
 
 from appliance.environment import for_other_programs
 
@@ -25,163 +31,10 @@ pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
 )
 
-BRIDGE = {
-    "topics": [
-        {"ros": ["/chatter", "/robot/*", "/many"], "to": "mqtt", "keep": 10000},
-        {"ros": "/hear", "to": "ros", "type": "std_msgs/msg/String"},
-        {"ros": "/both", "to": "both", "encoding": "ros1", "type": "std_msgs/msg/String"},
-        {"ros": "/raw/*", "to": "mqtt", "encoding": "ros1"},
-        {"ros": "/stamped", "to": "ros", "type": "geometry_msgs/msg/PointStamped"},
-        {
-            "ros": "/cmd_vel",
-            "to": "ros",
-            "type": "geometry_msgs/msg/Twist",
-            "clamp": {"linear.x": [-0.5, 0.5]},
-            "exclusive": True,
-            "on_silence": {"after": "300 ms", "publish": {}},
-        },
-    ],
-    "services": [
-        "/robot/*",
-        {"ros": "/robot/sleep", "timeout": "300 ms"},
-        {
-            "ros": "/ask_human",
-            "to": "mqtt",
-            "type": "std_srvs/srv/SetBool",
-            "timeout": "500 ms",
-            "on_error": {"success": False, "message": "nobody"},
-        },
-        {"ros": "/ask_nobody", "to": "mqtt", "type": "std_srvs/srv/SetBool", "timeout": "300 ms"},
-    ],
-    "actions": ["/robot/*"],
-    "parameters": ["/arm/*", "!/arm/secret", "/speed"],
-}
-
-
-@pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Python:
-    return Python(tmp_path_factory.mktemp("python"))
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    world = World(tmp_path_factory.mktemp("ros1"))
-    yield world
-    world.kill()
-
-
-@pytest.fixture(scope="module")
-def appliance(
-    python: Python, world: World, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Ros1Appliance]:
-    """It is there before the Master is."""
-    process = Ros1Appliance(tmp_path_factory.mktemp("appliance"), python, world, BRIDGE)
-    process.start()
-    try:
-        process.wait_for_log("waiting for the ROS Master: .*refused")
-        world.start()
-        process.wait_for_log("on ROS as /appliance", timeout=2 * PATIENCE)
-        yield process
-    finally:
-        process.stop()
-        print(process.log)
-
-
-@pytest.fixture(scope="module")
-def robot(world: World, appliance: Ros1Appliance) -> Iterator[Node]:
-    node = Node(world)
-    try:
-        assert node.hear() == ["ok", "ready"]
-        yield node
-    finally:
-        node.stop()
-
-
-class Mqtt:
-    """An MQTT 5 client, and what it has received."""
-
-    def __init__(self, appliance: Ros1Appliance, *topics: str) -> None:
-        self.name = f"test-{uuid.uuid4().hex[:6]}"
-        self.received: list[paho.MQTTMessage] = []
-        self._changed = threading.Condition()
-        self.paho = paho.Client(paho.CallbackAPIVersion.VERSION2, self.name, protocol=paho.MQTTv5)
-        self.paho.username_pw_set("alice", appliance.passwords["alice"])
-        self.paho.on_message = self._on_message
-        ready = threading.Event()
-        self.paho.on_connect = lambda *_: self.paho.subscribe(
-            [(topic, 1) for topic in (*topics, f"r2d2/+/+/_reply/{self.name}/#")]
-        )
-        self.paho.on_subscribe = lambda *_: ready.set()
-        self.paho.connect("127.0.0.1", appliance.plain_port)
-        self.paho.loop_start()
-        assert ready.wait(PATIENCE)
-
-    def __enter__(self) -> Mqtt:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.paho.disconnect()
-        self.paho.loop_stop()
-
-    def _on_message(self, client: object, userdata: object, message: paho.MQTTMessage) -> None:
-        with self._changed:
-            self.received.append(message)
-            self._changed.notify_all()
-
-    def until(self, condition: Callable[[paho.MQTTMessage], object]) -> paho.MQTTMessage:
-        """The first message that this holds for."""
-        found: list[paho.MQTTMessage] = []
-
-        def is_there() -> bool:
-            found[:] = [message for message in self.received if condition(message)]
-            return bool(found)
-
-        with self._changed:
-            self._changed.wait_for(is_there, PATIENCE)
-        assert found, [(m.topic, m.payload) for m in self.received]
-        return found[0]
-
-    def next(self, topic: str, payload: object = ...) -> paho.MQTTMessage:
-        """The first message on a topic, or with a payload, which is taken away."""
-
-        def fits(message: paho.MQTTMessage) -> bool:
-            return message.topic == topic and (
-                payload is ... or (json.loads(message.payload or "null") == payload)
-            )
-
-        message = self.until(fits)
-        self.received.remove(message)
-        return message
-
-    def call(self, topic: str, value: object, kind: str = "_call") -> object:
-        """The answer to a call."""
-        properties = Properties(PacketTypes.PUBLISH)
-        token = uuid.uuid4().hex[:6].encode()
-        base = topic if topic.count("/") > 1 else f"{topic}/x"
-        properties.ResponseTopic = f"{base}/_reply/{self.name}/answer"
-        properties.CorrelationData = token
-        self.paho.subscribe(properties.ResponseTopic, 1)
-        self.paho.publish(f"{topic}/{kind}", json.dumps(value), 1, properties=properties)
-        answer = self.until(
-            lambda m: m.topic == properties.ResponseTopic and m.properties.CorrelationData == token
-        )
-        return json.loads(answer.payload)
-
 
 def mosquitto(appliance: Ros1Appliance, command: str, *arguments: str) -> list[str]:
     login = ["-h", "127.0.0.1", "-p", str(appliance.plain_port), "-u", "alice"]
     return [command, *login, "-P", appliance.passwords["alice"], *arguments]
-
-
-def output(process: subprocess.Popen[str], again: Callable[[], object]) -> str:
-    """What it writes until it ends, while something is done again: it does not tell when it has
-    subscribed."""
-    deadline = time.monotonic() + 2 * PATIENCE
-    while process.poll() is None:
-        assert time.monotonic() < deadline, f"{process.args} does not end"
-        again()
-        time.sleep(0.1)
-    return process.communicate()[0]
 
 
 def test_strings_between_rostopic_and_mosquitto(world: World, appliance: Ros1Appliance) -> None:
@@ -451,52 +304,3 @@ def test_every_type_of_debians_packages(python: Python, world: World) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
     packages, types = map(int, re.findall(r"(\d+) (?:packages|types)", done.stdout))
     assert packages >= 18 and types >= 217, done.stdout
-
-
-def test_a_master_that_is_killed_and_comes_back(
-    world: World, robot: Node, appliance: Ros1Appliance
-) -> None:
-    with Mqtt(appliance, "r2d2/many", "r2d2/chatter", "r2d2/_appliance/state") as client:
-        robot.do("publish", "/many", "std_msgs/String", "before")
-        client.next("r2d2/many", {"data": "before"})
-        world.kill()
-        appliance.wait_for_log("the ROS Master does not answer")
-        # Nodes that know each other need no Master.
-        robot.do("publish", "/many", "std_msgs/String", "meanwhile")
-        client.next("r2d2/many", {"data": "meanwhile"})
-        assert client.call("r2d2/robot/switch", {"data": True})["error"]  # type: ignore[index]
-        world.start()
-        appliance.wait_for_log("the ROS Master is back")
-        appliance.wait_for_log("registered with the ROS Master anew")
-        publishers, subscribers, services = world.graph()
-        assert "/appliance" in publishers["/hear"] and "/appliance" in subscribers["/many"]
-        assert "/appliance" in services["/ask_human"]
-        # A node that comes only now: both ways, a service, and the old robot's still.
-        talker = world.begin(
-            "rostopic", "pub", "-r", "10", "/chatter", "std_msgs/String", "data: again"
-        )
-        echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
-        try:
-            client.next("r2d2/chatter", {"data": "again"})
-            greet = partial(client.paho.publish, "r2d2/hear", '{"data": "hello again"}')
-            assert "hello again" in output(echo, greet)
-        finally:
-            for process in (talker, echo):
-                if process.poll() is None:
-                    end(process)
-        said = world.run("rosservice", "call", "/ask_human", "true")
-        assert "nobody" in said
-        robot.do("publish", "/many", "std_msgs/String", "after")
-        client.next("r2d2/many", {"data": "after"})
-        state = client.next("r2d2/_appliance/state", ...)
-        assert state.payload == b"online"
-
-
-def test_a_node_that_takes_the_name_ends_the_bridge_and_not_the_broker(
-    world: World, appliance: Ros1Appliance
-) -> None:
-    world.shut_down("/appliance")
-    appliance.wait_for_log("there is no bridge to ROS: /appliance was shut down from outside")
-    with Mqtt(appliance, "r2d2/x") as client:
-        client.paho.publish("r2d2/x", "1", 1)
-        client.next("r2d2/x", 1)

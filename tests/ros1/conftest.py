@@ -1,0 +1,86 @@
+"""One Master, one appliance and one robot for all tests with ROS 1; they clean up behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from appliance_process import PATIENCE
+from ros1_world import Node, Python, Ros1Appliance, World
+
+BRIDGE = {
+    "topics": [
+        {"ros": ["/chatter", "/robot/*", "/many"], "to": "mqtt", "keep": 10000},
+        {"ros": "/hear", "to": "ros", "type": "std_msgs/msg/String"},
+        {"ros": "/both", "to": "both", "encoding": "ros1", "type": "std_msgs/msg/String"},
+        {"ros": "/raw/*", "to": "mqtt", "encoding": "ros1"},
+        {"ros": "/stamped", "to": "ros", "type": "geometry_msgs/msg/PointStamped"},
+        {
+            "ros": "/cmd_vel",
+            "to": "ros",
+            "type": "geometry_msgs/msg/Twist",
+            "clamp": {"linear.x": [-0.5, 0.5]},
+            "exclusive": True,
+            "on_silence": {"after": "300 ms", "publish": {}},
+        },
+    ],
+    "services": [
+        "/robot/*",
+        {"ros": "/robot/sleep", "timeout": "300 ms"},
+        {
+            "ros": "/ask_human",
+            "to": "mqtt",
+            "type": "std_srvs/srv/SetBool",
+            "timeout": "500 ms",
+            "on_error": {"success": False, "message": "nobody"},
+        },
+        {"ros": "/ask_nobody", "to": "mqtt", "type": "std_srvs/srv/SetBool", "timeout": "300 ms"},
+    ],
+    "actions": ["/robot/*"],
+    "parameters": [
+        {"ros": ["/arm/*", "!/arm/secret", "/speed", "/arm/absent"]},
+        {"ros": "/camera/*", "encoding": "cbor"},
+    ],
+    "limits": {"payload": "64 KiB"},
+}
+
+
+@pytest.fixture(scope="package")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Python:
+    return Python(tmp_path_factory.mktemp("python"))
+
+
+@pytest.fixture(scope="package")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    world = World(tmp_path_factory.mktemp("ros1"))
+    yield world
+    world.kill()
+
+
+@pytest.fixture(scope="package")
+def appliance(
+    python: Python, world: World, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Ros1Appliance]:
+    """It is there before the Master is."""
+    process = Ros1Appliance(tmp_path_factory.mktemp("appliance"), python, world, BRIDGE)
+    process.start()
+    try:
+        process.wait_for_log("waiting for the ROS Master: .*refused")
+        world.start()
+        process.wait_for_log("on ROS as /appliance", timeout=2 * PATIENCE)
+        yield process
+    finally:
+        process.stop()
+        print(process.log)
+
+
+@pytest.fixture(scope="package")
+def robot(world: World, appliance: Ros1Appliance) -> Iterator[Node]:
+    node = Node(world)
+    try:
+        assert node.hear() == ["ok", "ready"]
+        for name in ("switch", "work"):
+            appliance.wait_for_log(f"/robot/{name} can be called")
+        yield node
+    finally:
+        node.stop()

@@ -1,0 +1,83 @@
+"""Nodes and Masters of ROS 1 that go and come back. These tests leave a Master behind that does not
+know the robot."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import psutil
+import pytest
+from ros1_world import Mqtt, Node, Ros1Appliance, World, end, is_installed, output
+
+pytestmark = pytest.mark.skipif(
+    not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
+)
+
+
+def test_it_joins_again_and_leaves_another_its_name(
+    world: World, robot: Node, appliance: Ros1Appliance
+) -> None:
+    process = psutil.Process(appliance.pid)
+
+    switch = "/robot/switch can be called"
+    before, offered = (appliance.log.count(text) for text in ("on ROS as /appliance", switch))
+
+    def works(times: int) -> None:
+        appliance.wait_for_log("on ROS as /appliance", before + times)
+        appliance.wait_for_log(switch, offered + times)
+        with Mqtt(appliance, "r2d2/many") as client:
+            assert client.call("r2d2/robot/switch", {"data": True})["message"] == "so"  # type: ignore[index]
+            robot.do("publish", "/many", "std_msgs/String", "again")
+            client.next("r2d2/many", {"data": "again"})
+
+    world.shut_down("/appliance")
+    appliance.wait_for_log("there is no bridge to ROS: /appliance was shut down from outside")
+    works(1)
+    threads = process.num_threads()
+    # Another node takes the name, as the Master lets it, and is let have it.
+    other = world.begin("rostopic", "echo", "/none", "__name:=appliance")
+    try:
+        appliance.wait_for_log("another node, at http://127.0.0.1:.*, is called /appliance")
+    finally:
+        end(other)
+    works(2)
+    assert process.num_threads() <= threads + 5  # connections have threads
+
+
+def test_a_master_that_is_killed_and_comes_back(
+    world: World, robot: Node, appliance: Ros1Appliance
+) -> None:
+    with Mqtt(appliance, "r2d2/many", "r2d2/chatter", "r2d2/_appliance/state") as client:
+        robot.do("publish", "/many", "std_msgs/String", "before")
+        client.next("r2d2/many", {"data": "before"})
+        world.kill()
+        appliance.wait_for_log("the ROS Master does not answer")
+        # Nodes that know each other need no Master.
+        robot.do("publish", "/many", "std_msgs/String", "meanwhile")
+        client.next("r2d2/many", {"data": "meanwhile"})
+        assert client.call("r2d2/robot/switch", {"data": True})["error"]  # type: ignore[index]
+        world.start()
+        appliance.wait_for_log("the ROS Master is back")
+        appliance.wait_for_log("registered with the ROS Master anew")
+        publishers, subscribers, services = world.graph()
+        assert "/appliance" in publishers["/hear"] and "/appliance" in subscribers["/many"]
+        assert "/appliance" in services["/ask_human"]
+        # A node that comes only now: both ways, a service, and the old robot's still.
+        talker = world.begin(
+            "rostopic", "pub", "-r", "10", "/chatter", "std_msgs/String", "data: again"
+        )
+        echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
+        try:
+            client.next("r2d2/chatter", {"data": "again"})
+            greet = partial(client.paho.publish, "r2d2/hear", '{"data": "hello again"}')
+            assert "hello again" in output(echo, greet)
+        finally:
+            for process in (talker, echo):
+                if process.poll() is None:
+                    end(process)
+        said = world.run("rosservice", "call", "/ask_human", "true")
+        assert "nobody" in said
+        robot.do("publish", "/many", "std_msgs/String", "after")
+        client.next("r2d2/many", {"data": "after"})
+        state = client.next("r2d2/_appliance/state", ...)
+        assert state.payload == b"online"
