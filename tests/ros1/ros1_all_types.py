@@ -246,7 +246,7 @@ def check(name, message_class, seed, mutations):
 
 if __name__ == "__main__":
     seed = sys.argv[1] if len(sys.argv) > 1 else "0"
-    mutations = int(sys.argv[2]) if len(sys.argv) > 2 else 8
+    mutations = int(sys.argv[2]) if len(sys.argv) > 2 else 4
     counts = {name: check(name, found, seed, mutations) for name, found in classes()}
     packages = {name.partition("/")[0] for name in counts}
     print(f"{len(packages)} packages, {len(counts)} types, {sum(counts.values())} messages")

@@ -21,7 +21,7 @@ import uuid
 from collections.abc import Callable, Mapping
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 from xmlrpc.client import ServerProxy
 
 import paho.mqtt.client as paho
@@ -162,17 +162,14 @@ class World:
 
     def graph(self) -> list[dict[str, list[str]]]:
         """Publishers, subscribers and servers, as the Master knows them."""
-        master = ServerProxy(self.environment["ROS_MASTER_URI"])
-        _, _, state = cast(
-            "list[list[list[tuple[str, list[str]]]]]", master.getSystemState("/test")
-        )
-        return [dict(part) for part in state]
+        return [dict(part) for part in self.ask("getSystemState")]
 
-    def shut_down(self, node: str) -> None:
-        """What `rosnode kill` does, and the Master when another node takes the name."""
+    def ask(self, method: str, *arguments: object) -> Any:
+        """What the Master answers; AssertionError when it fails."""
         master = ServerProxy(self.environment["ROS_MASTER_URI"])
-        _, _, uri = cast("list[str]", master.lookupNode("/test", node))
-        ServerProxy(uri).shutdown("/test", "the test says so")
+        answer = cast("list[Any]", getattr(master, method)("/test", *arguments))
+        assert answer[0] == 1, answer
+        return answer[2]
 
     def begin(self, *command: str) -> subprocess.Popen[str]:
         """One of ROS's commands, running; `end` it."""

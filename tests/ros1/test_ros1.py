@@ -253,9 +253,8 @@ def test_an_action(robot: Node, appliance: Ros1Appliance) -> None:
 
 def test_parameters(world: World, appliance: Ros1Appliance) -> None:
     world.run("rosparam", "set", "/arm/gain", "0.5")
-    world.run("rosparam", "set", "/arm/secret", "1")
-    world.run("rosparam", "set", "/arm/pid/p", "1")
-    world.run("rosparam", "set", "/speed", "[1, two, 3.5]")
+    for name, value in (("/arm/secret", 1), ("/arm/pid/p", 1), ("/speed", [1, "two", 3.5])):
+        world.ask("setParam", name, value)
     with Mqtt(appliance, "r2d2/arm/_param/#", "r2d2/_param/#") as client:
         client.next("r2d2/arm/_param/gain", 0.5)
         client.next("r2d2/_param/speed", [1, "two", 3.5])
@@ -267,16 +266,16 @@ def test_parameters(world: World, appliance: Ros1Appliance) -> None:
         client.next("r2d2/arm/_param/gain", 2.0)
         assert world.run("rosparam", "get", "/arm/gain") == "2.0\n"
         assert set_to("new", [True, "x"]) == {"successful": True, "reason": ""}
-        assert world.run("rosparam", "get", "/arm/new") == "- true\n- x\n\n"
-        for name, value, code in (
+        assert world.ask("getParam", "/arm/new") == [True, "x"]
+        for name, wrong, code in (
             ("secret", 2, "not_authorized"),
             ("gain", None, "bad_request"),
             ("gain", {"a": 1}, "bad_request"),
             ("pid", 1, "rejected"),
             ("other", 2**40, "bad_request"),
         ):
-            assert set_to(name, value)["error"]["code"] == code, name  # type: ignore[index]
-        world.run("rosparam", "delete", "/arm/gain")
+            assert set_to(name, wrong)["error"]["code"] == code, name  # type: ignore[index]
+        world.ask("deleteParam", "/arm/gain")
         client.until(lambda m: m.topic == "r2d2/arm/_param/gain" and not m.payload)
         assert not [m for m in client.received if m.topic.endswith("secret")]
 

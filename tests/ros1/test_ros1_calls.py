@@ -9,7 +9,7 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable
-from xmlrpc.client import Binary, ServerProxy
+from xmlrpc.client import Binary
 
 import cbor2
 import paho.mqtt.client as paho
@@ -104,11 +104,6 @@ def test_goals_in_cbor_and_in_ros_bytes(robot: Node, appliance: Ros1Appliance) -
 
 
 def test_parameters_in_cbor_and_what_is_absent(world: World, appliance: Ros1Appliance) -> None:
-    master = ServerProxy(world.environment["ROS_MASTER_URI"])
-
-    def is_set(name: str, value: object) -> None:
-        assert master.setParam("/test", name, value)[0] == 1  # type: ignore[index]
-
     def absent(message: paho.MQTTMessage) -> list[str]:
         return [
             one["ros"]
@@ -119,9 +114,9 @@ def test_parameters_in_cbor_and_what_is_absent(world: World, appliance: Ros1Appl
     skipped = "r2d2/_appliance/skipped"
     with Mqtt(appliance, "r2d2/camera/_param/#", "r2d2/arm/_param/#", skipped) as client:
         client.until(lambda m: m.topic == skipped and "/arm/absent" in absent(m))
-        is_set("/camera/key", Binary(b"\0\1"))
-        is_set("/arm/key", Binary(b"\0\1"))
-        is_set("/arm/absent", 1)
+        world.ask("setParam", "/camera/key", Binary(b"\0\1"))
+        world.ask("setParam", "/arm/key", Binary(b"\0\1"))
+        world.ask("setParam", "/arm/absent", 1)
         found = client.until(lambda m: m.topic == "r2d2/camera/_param/key")
         assert (cbor2.loads(found.payload), found.properties.ContentType) == (b"\0\1", CBOR)
         assert client.next("r2d2/arm/_param/key").payload == b'"AAE="'
@@ -131,7 +126,7 @@ def test_parameters_in_cbor_and_what_is_absent(world: World, appliance: Ros1Appl
         client.until(lambda m: m.topic == "r2d2/camera/_param/key" and m.payload == b"A\2")
         # In JSON what was bytes is base64.
         client.ask("r2d2/arm/_param/key/set", b'"Ag=="')
-        assert master.getParam("/test", "/arm/key")[2].data == b"\2"  # type: ignore[index, union-attr]
+        assert world.ask("getParam", "/arm/key").data == b"\2"
         for topic, payload, content_type in (
             ("camera/_param/key/set", b"\1", RAW),
             ("arm/_param/key/set", b'"no base64"', ""),
@@ -142,7 +137,7 @@ def test_parameters_in_cbor_and_what_is_absent(world: World, appliance: Ros1Appl
             code, _ = error(client.ask(f"r2d2/{topic}", payload, content_type))
             assert code == "bad_request", topic
         for name in ("/camera", "/arm/key", "/arm/absent"):
-            master.deleteParam("/test", name)
+            world.ask("deleteParam", name)
 
 
 @pytest.fixture
@@ -177,7 +172,7 @@ def test_commands_that_call(
     )
     code, text = reach("goal", "/robot/work", "{goal: 2}")
     assert code == 0 and text.endswith('succeeded {"result":2}\n'), text
-    world.run("rosparam", "set", "/speed", "1.5")
+    world.ask("setParam", "/speed", 1.5)
     with Mqtt(appliance, "r2d2/_param/speed") as client:
         client.next("r2d2/_param/speed", 1.5)
     assert reach("param", "set", "/", "speed", "2") == (0, "")

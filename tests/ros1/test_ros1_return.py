@@ -18,29 +18,24 @@ def test_it_joins_again_and_leaves_another_its_name(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
     process = psutil.Process(appliance.pid)
-
-    switch = "/robot/switch can be called"
-    before, offered = (appliance.log.count(text) for text in ("on ROS as /appliance", switch))
-
-    def works(times: int) -> None:
-        appliance.wait_for_log("on ROS as /appliance", before + times)
-        appliance.wait_for_log(switch, offered + times)
-        with Mqtt(appliance, "r2d2/many") as client:
-            assert client.call("r2d2/robot/switch", {"data": True})["message"] == "so"  # type: ignore[index]
-            robot.do("publish", "/many", "std_msgs/String", "again")
-            client.next("r2d2/many", {"data": "again"})
-
-    world.shut_down("/appliance")
-    appliance.wait_for_log("there is no bridge to ROS: /appliance was shut down from outside")
-    works(1)
     threads = process.num_threads()
-    # Another node takes the name, as the Master lets it, and is let have it.
+    joined, offered = "on ROS as /appliance", "/robot/switch can be called"
+    before = {text: appliance.log.count(text) for text in (joined, offered)}
+    # The Master lets another node take the name.
     other = world.begin("rostopic", "echo", "/none", "__name:=appliance")
     try:
+        appliance.wait_for_log("there is no bridge to ROS: /appliance was shut down from outside")
         appliance.wait_for_log("another node, at http://127.0.0.1:.*, is called /appliance")
+        assert other.poll() is None
     finally:
         end(other)
-    works(2)
+    for text, count in before.items():
+        appliance.wait_for_log(text, count + 1)
+    with Mqtt(appliance, "r2d2/many") as client:
+        answer = client.call("r2d2/robot/switch", {"data": True})
+        assert answer == {"success": False, "message": "so"}
+        robot.do("publish", "/many", "std_msgs/String", "again")
+        client.next("r2d2/many", {"data": "again"})
     assert process.num_threads() <= threads + 5  # connections have threads
 
 
