@@ -65,8 +65,8 @@ class Status:
         bridge = self._parts.bridge
         if bridge is None:
             ros = "without ROS"
-        elif bridge.problem is not None:
-            ros = f"no ROS: {bridge.problem}"
+        elif bridge.state != "joined" and (problem := bridge.problem or bridge.obstacle):
+            ros = f"no ROS: {problem}"
         elif bridge.state == "joined":
             ros = f"on ROS as {bridge.node_name}, {_count(len(bridge.topics()), 'topic')} bridged"
         else:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 from collections.abc import Iterator
 
 import pytest
 from appliance_process import PATIENCE
-from ros1_world import Node, Python, Ros1Appliance, World
+from ros1_world import Node, Python, Ros1Appliance, Run, World
 
 BRIDGE = {
     "topics": [
@@ -84,3 +86,22 @@ def robot(world: World, appliance: Ros1Appliance) -> Iterator[Node]:
         yield node
     finally:
         node.stop()
+
+
+@pytest.fixture
+def run(appliance: Ros1Appliance) -> Run:
+    def run(*arguments: str, **environment: str) -> tuple[int, str]:
+        """A command's exit code and what it says."""
+        login = {"APPLIANCE_PASSWORD": appliance.passwords["alice"]}
+        done = subprocess.run(
+            [appliance.python, "-m", "appliance", *arguments, "-c", appliance.config],
+            env={**os.environ, **appliance.environment, **login, **environment},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=2 * PATIENCE,
+            check=False,
+        )
+        return done.returncode, done.stdout
+
+    return run

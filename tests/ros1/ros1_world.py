@@ -40,6 +40,9 @@ import appliance
 from appliance.environment import for_other_programs
 
 SYSTEM_PYTHON = "/usr/bin/python3"
+#: Runs a command of the appliance's: its exit code, and what it says.
+Run = Callable[..., "tuple[int, str]"]
+
 HERE = Path(__file__).parent
 ROOT = Path(appliance.__file__).parent.parent
 

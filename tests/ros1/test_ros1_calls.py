@@ -4,18 +4,15 @@ that it joins ROS again."""
 from __future__ import annotations
 
 import json
-import os
 import struct
-import subprocess
 import time
-from collections.abc import Callable
 from xmlrpc.client import Binary
 
 import cbor2
 import paho.mqtt.client as paho
 import pytest
-from appliance_process import PATIENCE, eventually
-from ros1_world import Mqtt, Node, Ros1Appliance, World, is_installed
+from appliance_process import eventually
+from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, is_installed
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -140,28 +137,7 @@ def test_parameters_in_cbor_and_what_is_absent(world: World, appliance: Ros1Appl
             world.ask("deleteParam", name)
 
 
-@pytest.fixture
-def run(appliance: Ros1Appliance) -> Callable[..., tuple[int, str]]:
-    def run(*arguments: str, **environment: str) -> tuple[int, str]:
-        """A command's exit code and what it says."""
-        login = {"APPLIANCE_PASSWORD": appliance.passwords["alice"]}
-        done = subprocess.run(
-            [appliance.python, "-m", "appliance", *arguments, "-c", appliance.config],
-            env={**os.environ, **appliance.environment, **login, **environment},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=2 * PATIENCE,
-            check=False,
-        )
-        return done.returncode, done.stdout
-
-    return run
-
-
-def test_commands_that_call(
-    world: World, robot: Node, appliance: Ros1Appliance, run: Callable[..., tuple[int, str]]
-) -> None:
+def test_commands_that_call(world: World, robot: Node, appliance: Ros1Appliance, run: Run) -> None:
     def reach(*arguments: str) -> tuple[int, str]:
         ca = str(appliance.ca)
         return run(*arguments, "-p", str(appliance.port), "--ca", ca, "-u", "alice")
@@ -179,9 +155,7 @@ def test_commands_that_call(
     assert reach("param", "get", "/", "speed") == (0, "2.0\n")
 
 
-def test_commands_that_tell_how_it_is(
-    robot: Node, appliance: Ros1Appliance, run: Callable[..., tuple[int, str]]
-) -> None:
+def test_commands_that_tell_how_it_is(robot: Node, appliance: Ros1Appliance, run: Run) -> None:
     code, text = run("check")
     assert code == 0 and "bridge: ROS 1 in /" in text, text
     code, text = run("status")

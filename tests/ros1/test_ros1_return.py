@@ -7,7 +7,7 @@ from functools import partial
 
 import psutil
 import pytest
-from ros1_world import Mqtt, Node, Ros1Appliance, World, end, is_installed, output
+from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, end, is_installed, output
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -40,7 +40,7 @@ def test_it_joins_again_and_leaves_another_its_name(
 
 
 def test_a_master_that_is_killed_and_comes_back(
-    world: World, robot: Node, appliance: Ros1Appliance
+    world: World, robot: Node, appliance: Ros1Appliance, run: Run
 ) -> None:
     with Mqtt(appliance, "r2d2/many", "r2d2/chatter", "r2d2/_appliance/state") as client:
         robot.do("publish", "/many", "std_msgs/String", "before")
@@ -51,6 +51,7 @@ def test_a_master_that_is_killed_and_comes_back(
         robot.do("publish", "/many", "std_msgs/String", "meanwhile")
         client.next("r2d2/many", {"data": "meanwhile"})
         assert client.call("r2d2/robot/switch", {"data": True})["error"]  # type: ignore[index]
+        assert "ROS: the ROS Master does not answer: http://" in run("status")[1]
         world.start()
         appliance.wait_for_log("the ROS Master is back")
         appliance.wait_for_log("registered with the ROS Master anew")
