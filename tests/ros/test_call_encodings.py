@@ -16,7 +16,7 @@ from call_house import AllTypes, House, action, call_routes, parameters, service
 
 from appliance.mqtt.codec import Property
 from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
+from appliance.ros.definitions import CDR, PACKED, load_description
 from appliance.ros.goals import GOAL_INFO, STATUS, id_of, split_id, with_id
 from appliance.ros.node import Durability, FakeNode, QosProfile
 
@@ -357,8 +357,13 @@ def test_an_id_goes_before_a_goal_and_feedback_without_converting_them(name):
     }[name]
     goal = cdr(f"{type_name}_Goal", fields)
     whole = cdr(f"{type_name}_SendGoal_Request", {"goal_id": {"uuid": id_}, "goal": fields})
-    assert with_id(goal, id_) == whole
-    assert split_id(whole) == (id_, goal)
+    assert with_id(goal, id_, CDR) == whole
+    assert split_id(whole, CDR) == (id_, goal)
+
+
+def test_an_id_goes_before_a_goal_of_ros_1():
+    assert with_id(b"goal", bytes(range(16)), PACKED) == bytes(range(16)) + b"goal"
+    assert split_id(bytes(range(16)) + b"goal", PACKED) == (bytes(range(16)), b"goal")
 
 
 @every_encoding
