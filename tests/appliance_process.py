@@ -30,7 +30,7 @@ ROBOT = "r2d2"
 HOST = "localhost"
 
 #: Seconds for what takes milliseconds, on a computer that is busy with something else.
-PATIENCE = 10.0
+PATIENCE = 30.0
 
 #: For interop tests: what alice publishes under r2d2/ she and bob can read.
 ACL = """\

@@ -51,7 +51,7 @@ def binary(tmp_path_factory):
     built = subprocess.run(
         [
             *(sys.executable, "-m", "PyInstaller", "--noconfirm", "--distpath", folder),
-            *("--workpath", PROJECT / "build", PROJECT / "appliance/binary/appliance.spec"),
+            *("--workpath", PROJECT / "build", PROJECT / "appliance/packaging/appliance.spec"),
         ],
         capture_output=True,
         text=True,

@@ -19,7 +19,7 @@ from appliance.broker.message import Message
 from appliance.environment import for_other_programs
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros import ros2
+from appliance.ros import installation, ros2
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.node import BusError, QosProfile
 from appliance.store import MemoryStore
@@ -408,7 +408,7 @@ def test_ros_is_available():
 
 
 def test_without_rclpy_one_line_says_so(monkeypatch):
-    monkeypatch.setattr(ros2, "find_spec", lambda name: None)
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
     is_available, reason = ros2.available()
     assert not is_available
     assert "rclpy cannot be imported" in reason
@@ -464,10 +464,11 @@ def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
     assert not ros2.use_fastdds_profile({})
 
 
-def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(monkeypatch):
+def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(tmp_path, monkeypatch):
     environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
     assert not ros2.use_fastdds_profile(environment)
-    monkeypatch.setattr(ros2, "_resources", lambda kind: ["fastrtps"])
+    (tmp_path / "fastrtps").mkdir()
+    monkeypatch.setattr(ros2, "_shares", lambda: [tmp_path])
     assert ros2.use_fastdds_profile(environment)
     profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
     assert "UDPv4" in profile and "SHM" not in profile

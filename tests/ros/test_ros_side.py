@@ -18,7 +18,7 @@ import yaml
 from appliance import config
 from appliance.doctor import ros as doctor
 from appliance.environment import for_other_programs
-from appliance.ros import ros2
+from appliance.ros import ros2, ros2_loop
 from appliance.ros.bridge import Bridge
 
 pytest.importorskip("rclpy")
@@ -124,12 +124,12 @@ def test_latency_is_that_of_a_clock_that_was_set_meanwhile(monkeypatch):
     """What is measured is what has come since the subscription, whatever the clock says now."""
     wall, counted = 2_000 * 10**9, 500 * 10**9
     since = counted - 10 * 10**9
-    monkeypatch.setattr(ros2.time, "monotonic_ns", lambda: counted)
+    monkeypatch.setattr(ros2_loop.time, "monotonic_ns", lambda: counted)
     for jump in (0, 3600, -3600, 10**9, -(10**9)):
         now = wall + jump * 10**9
-        monkeypatch.setattr(ros2.time, "time_ns", lambda now=now: now)
+        monkeypatch.setattr(ros2_loop.time, "time_ns", lambda now=now: now)
         for age, is_timed in ((10**6, True), (9 * 10**9, True), (11 * 10**9, False)):
-            published_at = ros2._published_at({"source_timestamp": now - age}, since)
+            published_at = ros2_loop.published_at({"source_timestamp": now - age}, since)
             assert published_at == (now - age if is_timed else 0)
 
 
@@ -172,7 +172,9 @@ async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
     house = start(
         route("/a", "mqtt", "text"), route("/b", "ros", "text", type=STRING), diagnostics=0.1
     )
-    offered = ServiceSettings(ros="/ask", mqtt="r2d2{ros}", to="mqtt", type="std_srvs/srv/Trigger")
+    offered = ServiceSettings(
+        names=("/ask",), mqtt="r2d2{ros}", to="mqtt", type="std_srvs/srv/Trigger"
+    )
     house.bridge.calls.replace(CallRoutes(services=(offered,)))
     await peer.do("advertise", "/a", STRING)
     await peer.do("subscribe", "/b", STRING)

@@ -73,9 +73,14 @@ def booted(root: Path) -> Iterator[Machine]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        children = psutil.Process(nspawn.pid).children
-        eventually(children, "systemd starts", PATIENCE)
-        machine = Machine(children()[0].pid)
+
+        def inits() -> list[int]:
+            """The one in there; what nspawn starts before to prepare it has other names."""
+            found = psutil.Process(nspawn.pid).children()
+            return [child.pid for child in found if child.name() == "systemd"]
+
+        eventually(inits, "systemd starts", PATIENCE)
+        machine = Machine(inits()[0])
         up = ("running", "degraded")
         eventually(
             lambda: machine.run("systemctl", "is-system-running", check=False) in up,
@@ -104,6 +109,7 @@ class Service(BrokerProcess):
         self.passwords = {"alice": PASSWORD}
         home = root / "etc/appliance"
         self.ca = home / "certs/ca.crt"
+        machine.run("dpkg", "--purge", "appliance", check=False)  # with the data of a trial before
         self.upgrade()
         settings = yaml.safe_load((home / "appliance.yaml").read_text())
         settings |= {"robot": ROBOT, "bridge": {"bus": "none"}}
@@ -111,8 +117,7 @@ class Service(BrokerProcess):
         (home / "appliance.yaml").write_text(yaml.safe_dump(settings))
         (home / "acl.conf").write_text(ACL)
         (root / "root/password").write_text(PASSWORD)
-        command = ("appliance", "user", "add", "alice", "--password-file", "/root/password")
-        machine.run(*command, check=False)  # of a trial before, there may be one
+        machine.run("appliance", "user", "add", "alice", "--password-file", "/root/password")
         drop_in = root / "etc/systemd/system/appliance.service.d/trial.conf"
         drop_in.parent.mkdir(exist_ok=True)
         drop_in.write_text(DROP_IN)
@@ -128,7 +133,8 @@ class Service(BrokerProcess):
         self.machine.run("dpkg", "-i", place)
 
     def signal(self, name: str) -> None:
-        self.machine.run("kill", f"-{name}", self.main)
+        # To all of its processes: the single file's main one only waits for the one that works.
+        self.machine.run("systemctl", "kill", "-s", name, "appliance")
 
     def start(self) -> None:
         """Wait until systemd has started another one, which is ready."""

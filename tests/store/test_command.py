@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,6 @@ def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -
 
 def test_nothing_stored_yet_is_told(process: ApplianceProcess) -> None:
     process.stop()
-    for path in (process.directory / "state").iterdir():
-        path.unlink()
+    shutil.rmtree(process.directory / "state")
     told = store(process)
     assert told.returncode == 1 and "nothing has been stored yet" in told.stderr
