@@ -17,7 +17,7 @@ from appliance_process import ApplianceProcess
 
 from appliance import certs, cli, config
 from appliance.config import Settings
-from appliance.doctor import computer, examination, ports, ros, secrets
+from appliance.doctor import computer, examination, ports, ros, ros1, secrets
 from appliance.doctor.examination import Part, examine
 from appliance.doctor.finding import Finding
 
@@ -296,3 +296,19 @@ def test_a_bus_that_is_not_ros_2_is_left_alone(here: Path) -> None:
     parts: list[Part] = [ros.ros]
     [finding] = parts[0](write(here), None)
     assert finding.text == "bridge.bus is none"
+
+
+def test_ros_1_that_is_not_here(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
+    monkeypatch.setenv("ROS_IP", "127.0.0.1")
+    monkeypatch.setattr(ros1, "available", lambda: (False, "it is not here. Install it"))
+    routes = {"topics": [{"ros": "/odom", "to": "mqtt"}]}
+    for bridge, level in ((routes, "problem"), ({}, "warning")):
+        found = by_subject(ros.ros(write(here, bridge={"bus": "ros1", **bridge}), None))
+        assert found["ROS"] == Finding(level, "ROS", "it is not here", "Install it")
+        master = found["ROS Master"]
+        assert (master.level, "start roscore" in master.advice) == (level, True)
+        assert "http://127.0.0.1:1: [Errno 111]" in master.text
+        assert found["ROS network"].level == "ok"
+    far = ros1._address("http://192.0.2.1:11311")
+    assert far.level == "warning" and "which other computers take for themselves" in far.text

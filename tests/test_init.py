@@ -128,6 +128,14 @@ def test_the_first_user_may_call_what_is_bridged_and_nothing_else(tmp_path: Path
     assert [f for f in check(config.load(tmp_path / "appliance.yaml")) if f.level == "error"] == []
 
 
+def test_parameters_of_ros_1_may_be_at_the_top(tmp_path: Path) -> None:
+    (tmp_path / "appliance.yaml").write_text("bridge: {bus: ros1, parameters: [/speed]}")
+    list(initialise(tmp_path, user="alice"))
+    lines = (tmp_path / "acl.conf").read_text().splitlines()
+    assert "topic write {robot}/_param/speed/set/#" in lines
+    assert "topic write {robot}/_param/_set/#" in lines
+
+
 def test_where_nothing_is_called_yet_the_lines_are_shown(tmp_path: Path) -> None:
     list(initialise(tmp_path, robot="r2", user="alice"))
     text = (tmp_path / "acl.conf").read_text()
