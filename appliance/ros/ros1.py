@@ -230,7 +230,7 @@ class Ros1Node:
         if not self._await_master():
             return False
         self._check_name()
-        rospy = _fresh_rospy()
+        self._rospy = rospy = _fresh_rospy()
         # rospy would take over the logging of the whole process.
         rospy.core.configure_logging = lambda *_, **__: None
         rospy.init_node(
@@ -240,7 +240,6 @@ class Ros1Node:
             disable_rosout=True,
             disable_signals=True,
         )
-        self._rospy = rospy
         self.name = rospy.get_name()
         self._uri = rospy.core.get_node_uri()
         self._master.caller = self.name
