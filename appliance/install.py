@@ -14,9 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from appliance import config
 from appliance.environment import for_other_programs
 from appliance.init import CONFIGURATION as CONFIGURATION_TEXT
-from appliance.init import Credentials, initialise
+from appliance.init import Credentials, initialise, robot_name
 from appliance.init import Step as InitStep
 from appliance.unit import (
     CONFIGURATION,
@@ -149,6 +150,8 @@ class Installation:
             if not purge:
                 yield Step("kept", str(path), f"{text}; --purge removes it")
             else:
+                if place.is_symlink():
+                    text = f"the link; {text} stay in {place.resolve()}"
                 yield self._step("removed", str(path), text, partial(_remove, place))
         if purge and self._account() is not None and self.user == OWN_USER:
             remove = partial(self._run, "userdel", *self._prefix, OWN_USER)
@@ -176,11 +179,17 @@ class Installation:
         self._undo.clear()
 
     def _user_before(self) -> str:
-        try:
-            lines = self._at(UNIT_FILE).read_text().splitlines()
-        except OSError:
-            return ""
-        return next((line[5:].strip() for line in lines if line.startswith("User=")), "")
+        """Whom the service runs as by its unit and what `systemctl edit` adds to it."""
+        unit = self._at(UNIT_FILE)
+        files = [] if self.packaged else [unit]
+        files += sorted(unit.with_name(f"{unit.name}.d").glob("*.conf"))
+        user = ""
+        for file in files:
+            with contextlib.suppress(OSError):
+                lines = file.read_text().splitlines()
+                named = [line.partition("=")[2].strip() for line in lines if line[:5] == "User="]
+                user = named[-1] if named else user
+        return user
 
     def _put_before(self) -> list[Path]:
         """What an installation has put in place; a command that was there already is not in it."""
@@ -210,6 +219,10 @@ class Installation:
             raise InstallError("this needs root: sudo appliance install; --dry-run only shows it")
         if not self.root.is_dir():
             raise InstallError(f"there is no directory {self.root}")
+        for path in (CONFIGURATION, DATA):
+            target = self._at(path).resolve()
+            if not target.is_relative_to(self.root):
+                raise InstallError(f"{self._at(path)} leads out of {self.root}, to {target}")
         if self._at(PACKAGED_UNIT).exists() and not self.packaged:
             raise InstallError(
                 "the Debian package is installed here, and looks after the same files: "
@@ -323,19 +336,35 @@ class Installation:
         assert account is not None
         place.mkdir(mode=0o750, parents=True, exist_ok=True)
         before = place.stat().st_uid
-        made = set()
+        if before != os.geteuid():
+            yield self._configuration_of_another(place)
+            _hand_over(place, account, before)
+            return
         text = CONFIGURATION_TEXT.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1)
         for step in initialise(place, robot=self.robot, configuration=text):
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
                 yield Step("made" if step.made else "kept", str(shown), step.text)
-                if step.made:
-                    made.add(step.path)
             else:
                 yield step
         _hand_over(place, account, before)
-        for path in made:
-            os.chown(path, account.uid, account.gid)
+
+    def _configuration_of_another(self, place: Path) -> Step:
+        """That of an earlier installation; root makes nothing where another user is at home.
+
+        Where it would be made is for that user to say, by links and by what appliance.yaml names.
+        """
+        file = place / "appliance.yaml"
+        if not file.exists():
+            raise InstallError(
+                f"{CONFIGURATION} is there, of another user and without an appliance.yaml: put it "
+                "back, or move the folder away, and everything in it is made anew"
+            )
+        settings = config.load(file)
+        if self.robot and settings.robot != robot_name(self.robot):
+            raise InstallError(f"{file} has robot: {settings.robot}; change it there")
+        text = "configuration, certificates, users and access rules"
+        return Step("kept", str(CONFIGURATION), text)
 
     def _data(self, account: _Account | None) -> Iterator[Step]:
         place = self._at(DATA)
@@ -524,8 +553,9 @@ def _same(one: Path, other: Path) -> bool:
 def _hand_over(tree: Path, account: _Account, owner: int) -> None:
     """Give what `owner` has in there to the service's user; what others have stays theirs."""
     # By descriptors and never through a link: the service's user may change what is in there now.
-    for _, directories, files, descriptor in os.fwalk(tree):
-        for name in (".", *directories, *files):
+    # The folder itself last: it tells the next installation whether this one was cut off.
+    for _, directories, files, descriptor in os.fwalk(tree.resolve(), topdown=False):
+        for name in (*directories, *files, "."):
             status = os.stat(name, dir_fd=descriptor, follow_symlinks=False)
             if status.st_uid == owner and (stat.S_ISDIR(status.st_mode) or status.st_nlink == 1):
                 os.chown(name, account.uid, account.gid, dir_fd=descriptor, follow_symlinks=False)

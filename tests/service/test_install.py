@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -114,6 +115,95 @@ def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
     os.link(secret, home / "hard")
     install(image, single_file(tmp_path))
     assert secret.stat().st_uid == os.geteuid()
+
+
+def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) -> None:
+    """The service may write its configuration, which must not lead an upgrade elsewhere."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    home, outside = image / "etc/appliance", tmp_path / "cron.d"
+    outside.mkdir()
+    with (home / "appliance.yaml").open("a") as file:
+        file.write(f"broker: {{acl: {outside}/acl, users: {outside}/users}}\n")
+    text = (home / "appliance.yaml").read_text().replace("broker:\n  store", "other:\n  store")
+    (home / "appliance.yaml").write_text(
+        "\n".join(line for line in text.splitlines() if not line.startswith(("other", "  store")))
+    )
+    (home / "certs/server.crt").unlink()
+    (home / "certs").rename(home / "before")
+    (home / "certs").symlink_to(outside)
+    install(image, single_file(tmp_path, 2))
+    assert list(outside.iterdir()) == []
+    (home / "appliance.yaml").unlink()
+    with pytest.raises(InstallError, match="without an appliance.yaml"):
+        install(image, single_file(tmp_path, 3))
+
+
+def test_cut_off_while_it_hands_over(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    chown, left = os.chown, [3]
+
+    def cut_off(*arguments: Any, **options: Any) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError("the power went")
+        chown(*arguments, **options)
+
+    monkeypatch.setattr(os, "chown", cut_off)
+    with pytest.raises(OSError, match="the power went"):
+        install(image, single_file(tmp_path))
+    monkeypatch.undo()
+    install(image, single_file(tmp_path))
+    home = image / "etc/appliance"
+    assert {path.stat().st_uid for path in (home, *home.rglob("*"))} == {home.stat().st_uid}
+    assert home.stat().st_uid != os.geteuid()
+
+
+def test_an_upgrade_of_the_package_keeps_the_user_of_the_units_changes(
+    image: Path, tmp_path: Path
+) -> None:
+    """What README says: `systemctl edit` with another user, and its files handed to that."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+
+    def configure() -> None:
+        list(Installation(Path("/usr/bin/appliance"), root=image, packaged=True).install())
+
+    configure()
+    changes = image / "etc/systemd/system/appliance.service.d/override.conf"
+    changes.parent.mkdir(parents=True)
+    changes.write_text("[Service]\nUser=robot\nGroup=robot\n")
+    folders = image / "etc/appliance", image / "var/lib/appliance"
+    files = [path for folder in folders for path in (folder, *folder.rglob("*"))]
+    for path in files:
+        os.chown(path, UID, UID)
+    configure()
+    assert {path.stat().st_uid for path in files} == {UID}
+
+
+def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
+    """A system that is mounted read-only has its configuration on another disk."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    disk = image / "data"
+    disk.mkdir()
+    (image / "etc/appliance").symlink_to("../data")
+    install(image, single_file(tmp_path))
+    assert {path.stat().st_uid for path in (disk, *disk.rglob("*"))} == {disk.stat().st_uid}
+    assert disk.stat().st_uid != os.geteuid()
+    steps = list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    assert [step.text for step in steps if step.subject == "/etc/appliance"] == [
+        f"the link; configuration, users, certificates and keys stay in {disk}"
+    ]
+    assert (disk / "appliance.yaml").exists()
+
+    (image / "etc/appliance").symlink_to(tmp_path)
+    with pytest.raises(InstallError, match="leads out of"):
+        install(image, single_file(tmp_path))
 
 
 def test_a_dry_run_changes_nothing(image: Path, tmp_path: Path) -> None:
