@@ -402,6 +402,7 @@ class Installation:
 
     def unit(self, account: _Account | None = None) -> Unit:
         """The unit for this computer."""
+        account = account or self._account()
         homes = ("/home", "/root", "/run/user")
         behind = any(
             path.is_relative_to(home)
