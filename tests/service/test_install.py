@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
+from appliance import install_command
 from appliance.config import load
 from appliance.init import Credentials
 from appliance.install import Installation, InstallError
@@ -136,7 +137,7 @@ def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) 
     install(image, single_file(tmp_path, 2))
     assert list(outside.iterdir()) == []
     (home / "appliance.yaml").unlink()
-    with pytest.raises(InstallError, match="without an appliance.yaml"):
+    with pytest.raises(InstallError, match=r"without an appliance\.yaml"):
         install(image, single_file(tmp_path, 3))
 
 
@@ -237,6 +238,63 @@ def test_what_is_in_the_way_is_told(image: Path, tmp_path: Path) -> None:
     packaged.parent.mkdir(parents=True)
     packaged.touch()
     assert "apt upgrades and removes it" in error(Path("/", COMMAND), file, image)
+
+
+def test_the_command_keeps_the_user_of_before(
+    image: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (image / UNIT).parent.mkdir(parents=True)
+    (image / UNIT).write_text("[Service]\nUser=robot\n")
+    (image / "opt").mkdir()
+    (image / "opt/appliance").touch()
+    monkeypatch.setattr(sys, "argv", ["/opt/appliance"])
+    install_command.install(dry_run=True, root=image)
+    assert "\nUser=robot\nGroup=drivers\n" in capsys.readouterr().out
+
+
+def run_script(image: Path, name: str, *arguments: str) -> list[str]:
+    """A script of the package with `image` in place of /; returns the commands that it called."""
+    called = image / "called"
+    called.unlink(missing_ok=True)
+    programs = image / "programs"
+    programs.mkdir(exist_ok=True)
+    text = (PROJECT / "appliance/packaging/debian" / name).read_text()
+    for folder in ("/etc/", "/usr/", "/var/", "/run/"):
+        text = text.replace(folder, f"{image}{folder}")
+    for program in ("appliance", "deb-systemd-helper", "deb-systemd-invoke", "systemctl"):
+        for place in (programs / program, image / "usr/bin" / program):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(f'#!/bin/sh\necho "$0 $@" >> {called}\n')
+            place.chmod(0o755)
+    environment = {"PATH": f"{programs}:/usr/bin:/bin"}
+    subprocess.run(["sh", "-c", text, name, *arguments], env=environment, check=True)
+    lines = called.read_text().splitlines() if called.exists() else []
+    return [line.removeprefix(f"{image}/") for line in lines]
+
+
+def test_the_package_runs_its_own_command(image: Path) -> None:
+    """An older one that was installed by hand comes first in the PATH."""
+    assert run_script(image, "postinst", "configure")[0] == "usr/bin/appliance install --packaged"
+    called = run_script(image, "postinst", "abort-upgrade")
+    assert called and not [line for line in called if "install --packaged" in line]
+
+
+def test_to_purge_the_package_leaves_what_was_installed_by_hand_since(image: Path) -> None:
+    folders = image / "etc/appliance", image / "var/lib/appliance"
+    for folder in folders:
+        folder.mkdir(parents=True)
+    unit = image / UNIT
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\n")
+    run_script(image, "postrm", "purge")
+    assert all(folder.exists() for folder in folders)
+    unit.unlink()
+    unit.symlink_to("/dev/null")  # the mask that the package's removal leaves
+    run_script(image, "postrm", "remove")
+    assert all(folder.exists() for folder in folders)
+    run_script(image, "postrm", "purge")
+    assert not any(folder.exists() for folder in folders)
+    run_script(image, "postrm", "purge")
 
 
 def test_what_a_sourced_ros_says_is_taken_over(image: Path, tmp_path: Path) -> None:
