@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pwd
 import shutil
@@ -35,6 +36,8 @@ UNIT_FILE = Path("/etc/systemd/system", NAME)
 PACKAGED_COMMAND = Path("/usr/bin/appliance")
 PACKAGED_UNIT = Path("/usr/lib/systemd/system", NAME)
 _ENABLED = Path("/etc/systemd/system/multi-user.target.wants", NAME)
+
+_LOCK = Path("/run/appliance-install.lock")
 
 #: Seconds for systemd to start the service, which may have a large store to read, and to stop it.
 PATIENCE = 330.0
@@ -116,15 +119,16 @@ class Installation:
         self._check()
         if self.source is None and not self.packaged:
             self._check_command()
-        try:
-            yield from self._install()
-        except Exception:
-            self._put_back()
-            raise
-        finally:
-            for path in (COMMAND, UNIT_FILE):
-                if self._starts:
-                    _before(self._at(path)).unlink(missing_ok=True)
+        with self._alone():
+            try:
+                yield from self._install()
+            except BaseException:  # also Ctrl-C, and nobody who reads what is said any more
+                self._put_back()
+                raise
+            finally:
+                for path in (COMMAND, UNIT_FILE):
+                    if self._starts:
+                        _before(self._at(path)).unlink(missing_ok=True)
 
     def uninstall(self, *, purge: bool = False) -> Iterator[Step]:
         """Takes the service and the command away; with `purge` what they have written as well.
@@ -133,6 +137,10 @@ class Installation:
             InstallError: something is in the way.
         """
         self._check()
+        with self._alone():
+            yield from self._uninstall(purge)
+
+    def _uninstall(self, purge: bool) -> Iterator[Step]:
         if self._lives_here and self._at(UNIT_FILE).exists():
             yield self._step("done", "systemctl", "the service is stopped", self._disable)
         for path in self._put_before():
@@ -171,6 +179,26 @@ class Installation:
             yield from self._variables()
             yield from self._unit(account)
             yield from self._start()
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Two at once would write the same files."""
+        if self.dry_run:
+            yield
+            return
+        lock = self._at(_LOCK)
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                text = "another `appliance install` is at work; wait for its end"
+                raise InstallError(text) from None
+            yield
+            lock.unlink(missing_ok=True)
+        finally:
+            os.close(descriptor)
 
     def _put_back(self) -> None:
         """Let the files be as they were."""
@@ -257,7 +285,8 @@ class Installation:
                 timeout=60,
                 check=False,
             )
-            reason = tried.stderr.strip().rpartition("\n")[2] if tried.returncode else ""
+            said = tried.stderr.strip().rpartition("\n")[2] or f"exit code {tried.returncode}"
+            reason = said if tried.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             reason = str(error)
         if reason:
@@ -397,7 +426,7 @@ class Installation:
             else ""
         )
         yield self._step(
-            "made", str(ENVIRONMENT), say, partial(self._put, ENVIRONMENT, text, 0o644)
+            "made", str(ENVIRONMENT), say, partial(self._put, ENVIRONMENT, text, 0o640)
         )
 
     def unit(self, account: _Account | None = None) -> Unit:

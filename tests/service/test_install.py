@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import stat
 import subprocess
 import sys
@@ -205,6 +206,62 @@ def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
     (image / "etc/appliance").symlink_to(tmp_path)
     with pytest.raises(InstallError, match="leads out of"):
         install(image, single_file(tmp_path))
+
+
+def test_two_at_once(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    first = Installation(Path("/", COMMAND), single_file(tmp_path), image).install()
+    next(first)
+    with pytest.raises(InstallError, match="another `appliance install` is at work"):
+        install(image, single_file(tmp_path, 2))
+    with pytest.raises(InstallError, match="another `appliance install` is at work"):
+        list(Installation(Path("/", COMMAND), root=image).uninstall())
+    list(first)
+    install(image, single_file(tmp_path, 2))
+
+
+def test_interrupted_it_is_as_before(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while the new version is started, which may not run at all."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+
+    def interrupted(self: Installation) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Installation, "_starts", True)
+    monkeypatch.setattr(Installation, "_restart", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        install(image, single_file(tmp_path, 2))
+    assert (image / COMMAND).read_text() == single_file(tmp_path).read_text()
+    assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
+
+
+def test_the_variables_are_not_for_everyone(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    assert not (image / "etc/default/appliance").stat().st_mode & 0o007
+
+
+@pytest.mark.parametrize("setup", ["/nowhere/setup.sh", ""])
+def test_it_starts_without_the_ros_that_it_had(tmp_path: Path, setup: str) -> None:
+    lines = str(Unit(tmp_path / "appliance")).replace("\\\n", " ").splitlines()
+    command = next(line for line in lines if line.startswith("ExecStart=")).partition("=")[2]
+    (tmp_path / "appliance").write_text('#!/bin/sh\necho "ran $1"\n')
+    (tmp_path / "appliance").chmod(0o755)
+    done = subprocess.run(
+        shlex.split(command.replace("$$", "$")),
+        env={"ROS_SETUP": setup},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "ran run\n"
+    assert done.stderr == (f"<4>ROS_SETUP cannot be read: {setup}\n" if setup else "")
 
 
 def test_a_dry_run_changes_nothing(image: Path, tmp_path: Path) -> None:
