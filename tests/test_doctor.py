@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -279,6 +280,28 @@ def test_domains(here: Path, monkeypatch: pytest.MonkeyPatch, domain: str, level
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     [finding] = ros._discovery(write(here, bridge={}))
     assert finding.level == level and "nodes of this computer only" in finding.text
+
+
+def test_it_looks_with_the_environment_of_the_running_one(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A domain of its own, which is in /etc/default/appliance, is not in root's shell."""
+    for name in ros._DISCOVERY:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "1")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    settings = config.load(here / "appliance.yaml")
+    assert ros.adopt_environment(settings, None) == []
+    environment = {"ROS_DOMAIN_ID": "42", "ROS_LOCALHOST_ONLY": "1", "HOME": "/nowhere"}
+    with subprocess.Popen(["sleep", "60"], env=environment) as running:
+        try:
+            adopted = ros.adopt_environment(settings, {"pid": running.pid})
+        finally:
+            running.kill()
+    assert adopted == ["no RMW_IMPLEMENTATION", "ROS_DOMAIN_ID=42"]
+    assert os.environ["ROS_DOMAIN_ID"] == "42" and "RMW_IMPLEMENTATION" not in os.environ
+    assert os.environ["HOME"] != "/nowhere"
 
 
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
