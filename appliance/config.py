@@ -827,8 +827,12 @@ class Settings(_Section):
 def find(path: Path | None = None) -> Path:
     """The configuration file to use: `path`, else the first of SEARCH_PATH. Raises ConfigError."""
     for candidate in (path,) if path else SEARCH_PATH:
-        if candidate.is_file():
-            return candidate
+        try:
+            if candidate.is_file():
+                return candidate
+        except PermissionError:
+            text = "may not be looked at: run this as the appliance's user, or as root"
+            raise ConfigError([Problem(candidate, 0, "", text)]) from None
     missing = path or SEARCH_PATH[0]
     places = "no such file" if path else f"not found, nor {SEARCH_PATH[1]}"
     raise ConfigError([Problem(missing, 0, "", f"{places}; `appliance init` writes one")])

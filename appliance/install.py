@@ -244,7 +244,7 @@ class Installation:
 
     def _check(self) -> None:
         if os.geteuid() and not self.dry_run:
-            raise InstallError("this needs root: sudo appliance install; --dry-run only shows it")
+            raise InstallError("this needs root (sudo); --dry-run only shows it")
         if not self.root.is_dir():
             raise InstallError(f"there is no directory {self.root}")
         for path in (CONFIGURATION, DATA):
@@ -358,14 +358,16 @@ class Installation:
         if not self.initialise:
             return
         if self.dry_run:
-            verb: Verb = "kept" if (place / "appliance.yaml").exists() else "made"
+            # Who only wants to see it may not look into the folder.
+            is_there = os.access(place, os.X_OK) and (place / "appliance.yaml").exists()
+            verb: Verb = "kept" if is_there or self._is_of_another(place) else "made"
             text = "configuration, certificates, first user and access rules; what is there stays"
             yield Step(verb, str(CONFIGURATION), text)
             return
         assert account is not None
         place.mkdir(mode=0o750, parents=True, exist_ok=True)
         before = place.stat().st_uid
-        if before != os.geteuid():
+        if self._is_of_another(place):
             yield self._configuration_of_another(place)
             _hand_over(place, account, before)
             return
@@ -377,6 +379,10 @@ class Installation:
             else:
                 yield step
         _hand_over(place, account, before)
+
+    def _is_of_another(self, place: Path) -> bool:
+        """Whether another user than root has it, to whom it was handed over."""
+        return place.exists() and place.stat().st_uid != 0
 
     def _configuration_of_another(self, place: Path) -> Step:
         """That of an earlier installation; root makes nothing where another user is at home.

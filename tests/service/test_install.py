@@ -427,3 +427,22 @@ def test_the_first_configuration_is_one(tmp_path: Path) -> None:
         "crash_reports",
         "bridge",
     }
+
+
+def test_a_dry_run_of_who_may_not_look(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    exists = Path.exists
+
+    def closed(path: Path) -> bool:
+        if path.name == "appliance.yaml":
+            raise PermissionError(13, "Permission denied", str(path))
+        return exists(path)
+
+    monkeypatch.setattr(Path, "exists", closed)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    done = install(image, single_file(tmp_path), dry_run=True)
+    assert done["/etc/appliance"] == "kept"
