@@ -158,6 +158,18 @@ def test_places_where_nobody_can_listen(here: Path) -> None:
 # The computer
 
 
+def test_a_port_for_root_alone(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service is not root, also when root asks."""
+    monkeypatch.setattr(ports, "_UNPRIVILEGED", here / "none")
+    settings = write(here, broker={"listeners": [{"bind": "127.0.0.1:799"}]})
+    assert settings.file is not None
+    if os.geteuid() == 0:
+        assert by_subject(ports.ports(settings, None))["port 127.0.0.1:799"].level == "ok"
+        os.chown(settings.file, 4321, 4321)
+    finding = by_subject(ports.ports(settings, None))["port 127.0.0.1:799"]
+    assert finding.level == "warning" and "CapabilityBoundingSet=" in finding.advice
+
+
 def test_a_clock_that_is_not_set(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = write(here)
     assert computer.is_synchronised() in (True, False)
