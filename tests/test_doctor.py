@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import yaml
-from appliance_process import ApplianceProcess
+from appliance_process import ApplianceProcess, eventually
 
 from appliance import certs, cli, config
 from appliance.config import Settings
@@ -308,6 +308,8 @@ def test_it_looks_with_the_environment_of_the_running_one(
     environment = {"ROS_DOMAIN_ID": "42", "ROS_LOCALHOST_ONLY": "1", "HOME": "/nowhere"}
     with subprocess.Popen(["sleep", "60"], env=environment) as running:
         try:
+            environ = Path(f"/proc/{running.pid}/environ")
+            eventually(environ.read_bytes, "its environment, a moment after it has begun")
             adopted = ros.adopt_environment(settings, {"pid": running.pid})
         finally:
             running.kill()

@@ -81,7 +81,7 @@ def adopt_environment(settings: Settings, running: dict[str, Any] | None) -> lis
     else:
         with suppress(OSError):
             lines = Path(f"/proc/{running['pid']}/environ").read_bytes().split(b"\0")
-            theirs = dict(os.fsdecode(line).partition("=")[::2] for line in lines)
+            theirs = dict(os.fsdecode(line).partition("=")[::2] for line in lines if line)
     adopted = []
     for name in _DISCOVERY if theirs else ():
         value = theirs.get(name)
