@@ -14,6 +14,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -35,6 +36,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from appliance.document import Document, KeyPath, Problem
+from appliance.environment import of_service
 
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Where the configuration is looked for when no file is named; the first that exists is used."""
@@ -825,22 +827,43 @@ class Settings(_Section):
 def find(path: Path | None = None) -> Path:
     """The configuration file to use: `path`, else the first of SEARCH_PATH. Raises ConfigError."""
     for candidate in (path,) if path else SEARCH_PATH:
-        if candidate.is_file():
-            return candidate
+        try:
+            if candidate.is_file():
+                return candidate
+        except PermissionError:
+            text = "may not be looked at: run this as the appliance's user, or as root"
+            raise ConfigError([Problem(candidate, 0, "", text)]) from None
     missing = path or SEARCH_PATH[0]
     places = "no such file" if path else f"not found, nor {SEARCH_PATH[1]}"
     raise ConfigError([Problem(missing, 0, "", f"{places}; `appliance init` writes one")])
 
 
 def load(path: Path | None = None) -> Settings:
-    """The settings of that file, or of the first of SEARCH_PATH. Raises ConfigError."""
+    """The settings of that file, or of the first of SEARCH_PATH. Raises ConfigError.
+
+    Those of the service are read with its variables, too: a shell of its administrator has none.
+    """
     file = find(path)
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
         raise ConfigError([Problem(file, 0, "", f"cannot be read: {reason}")]) from None
-    return loads(text, file)
+    return loads(text, file, {**of_service(file), **os.environ})
+
+
+def load_control(path: Path | None = None) -> Settings:
+    """The defaults, with nothing but `control` of a file that `load` finds something wrong with.
+
+    The running one goes on with what it has read before, and can still be asked.
+    """
+    text, file = "", path or SEARCH_PATH[0]
+    with suppress(ConfigError, OSError):
+        file = find(path)
+        found = re.search(r"^control:.*", file.read_text(encoding="utf-8", errors="replace"), re.M)
+        text = found[0] if found else ""
+        return loads(text, file, {**of_service(file), **os.environ})
+    return loads("", file)
 
 
 def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:

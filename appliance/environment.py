@@ -1,10 +1,12 @@
-"""The environment that other programs are started with."""
+"""The environment that other programs are started with, and that of the service."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = "LD_LIBRARY_PATH"
@@ -28,3 +30,24 @@ def for_other_programs(environment: Mapping[str, str] | None = None) -> dict[str
     if kept:
         result[LIBRARIES] = os.pathsep.join(kept)
     return result
+
+
+def of_service(configuration: Path) -> dict[str, str]:
+    """What systemd gives to the service with that configuration, EnvironmentFile= in its unit.
+
+    Empty for the configuration of no service, and for who may not read it.
+    """
+    *_, etc, folder, name = ("", "", *configuration.absolute().parts)
+    if (etc, folder, name) != ("etc", "appliance", "appliance.yaml"):
+        return {}
+    lines: list[str] = []
+    with suppress(OSError, UnicodeDecodeError):
+        file = configuration.absolute().parents[1] / "default/appliance"
+        lines = file.read_text(encoding="utf-8").replace("\\\n", "").splitlines()
+    found = {}
+    for line in map(str.strip, lines):
+        name, is_set, value = line.partition("=")
+        if is_set and line[0] not in "#;":
+            with suppress(ValueError):  # a quote without an end
+                found[name.strip()] = shlex.split(value)[0] if value[:1] in {"'", '"'} else value
+    return found

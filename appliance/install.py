@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pwd
 import shutil
@@ -14,9 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from appliance import config
 from appliance.environment import for_other_programs
 from appliance.init import CONFIGURATION as CONFIGURATION_TEXT
-from appliance.init import Credentials, initialise
+from appliance.init import Credentials, initialise, robot_name
 from appliance.init import Step as InitStep
 from appliance.unit import (
     CONFIGURATION,
@@ -34,6 +36,8 @@ UNIT_FILE = Path("/etc/systemd/system", NAME)
 PACKAGED_COMMAND = Path("/usr/bin/appliance")
 PACKAGED_UNIT = Path("/usr/lib/systemd/system", NAME)
 _ENABLED = Path("/etc/systemd/system/multi-user.target.wants", NAME)
+
+_LOCK = Path("/run/appliance-install.lock")
 
 #: Seconds for systemd to start the service, which may have a large store to read, and to stop it.
 PATIENCE = 330.0
@@ -115,15 +119,16 @@ class Installation:
         self._check()
         if self.source is None and not self.packaged:
             self._check_command()
-        try:
-            yield from self._install()
-        except Exception:
-            self._put_back()
-            raise
-        finally:
-            for path in (COMMAND, UNIT_FILE):
-                if self._starts:
-                    _before(self._at(path)).unlink(missing_ok=True)
+        with self._alone():
+            try:
+                yield from self._install()
+            except BaseException:  # also Ctrl-C, and nobody who reads what is said any more
+                self._put_back()
+                raise
+            finally:
+                for path in (COMMAND, UNIT_FILE):
+                    if self._starts:
+                        _before(self._at(path)).unlink(missing_ok=True)
 
     def uninstall(self, *, purge: bool = False) -> Iterator[Step]:
         """Takes the service and the command away; with `purge` what they have written as well.
@@ -132,6 +137,10 @@ class Installation:
             InstallError: something is in the way.
         """
         self._check()
+        with self._alone():
+            yield from self._uninstall(purge)
+
+    def _uninstall(self, purge: bool) -> Iterator[Step]:
         if self._lives_here and self._at(UNIT_FILE).exists():
             yield self._step("done", "systemctl", "the service is stopped", self._disable)
         for path in self._put_before():
@@ -149,6 +158,8 @@ class Installation:
             if not purge:
                 yield Step("kept", str(path), f"{text}; --purge removes it")
             else:
+                if place.is_symlink():
+                    text = f"the link; {text} stay in {place.resolve()}"
                 yield self._step("removed", str(path), text, partial(_remove, place))
         if purge and self._account() is not None and self.user == OWN_USER:
             remove = partial(self._run, "userdel", *self._prefix, OWN_USER)
@@ -169,6 +180,26 @@ class Installation:
             yield from self._unit(account)
             yield from self._start()
 
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Two at once would write the same files."""
+        if self.dry_run:
+            yield
+            return
+        lock = self._at(_LOCK)
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                text = "another `appliance install` is at work; wait for its end"
+                raise InstallError(text) from None
+            yield
+            lock.unlink(missing_ok=True)
+        finally:
+            os.close(descriptor)
+
     def _put_back(self) -> None:
         """Let the files be as they were."""
         for undo in reversed(self._undo):
@@ -176,11 +207,17 @@ class Installation:
         self._undo.clear()
 
     def _user_before(self) -> str:
-        try:
-            lines = self._at(UNIT_FILE).read_text().splitlines()
-        except OSError:
-            return ""
-        return next((line[5:].strip() for line in lines if line.startswith("User=")), "")
+        """Whom the service runs as by its unit and what `systemctl edit` adds to it."""
+        unit = self._at(UNIT_FILE)
+        files = [] if self.packaged else [unit]
+        files += sorted(unit.with_name(f"{unit.name}.d").glob("*.conf"))
+        user = ""
+        for file in files:
+            with contextlib.suppress(OSError):
+                lines = file.read_text().splitlines()
+                named = [line.partition("=")[2].strip() for line in lines if line[:5] == "User="]
+                user = named[-1] if named else user
+        return user
 
     def _put_before(self) -> list[Path]:
         """What an installation has put in place; a command that was there already is not in it."""
@@ -207,9 +244,13 @@ class Installation:
 
     def _check(self) -> None:
         if os.geteuid() and not self.dry_run:
-            raise InstallError("this needs root: sudo appliance install; --dry-run only shows it")
+            raise InstallError("this needs root (sudo); --dry-run only shows it")
         if not self.root.is_dir():
             raise InstallError(f"there is no directory {self.root}")
+        for path in (CONFIGURATION, DATA):
+            target = self._at(path).resolve()
+            if not target.is_relative_to(self.root):
+                raise InstallError(f"{self._at(path)} leads out of {self.root}, to {target}")
         if self._at(PACKAGED_UNIT).exists() and not self.packaged:
             raise InstallError(
                 "the Debian package is installed here, and looks after the same files: "
@@ -244,7 +285,8 @@ class Installation:
                 timeout=60,
                 check=False,
             )
-            reason = tried.stderr.strip().rpartition("\n")[2] if tried.returncode else ""
+            said = tried.stderr.strip().rpartition("\n")[2] or f"exit code {tried.returncode}"
+            reason = said if tried.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             reason = str(error)
         if reason:
@@ -316,26 +358,48 @@ class Installation:
         if not self.initialise:
             return
         if self.dry_run:
-            verb: Verb = "kept" if (place / "appliance.yaml").exists() else "made"
+            # Who only wants to see it may not look into the folder.
+            is_there = os.access(place, os.X_OK) and (place / "appliance.yaml").exists()
+            verb: Verb = "kept" if is_there or self._is_of_another(place) else "made"
             text = "configuration, certificates, first user and access rules; what is there stays"
             yield Step(verb, str(CONFIGURATION), text)
             return
         assert account is not None
         place.mkdir(mode=0o750, parents=True, exist_ok=True)
         before = place.stat().st_uid
-        made = set()
+        if self._is_of_another(place):
+            yield self._configuration_of_another(place)
+            _hand_over(place, account, before)
+            return
         text = CONFIGURATION_TEXT.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1)
         for step in initialise(place, robot=self.robot, configuration=text):
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
                 yield Step("made" if step.made else "kept", str(shown), step.text)
-                if step.made:
-                    made.add(step.path)
             else:
                 yield step
         _hand_over(place, account, before)
-        for path in made:
-            os.chown(path, account.uid, account.gid)
+
+    def _is_of_another(self, place: Path) -> bool:
+        """Whether another user than root has it, to whom it was handed over."""
+        return place.exists() and place.stat().st_uid != 0
+
+    def _configuration_of_another(self, place: Path) -> Step:
+        """That of an earlier installation; root makes nothing where another user is at home.
+
+        Where it would be made is for that user to say, by links and by what appliance.yaml names.
+        """
+        file = place / "appliance.yaml"
+        if not file.exists():
+            raise InstallError(
+                f"{CONFIGURATION} is there, of another user and without an appliance.yaml: put it "
+                "back, or move the folder away, and everything in it is made anew"
+            )
+        settings = config.load(file)
+        if self.robot and settings.robot != robot_name(self.robot):
+            raise InstallError(f"{file} has robot: {settings.robot}; change it there")
+        text = "configuration, certificates, users and access rules"
+        return Step("kept", str(CONFIGURATION), text)
 
     def _data(self, account: _Account | None) -> Iterator[Step]:
         place = self._at(DATA)
@@ -368,11 +432,12 @@ class Installation:
             else ""
         )
         yield self._step(
-            "made", str(ENVIRONMENT), say, partial(self._put, ENVIRONMENT, text, 0o644)
+            "made", str(ENVIRONMENT), say, partial(self._put, ENVIRONMENT, text, 0o640)
         )
 
     def unit(self, account: _Account | None = None) -> Unit:
         """The unit for this computer."""
+        account = account or self._account()
         homes = ("/home", "/root", "/run/user")
         behind = any(
             path.is_relative_to(home)
@@ -524,8 +589,9 @@ def _same(one: Path, other: Path) -> bool:
 def _hand_over(tree: Path, account: _Account, owner: int) -> None:
     """Give what `owner` has in there to the service's user; what others have stays theirs."""
     # By descriptors and never through a link: the service's user may change what is in there now.
-    for _, directories, files, descriptor in os.fwalk(tree):
-        for name in (".", *directories, *files):
+    # The folder itself last: it tells the next installation whether this one was cut off.
+    for _, directories, files, descriptor in os.fwalk(tree.resolve(), topdown=False):
+        for name in (*directories, *files, "."):
             status = os.stat(name, dir_fd=descriptor, follow_symlinks=False)
             if status.st_uid == owner and (stat.S_ISDIR(status.st_mode) or status.st_nlink == 1):
                 os.chown(name, account.uid, account.gid, dir_fd=descriptor, follow_symlinks=False)

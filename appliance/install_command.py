@@ -28,11 +28,12 @@ def install(
         str | None, typer.Option(help="The robot's name; else this computer's.")
     ] = None,
     user: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Run as this user: the one of the ROS nodes shares its memory with them."
+            help="Run as this user: the one of the ROS nodes shares its memory with them. Else the "
+            "one that it ran as before, or its own, appliance."
         ),
-    ] = "appliance",
+    ] = None,
     start: Annotated[
         bool, typer.Option("--start/--no-start", help="Start the service now, or restart it.")
     ] = True,
@@ -60,7 +61,7 @@ def install(
     from appliance.init import Credentials, InitError
     from appliance.install import InstallError
 
-    installation = _installation(root, dry_run, user)
+    installation = _installation(root, dry_run, user or "")
     installation.robot = robot
     installation.start, installation.initialise = start, init
     installation.packaged = packaged

@@ -37,6 +37,7 @@ class Notifier:
         self._socket = _connect(address) if address else None
         self._timer: asyncio.TimerHandle | None = None
         self._status = ""
+        self._owes_ready = False
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str]) -> Notifier:
@@ -53,23 +54,25 @@ class Notifier:
     def start(self, loop: asyncio.AbstractEventLoop, status: Callable[[], str]) -> None:
         """Tell that the service is ready; from now on, that it is alive, and what `status` says."""
         self._status = status()
-        self._tell("READY=1", f"STATUS={self._status}")
+        self._tell_ready(f"STATUS={self._status}")
         if self._socket is None:
             return
-        interval = min(STATUS_INTERVAL, self.watchdog / 2 if self.watchdog else STATUS_INTERVAL)
+        # Half of it is what systemd asks for; one that is late, or lost, is not to be the end.
+        interval = min(STATUS_INTERVAL, self.watchdog / 4 if self.watchdog else STATUS_INTERVAL)
         looked = loop.time()
 
         def beat() -> None:
             nonlocal looked
-            lines = ["WATCHDOG=1"] if self.watchdog else []
+            self._timer = loop.call_later(interval, beat)
+            if self.watchdog:
+                self._tell("WATCHDOG=1", wait=False)
+            if self._owes_ready:
+                self._tell_ready(wait=False)
             if loop.time() >= looked + STATUS_INTERVAL:
                 looked = loop.time()
-                if (text := status()) != self._status:
+                text = status()  # last: should it fail, the service still lives
+                if text != self._status and self._tell(f"STATUS={text}", wait=False):
                     self._status = text
-                    lines.append(f"STATUS={text}")
-            if lines:
-                self._tell(*lines, wait=False)
-            self._timer = loop.call_later(interval, beat)
 
         self._timer = loop.call_later(0, beat)
 
@@ -81,10 +84,11 @@ class Notifier:
         try:
             yield
         finally:
-            self._tell("READY=1")
+            self._tell_ready()
 
     def stopping(self) -> None:
         """Tell that the service ends because it was asked to."""
+        self._owes_ready = False
         self._tell("STOPPING=1", "STATUS=stopping")
 
     def close(self) -> None:
@@ -95,9 +99,14 @@ class Notifier:
             self._socket.close()
             self._socket = None
 
-    def _tell(self, *lines: str, wait: bool = True) -> None:
+    def _tell_ready(self, *lines: str, wait: bool = True) -> None:
+        """Now, or with a later sign of life: systemd waits for it, and then ends the service."""
+        self._owes_ready = not self._tell("READY=1", *lines, wait=wait)
+
+    def _tell(self, *lines: str, wait: bool = True) -> bool:
+        """Returns whether systemd takes it."""
         if self._socket is None:
-            return
+            return False
         # A line's end in a value would begin another one.
         text = "\n".join(line.replace("\n", " ") for line in lines)
         try:
@@ -105,6 +114,8 @@ class Notifier:
             self._socket.send(text.encode(errors="replace"))
         except OSError as error:
             log.debug("systemd was not told %s: %s", lines[0], error)
+            return False
+        return True
 
 
 def _connect(address: str) -> socket.socket | None:

@@ -22,15 +22,14 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
 ) -> None:
     """Ask the running appliance how it is; exit code 1 when none is running."""
-    from appliance.config import SEARCH_PATH, loads
+    from appliance.config import load_control
     from appliance.control import ControlError, NotRunningError, ask
 
     broken: CommandError | None = None
     try:
         settings = load_settings(config)
     except CommandError as error:
-        # The running one goes on with what it has read before, and can still be asked.
-        broken, settings = error, loads("", config or SEARCH_PATH[0])
+        broken, settings = error, load_control(config)
     try:
         told = ask(settings.control, "status")
     except NotRunningError as error:

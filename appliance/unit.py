@@ -66,7 +66,10 @@ Type=notify
 SyslogIdentifier=appliance
 NotifyAccess={notify_access}
 EnvironmentFile=-{environment}
-ExecStart=/bin/sh -c 'if [ -n "$$ROS_SETUP" ]; then . "$$ROS_SETUP"; fi; exec "$$0" "$$@"' \\
+# A ROS that is gone, or not to be read from here, does not keep the broker from its work.
+ExecStart=/bin/sh -c 'if [ -r "$$ROS_SETUP" ]; then . "$$ROS_SETUP"; \\
+    elif [ -n "$$ROS_SETUP" ]; then echo "<4>ROS_SETUP cannot be read: $$ROS_SETUP" >&2; fi; \\
+    exec "$$0" "$$@"' \\
     {argument} run --config {configuration}/appliance.yaml
 # Waits for the end of it, and fails with the reason when files cannot be used.
 ExecReload={executable} reload --config {configuration}/appliance.yaml
@@ -133,6 +136,7 @@ _SAME_USER = ""
 #: What is written to ENVIRONMENT when there is no such file; `{settings}` are lines of variables.
 VARIABLES = """\
 # Environment variables of the service, read at its start: systemctl restart appliance
+# It is root's alone to read: what ${{NAME}} in appliance.yaml stands for may be a password.
 
 # The ROS 2 to use, its own or a workspace's; left out, what the appliance brings along is used.
 #ROS_SETUP=/opt/ros/jazzy/setup.sh

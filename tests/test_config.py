@@ -568,3 +568,14 @@ def test_what_is_said_beside_names() -> None:
     ]
     (found,) = problems("bridge: {services: [{ros: [/a, /b], to: mqtt, type: a/srv/B}]}")
     assert "to: must be ros when ros is a pattern or a list" in found
+
+
+def test_a_file_that_may_not_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that of the service, for most users of the robot."""
+
+    def is_file(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", is_file)
+    with pytest.raises(ConfigError, match="run this as the appliance's user, or as root"):
+        config.load(tmp_path / "appliance.yaml")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 import yaml
-from appliance_process import ApplianceProcess
+from appliance_process import ApplianceProcess, eventually
 
 from appliance import certs, cli, config
 from appliance.config import Settings
@@ -157,6 +158,18 @@ def test_places_where_nobody_can_listen(here: Path) -> None:
 # The computer
 
 
+def test_a_port_for_root_alone(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service is not root, also when root asks."""
+    monkeypatch.setattr(ports, "_UNPRIVILEGED", here / "none")
+    settings = write(here, broker={"listeners": [{"bind": "127.0.0.1:799"}]})
+    assert settings.file is not None
+    if os.geteuid() == 0:
+        assert by_subject(ports.ports(settings, None))["port 127.0.0.1:799"].level == "ok"
+        os.chown(settings.file, 4321, 4321)
+    finding = by_subject(ports.ports(settings, None))["port 127.0.0.1:799"]
+    assert finding.level == "warning" and "CapabilityBoundingSet=" in finding.advice
+
+
 def test_a_clock_that_is_not_set(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = write(here)
     assert computer.is_synchronised() in (True, False)
@@ -279,6 +292,30 @@ def test_domains(here: Path, monkeypatch: pytest.MonkeyPatch, domain: str, level
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     [finding] = ros._discovery(write(here, bridge={}))
     assert finding.level == level and "nodes of this computer only" in finding.text
+
+
+def test_it_looks_with_the_environment_of_the_running_one(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A domain of its own, which is in /etc/default/appliance, is not in root's shell."""
+    for name in ros._DISCOVERY:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "1")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    settings = config.load(here / "appliance.yaml")
+    assert ros.adopt_environment(settings, None) == []
+    environment = {"ROS_DOMAIN_ID": "42", "ROS_LOCALHOST_ONLY": "1", "HOME": "/nowhere"}
+    with subprocess.Popen(["sleep", "60"], env=environment) as running:
+        try:
+            environ = Path(f"/proc/{running.pid}/environ")
+            eventually(environ.read_bytes, "its environment, a moment after it has begun")
+            adopted = ros.adopt_environment(settings, {"pid": running.pid})
+        finally:
+            running.kill()
+    assert adopted == ["no RMW_IMPLEMENTATION", "ROS_DOMAIN_ID=42"]
+    assert os.environ["ROS_DOMAIN_ID"] == "42" and "RMW_IMPLEMENTATION" not in os.environ
+    assert os.environ["HOME"] != "/nowhere"
 
 
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

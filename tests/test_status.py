@@ -11,7 +11,7 @@ import pytest
 from appliance_process import ApplianceProcess
 from raw_client import RawClient
 
-from appliance import cli
+from appliance import cli, config
 from appliance.mqtt.packets import Publish
 
 
@@ -95,3 +95,18 @@ def test_a_file_that_was_broken_since_is_no_reason_not_to_ask(
         appliance.config.write_text(good)
     assert told["pid"] == appliance.pid
     assert any("robbot" in warning for warning in told["warnings"])
+
+
+def test_the_control_of_a_broken_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that of the service, whose control is not beside its configuration."""
+    file = tmp_path / "appliance.yaml"
+    for text in ("control: run/c.sock\nrobbot: r2\n", "robot: [\ncontrol: run/c.sock # here\n"):
+        file.write_text(text)
+        assert config.load_control(file).control == tmp_path / "run/c.sock"
+    for text in ("control: [\n", "robbot: r2\n", "\0"):
+        file.write_text(text)
+        assert config.load_control(file).control == tmp_path / "state/control.sock"
+    file.write_text("robbot: r2\n")
+    monkeypatch.setattr(config, "SEARCH_PATH", (tmp_path / "none.yaml", file))
+    assert config.load_control().file == file
+    assert config.load_control(tmp_path / "no/none.yaml").file == tmp_path / "no/none.yaml"

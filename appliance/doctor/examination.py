@@ -35,7 +35,7 @@ def examine(path: Path | None) -> Iterator[Finding]:
             yield Finding("problem", "configuration", str(problem))
         text = "what follows is with the defaults, and without the files that it would name"
         yield Finding("warning", "configuration", text)
-    known = settings or config.loads("", path or config.SEARCH_PATH[0])
+    known = settings or config.load_control(path)
     running: dict[str, Any] | None = None
     try:
         running = ask(known.control, "status", PATIENCE)

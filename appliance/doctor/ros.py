@@ -16,6 +16,7 @@ import psutil
 from appliance.config import Settings
 from appliance.doctor.finding import Finding
 from appliance.doctor.ros1 import ros1
+from appliance.environment import of_service
 from appliance.ros import installation
 from appliance.ros.ros2 import Ros2Node, available
 
@@ -34,6 +35,18 @@ MULTICAST_PATIENCE = 0.5
 
 NODE = "appliance_doctor"
 
+#: Variables by which nodes find each other, or do not.
+_DISCOVERY = (
+    "RMW_IMPLEMENTATION",
+    "ROS_DOMAIN_ID",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_LOCALHOST_ONLY",
+    "ROS_STATIC_PEERS",
+    "ROS_DISCOVERY_SERVER",
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "CYCLONEDDS_URI",
+)
+
 #: Topics that say nothing of what there is.
 _OF_EVERY_NODE = {"/parameter_events", "/rosout"}
 
@@ -48,6 +61,10 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
     if settings.bridge.bus == "ros1":
         yield from ros1(running, is_needed=_has_routes(settings))
         return
+    adopted = adopt_environment(settings, running)
+    if adopted:
+        text = f"as the appliance has it: {', '.join(adopted)}"
+        yield Finding("ok", "ROS environment", text)
     yield which_ros(is_needed=_has_routes(settings))
     yield from _discovery(settings)
     yield from shared_memory()
@@ -55,6 +72,29 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
     is_available, _ = available()
     if is_available:
         yield from _look(settings, running)
+
+
+def adopt_environment(settings: Settings, running: dict[str, Any] | None) -> list[str]:
+    """Take over what decides whom the appliance's node can see; returns it, as far as it differs.
+
+    A root's shell has neither the service's variables nor, after `sudo`, those of its own user.
+    """
+    theirs: dict[str, str] = {}
+    if running is None:
+        theirs = of_service(settings.file) if settings.file is not None else {}
+    else:
+        with suppress(OSError):
+            lines = Path(f"/proc/{running['pid']}/environ").read_bytes().split(b"\0")
+            theirs = dict(os.fsdecode(line).partition("=")[::2] for line in lines if line)
+    adopted = []
+    for name in _DISCOVERY if theirs else ():
+        value = theirs.get(name)
+        if value != os.environ.get(name) and (value is not None or running is not None):
+            adopted.append(f"{name}={value}" if value is not None else f"no {name}")
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+    return adopted
 
 
 def _has_routes(settings: Settings) -> bool:

@@ -62,7 +62,7 @@ def _stage(root: Path, command: Path) -> None:
     place.chmod(0o755)
     unit = Unit(PACKAGED_COMMAND, single_file=True, systemd=systemd_version())
     _write(root, PACKAGED_UNIT, str(unit).replace("`appliance install`, which", "a package that"))
-    _write(root, ENVIRONMENT, VARIABLES.format(settings=""))
+    _write(root, ENVIRONMENT, VARIABLES.format(settings=""), 0o640)
 
 
 def _documents(root: Path, release: str) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from appliance import install_command
 from appliance.config import load
 from appliance.init import Credentials
 from appliance.install import Installation, InstallError
@@ -116,6 +119,151 @@ def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
     assert secret.stat().st_uid == os.geteuid()
 
 
+def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) -> None:
+    """The service may write its configuration, which must not lead an upgrade elsewhere."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    home, outside = image / "etc/appliance", tmp_path / "cron.d"
+    outside.mkdir()
+    with (home / "appliance.yaml").open("a") as file:
+        file.write(f"broker: {{acl: {outside}/acl, users: {outside}/users}}\n")
+    text = (home / "appliance.yaml").read_text().replace("broker:\n  store", "other:\n  store")
+    (home / "appliance.yaml").write_text(
+        "\n".join(line for line in text.splitlines() if not line.startswith(("other", "  store")))
+    )
+    (home / "certs/server.crt").unlink()
+    (home / "certs").rename(home / "before")
+    (home / "certs").symlink_to(outside)
+    install(image, single_file(tmp_path, 2))
+    assert list(outside.iterdir()) == []
+    (home / "appliance.yaml").unlink()
+    with pytest.raises(InstallError, match=r"without an appliance\.yaml"):
+        install(image, single_file(tmp_path, 3))
+
+
+def test_cut_off_while_it_hands_over(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    chown, left = os.chown, [3]
+
+    def cut_off(*arguments: Any, **options: Any) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError("the power went")
+        chown(*arguments, **options)
+
+    monkeypatch.setattr(os, "chown", cut_off)
+    with pytest.raises(OSError, match="the power went"):
+        install(image, single_file(tmp_path))
+    monkeypatch.undo()
+    install(image, single_file(tmp_path))
+    home = image / "etc/appliance"
+    assert {path.stat().st_uid for path in (home, *home.rglob("*"))} == {home.stat().st_uid}
+    assert home.stat().st_uid != os.geteuid()
+
+
+def test_an_upgrade_of_the_package_keeps_the_user_of_the_units_changes(
+    image: Path, tmp_path: Path
+) -> None:
+    """What README says: `systemctl edit` with another user, and its files handed to that."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+
+    def configure() -> None:
+        list(Installation(Path("/usr/bin/appliance"), root=image, packaged=True).install())
+
+    configure()
+    changes = image / "etc/systemd/system/appliance.service.d/override.conf"
+    changes.parent.mkdir(parents=True)
+    changes.write_text("[Service]\nUser=robot\nGroup=robot\n")
+    folders = image / "etc/appliance", image / "var/lib/appliance"
+    files = [path for folder in folders for path in (folder, *folder.rglob("*"))]
+    for path in files:
+        os.chown(path, UID, UID)
+    configure()
+    assert {path.stat().st_uid for path in files} == {UID}
+
+
+def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
+    """A system that is mounted read-only has its configuration on another disk."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    disk = image / "data"
+    disk.mkdir()
+    (image / "etc/appliance").symlink_to("../data")
+    install(image, single_file(tmp_path))
+    assert {path.stat().st_uid for path in (disk, *disk.rglob("*"))} == {disk.stat().st_uid}
+    assert disk.stat().st_uid != os.geteuid()
+    steps = list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    assert [step.text for step in steps if step.subject == "/etc/appliance"] == [
+        f"the link; configuration, users, certificates and keys stay in {disk}"
+    ]
+    assert (disk / "appliance.yaml").exists()
+
+    (image / "etc/appliance").symlink_to(tmp_path)
+    with pytest.raises(InstallError, match="leads out of"):
+        install(image, single_file(tmp_path))
+
+
+def test_two_at_once(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    first = Installation(Path("/", COMMAND), single_file(tmp_path), image).install()
+    next(first)
+    with pytest.raises(InstallError, match="another `appliance install` is at work"):
+        install(image, single_file(tmp_path, 2))
+    with pytest.raises(InstallError, match="another `appliance install` is at work"):
+        list(Installation(Path("/", COMMAND), root=image).uninstall())
+    list(first)
+    install(image, single_file(tmp_path, 2))
+
+
+def test_interrupted_it_is_as_before(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while the new version is started, which may not run at all."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+
+    def interrupted(self: Installation) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Installation, "_starts", True)
+    monkeypatch.setattr(Installation, "_restart", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        install(image, single_file(tmp_path, 2))
+    assert (image / COMMAND).read_text() == single_file(tmp_path).read_text()
+    assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
+
+
+def test_the_variables_are_not_for_everyone(image: Path, tmp_path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    assert not (image / "etc/default/appliance").stat().st_mode & 0o007
+
+
+@pytest.mark.parametrize("setup", ["/nowhere/setup.sh", ""])
+def test_it_starts_without_the_ros_that_it_had(tmp_path: Path, setup: str) -> None:
+    lines = str(Unit(tmp_path / "appliance")).replace("\\\n", " ").splitlines()
+    command = next(line for line in lines if line.startswith("ExecStart=")).partition("=")[2]
+    (tmp_path / "appliance").write_text('#!/bin/sh\necho "ran $1"\n')
+    (tmp_path / "appliance").chmod(0o755)
+    done = subprocess.run(
+        shlex.split(command.replace("$$", "$")),
+        env={"ROS_SETUP": setup},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "ran run\n"
+    assert done.stderr == (f"<4>ROS_SETUP cannot be read: {setup}\n" if setup else "")
+
+
 def test_a_dry_run_changes_nothing(image: Path, tmp_path: Path) -> None:
     before = sorted(image.rglob("*"))
     done = install(image, single_file(tmp_path), dry_run=True)
@@ -147,6 +295,63 @@ def test_what_is_in_the_way_is_told(image: Path, tmp_path: Path) -> None:
     packaged.parent.mkdir(parents=True)
     packaged.touch()
     assert "apt upgrades and removes it" in error(Path("/", COMMAND), file, image)
+
+
+def test_the_command_keeps_the_user_of_before(
+    image: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (image / UNIT).parent.mkdir(parents=True)
+    (image / UNIT).write_text("[Service]\nUser=robot\n")
+    (image / "opt").mkdir()
+    (image / "opt/appliance").touch()
+    monkeypatch.setattr(sys, "argv", ["/opt/appliance"])
+    install_command.install(dry_run=True, root=image)
+    assert "\nUser=robot\nGroup=drivers\n" in capsys.readouterr().out
+
+
+def run_script(image: Path, name: str, *arguments: str) -> list[str]:
+    """A script of the package with `image` in place of /; returns the commands that it called."""
+    called = image / "called"
+    called.unlink(missing_ok=True)
+    programs = image / "programs"
+    programs.mkdir(exist_ok=True)
+    text = (PROJECT / "appliance/packaging/debian" / name).read_text()
+    for folder in ("/etc/", "/usr/", "/var/", "/run/"):
+        text = text.replace(folder, f"{image}{folder}")
+    for program in ("appliance", "deb-systemd-helper", "deb-systemd-invoke", "systemctl"):
+        for place in (programs / program, image / "usr/bin" / program):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(f'#!/bin/sh\necho "$0 $@" >> {called}\n')
+            place.chmod(0o755)
+    environment = {"PATH": f"{programs}:/usr/bin:/bin"}
+    subprocess.run(["sh", "-c", text, name, *arguments], env=environment, check=True)
+    lines = called.read_text().splitlines() if called.exists() else []
+    return [line.removeprefix(f"{image}/") for line in lines]
+
+
+def test_the_package_runs_its_own_command(image: Path) -> None:
+    """An older one that was installed by hand comes first in the PATH."""
+    assert run_script(image, "postinst", "configure")[0] == "usr/bin/appliance install --packaged"
+    called = run_script(image, "postinst", "abort-upgrade")
+    assert called and not [line for line in called if "install --packaged" in line]
+
+
+def test_to_purge_the_package_leaves_what_was_installed_by_hand_since(image: Path) -> None:
+    folders = image / "etc/appliance", image / "var/lib/appliance"
+    for folder in folders:
+        folder.mkdir(parents=True)
+    unit = image / UNIT
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\n")
+    run_script(image, "postrm", "purge")
+    assert all(folder.exists() for folder in folders)
+    unit.unlink()
+    unit.symlink_to("/dev/null")  # the mask that the package's removal leaves
+    run_script(image, "postrm", "remove")
+    assert all(folder.exists() for folder in folders)
+    run_script(image, "postrm", "purge")
+    assert not any(folder.exists() for folder in folders)
+    run_script(image, "postrm", "purge")
 
 
 def test_what_a_sourced_ros_says_is_taken_over(image: Path, tmp_path: Path) -> None:
@@ -222,3 +427,22 @@ def test_the_first_configuration_is_one(tmp_path: Path) -> None:
         "crash_reports",
         "bridge",
     }
+
+
+def test_a_dry_run_of_who_may_not_look(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    exists = Path.exists
+
+    def closed(path: Path) -> bool:
+        if path.name == "appliance.yaml":
+            raise PermissionError(13, "Permission denied", str(path))
+        return exists(path)
+
+    monkeypatch.setattr(Path, "exists", closed)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    done = install(image, single_file(tmp_path), dry_run=True)
+    assert done["/etc/appliance"] == "kept"

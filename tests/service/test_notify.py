@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import os
 import signal
@@ -124,6 +125,49 @@ async def test_systemd_does_not_read(tmp_path: Path) -> None:
     assert time.monotonic() - began < 0.8
     notifier.close()
     listening.close()
+
+
+async def test_what_systemd_did_not_take_is_told_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it waits for READY=1, and ends a service that has long been ready."""
+    monkeypatch.setattr("appliance.notify.PATIENCE", 0.01)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.setblocking(False)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+            other.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                while True:
+                    other.sendto(b"X=1", str(tmp_path / "notify"))
+        notifier = Notifier(str(tmp_path / "notify"), 0.1)
+        notifier.start(asyncio.get_running_loop(), lambda: "fine")
+        heard = []
+        for _ in range(100):
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    heard.append(listening.recv(100))
+            if b"READY=1" in heard:
+                break
+            await asyncio.sleep(0.01)
+        notifier.close()
+        assert b"READY=1" in heard
+
+
+async def test_a_status_that_fails_does_not_end_the_signs_of_life(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("appliance.notify.STATUS_INTERVAL", 0.02)
+    failed = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda loop, context: failed.append(context))
+    texts = iter(["fine"])
+    with NotifySocket() as notify:
+        notifier = Notifier(notify.address, 0.1)
+        notifier.start(loop, lambda: next(texts))
+        await asyncio.sleep(0.3)
+        notifier.close()
+        assert len(failed) > 2 and len(notify.all("WATCHDOG")) > 5
 
 
 def test_a_status_is_one_line() -> None:
