@@ -30,11 +30,21 @@ def ports(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         elif bind.port == 0:
             yield Finding("ok", subject, "whichever is free")
         else:
-            yield _port(subject, bind, listening, pid)
+            yield _port(subject, bind, listening, pid, _is_for_root(settings))
+
+
+def _is_for_root(settings: Settings) -> bool:
+    """Whether root runs the appliance: its configuration is the user's that runs it as a service."""
+    mine = os.geteuid() == 0
+    return mine and (settings.file is None or settings.file.stat().st_uid == 0)
 
 
 def _port(
-    subject: str, bind: Bind, listening: list[tuple[str, int, int | None]], pid: int | None
+    subject: str,
+    bind: Bind,
+    listening: list[tuple[str, int, int | None]],
+    pid: int | None,
+    is_for_root: bool,
 ) -> Finding:
     holders = [
         holder
@@ -53,12 +63,13 @@ def _port(
             "bind 0.0.0.0, or start the appliance when the network is there",
         )
     lowest = int(_UNPRIVILEGED.read_text()) if _UNPRIVILEGED.exists() else 1024
-    if bind.port < lowest and os.geteuid() != 0:
+    if bind.port < lowest and not is_for_root:
         return Finding(
             "warning",
             subject,
             f"free, and below {lowest}: only root may listen there",
-            "AmbientCapabilities=CAP_NET_BIND_SERVICE in the systemd unit, or another port",
+            "systemctl edit appliance: AmbientCapabilities=CAP_NET_BIND_SERVICE, and the same in "
+            "CapabilityBoundingSet=; or another port",
         )
     if pid is not None:
         return Finding(
