@@ -470,11 +470,18 @@ class Action:
     async def _ask_result(self, goal: _Goal, type_name: str) -> tuple[str, bytes]:
         """What became of the goal, and the response of `get_result`. Raises CallError."""
         converter = self._converters.get(f"{type_name}_GetResult_Request")
-        response = await self._requests.ask(
-            f"{self.ros}/_action/get_result",
-            f"{type_name}_GetResult",
-            converter.from_dict({"goal_id": {"uuid": goal.id}}),
-        )
+        service = f"{self.ros}/_action/get_result"
+        try:
+            response = await self._requests.ask(
+                service,
+                f"{type_name}_GetResult",
+                converter.from_dict({"goal_id": {"uuid": goal.id}}),
+            )
+        except CallError as error:
+            if error.code != "unavailable":
+                raise
+            # The server was there, and took the goal.
+            raise CallError("vanished", f"{service} went away before it answered") from None
         status = goals.status_of(response, self._wire)
         if status == "unknown":
             text = f"the server of {self.ros} has come anew and does not know the goal"

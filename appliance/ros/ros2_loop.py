@@ -65,6 +65,10 @@ class Doorbell:
         except BlockingIOError:
             return 0
 
+    def ring(self) -> None:
+        """As if one had come."""
+        os.eventfd_write(self.fd, 1)
+
     def silence(self, pointer: int) -> None:
         """It does not ring any more. The middleware waits here for a thread that is just ringing,
         so that `close` may follow, which must come before the subscription's end."""
@@ -148,7 +152,10 @@ class LoopSubscription:
             self._hand_over(lot)
             return
         if has_more:
-            self._loop.call_soon(self._ring)
+            # Not by a callback of the loop's: with what comes meanwhile there would be two turns a
+            # round, then three, and one that is left when the ROS thread has been given the rest.
+            self._owed -= 1
+            self._doorbell.ring()
         lost, self._lost = self._lost, 0
         self._on_loop(lot, lost)
 

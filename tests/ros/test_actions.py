@@ -128,6 +128,16 @@ async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
 
 
+async def test_a_server_that_ends_before_it_could_be_asked_for_the_result(house):
+    walks, client = await begin(house)
+    walks.services[1].remove()
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    house.node.spin()
+    await until(lambda: results(client), "the result")
+    (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
+    assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
+
+
 async def test_ros_ends_while_goals_are_under_way(house):
     _, client = await begin(house)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 from pathlib import Path
@@ -127,6 +128,53 @@ async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_fo
     await until(lambda: len(taker.taken) == 300, "all")
     assert max(taker.lots) == ros2_loop.LOT
     assert taker.lost == 0
+
+
+async def test_others_have_their_turn_between_two_lots(taker, peer):
+    taker = taker(depth=2000)
+    await taker.advertised(peer)
+    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 1500, 10_000))
+    turns = []
+    while len(taker.taken) < 1500:
+        before = len(taker.lots)
+        await asyncio.sleep(0)
+        turns.append(len(taker.lots) - before)
+        if not publishing.done():
+            time.sleep(0.05)  # noqa: ASYNC251 - as before
+    await publishing
+    assert taker.lost == 0
+    assert max(turns) == 1
+
+
+async def test_two_threads_never_take_at_the_same_time(monkeypatch, taker, peer):
+    taker = taker(BYTES, depth=2000)
+    await taker.advertised(peer)
+    given = []
+    hand_over, take_back = (
+        getattr(ros2_loop.LoopSubscription, name) for name in ("_hand_over", "_take_back")
+    )
+
+    def count_over(self, lot):
+        given.append(+1)
+        hand_over(self, lot)
+
+    def count_back(self, lost):
+        given.append(-1)
+        take_back(self, lost)
+
+    monkeypatch.setattr(ros2_loop.LoopSubscription, "_hand_over", count_over)
+    monkeypatch.setattr(ros2_loop.LoopSubscription, "_take_back", count_back)
+    publishing = []
+    for _ in range(10):
+        small = peer.do("publish_image", "/a", 10, 400, 100_000)
+        large = peer.do("publish_image", "/a", LARGE + 1, 1, 100_000)
+        publishing += [asyncio.create_task(small), asyncio.create_task(large)]
+    while len(taker.taken) < 4010:
+        time.sleep(0.02)  # noqa: ASYNC251 - as before
+        await asyncio.sleep(0)
+    await asyncio.gather(*publishing)
+    await until(lambda: sum(given) == 0, "the loop's thread has it again")
+    assert given and set(itertools.accumulate(given)) == {0, 1}
 
 
 async def test_what_a_busy_loop_misses_is_counted(house, peer):
