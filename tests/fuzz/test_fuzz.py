@@ -36,6 +36,7 @@ def test_in_this_process(one_case: Callable[[random.Random], None]) -> None:
         seed += 1
 
 
+@pytest.mark.timed  # the canary's patience, and two seconds to log in
 @pytest.mark.parametrize("kind", [sessions.Siege, strangers.Strangers])
 def test_sessions(kind: type[sessions.Siege], tmp_path: Path) -> None:
     siege = kind(tmp_path)
