@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from appliance import config
-from appliance.config import Bind, ConfigError, Settings
+from appliance.config import Bind, ConfigError, Settings, reading
 
 REFERENCE = Path(__file__).parent.parent / "appliance.yaml"
 HERE = Path("/srv/robot/appliance.yaml")
@@ -322,7 +322,7 @@ def test_what_is_no_bind(text: object) -> None:
 
 def test_the_file_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(config, "SEARCH_PATH", (Path("appliance.yaml"), tmp_path / "etc.yaml"))
+    monkeypatch.setattr(reading, "SEARCH_PATH", (Path("appliance.yaml"), tmp_path / "etc.yaml"))
     with pytest.raises(ConfigError, match="`appliance init` writes one"):
         config.load()
     with pytest.raises(ConfigError, match="no such file"):

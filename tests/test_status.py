@@ -12,6 +12,7 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 
 from appliance import cli, config
+from appliance.config import reading
 from appliance.mqtt.packets import Publish
 
 
@@ -107,6 +108,6 @@ def test_the_control_of_a_broken_file(tmp_path: Path, monkeypatch: pytest.Monkey
         file.write_text(text)
         assert config.load_control(file).control == tmp_path / "state/control.sock"
     file.write_text("robbot: r2\n")
-    monkeypatch.setattr(config, "SEARCH_PATH", (tmp_path / "none.yaml", file))
+    monkeypatch.setattr(reading, "SEARCH_PATH", (tmp_path / "none.yaml", file))
     assert config.load_control().file == file
     assert config.load_control(tmp_path / "no/none.yaml").file == tmp_path / "no/none.yaml"

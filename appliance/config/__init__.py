@@ -1,0 +1,77 @@
+"""appliance.yaml: read, checked as a whole, and turned into typed settings.
+
+Every problem is found in one go and told with its file, line and key; nothing is guessed. Sizes and
+durations carry their unit, paths are relative to the file, `${NAME}` and `${NAME:-default}` take
+environment variables, and values that look like secrets are masked wherever settings are printed.
+"""
+
+from __future__ import annotations
+
+from appliance.config.printing import (
+    MASK,
+    OPEN_WITH_SECRETS,
+    describe,
+    is_open_with_secrets,
+    mask,
+    secrets_in,
+)
+from appliance.config.quantities import (
+    Bind,
+    format_duration,
+    format_size,
+    parse_bind,
+    parse_duration,
+    parse_size,
+)
+from appliance.config.reading import SEARCH_PATH, ConfigError, find, load, load_control, loads
+from appliance.config.settings import (
+    ActionRoute,
+    Bridge,
+    BridgeLimits,
+    Broker,
+    Limits,
+    Listener,
+    OnSilence,
+    ParameterRoute,
+    Route,
+    ServiceRoute,
+    Settings,
+    Tls,
+    TopicRoute,
+)
+from appliance.config.values import Level
+
+__all__ = [
+    "MASK",
+    "OPEN_WITH_SECRETS",
+    "SEARCH_PATH",
+    "ActionRoute",
+    "Bind",
+    "Bridge",
+    "BridgeLimits",
+    "Broker",
+    "ConfigError",
+    "Level",
+    "Limits",
+    "Listener",
+    "OnSilence",
+    "ParameterRoute",
+    "Route",
+    "ServiceRoute",
+    "Settings",
+    "Tls",
+    "TopicRoute",
+    "describe",
+    "find",
+    "format_duration",
+    "format_size",
+    "is_open_with_secrets",
+    "load",
+    "load_control",
+    "loads",
+    "mask",
+    "parse_bind",
+    "parse_duration",
+    "parse_size",
+    "secrets_in",
+]

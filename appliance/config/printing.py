@@ -1,0 +1,70 @@
+"""Settings as they are shown: what looks like a secret is masked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from appliance.config.settings import Settings
+from appliance.document import KeyPath
+
+_SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
+
+
+_URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
+
+
+MASK = "********"
+
+OPEN_WITH_SECRETS = (
+    "has secrets in it, and every user of this computer can read it: close it with `chmod o=`, or "
+    "take them from environment variables, ${NAME}"
+)
+
+
+def mask(path: KeyPath, value: Any) -> Any:
+    """The value as it may be printed: masked when its key or its form says that it is a secret."""
+    if isinstance(value, Mapping):
+        return {key: mask((*path, key), inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [mask(path, inner) for inner in value]
+    if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
+        return MASK
+    return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
+    """All that `mask` hides in a value, to be kept out of what others say about it."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from secrets_in(inner, (*path, key))
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from secrets_in(inner, path)
+    elif path and isinstance(path[-1], str) and _SECRET_KEY.search(path[-1]):
+        if value:
+            yield str(value)
+    elif isinstance(value, str):
+        for match in _URL_PASSWORD.finditer(value):
+            yield match[0].partition(":")[2]
+
+
+def is_open_with_secrets(settings: Settings) -> bool:
+    """Whether every user of this computer can read secrets in the file of these settings."""
+    if settings.file is None:
+        return False
+    try:
+        if not settings.file.stat().st_mode & 0o004:
+            return False
+        text = settings.file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    # What an environment variable has put there is not in the file.
+    return any(secret in text for secret in secrets_in(settings.broker.plugins))
+
+
+def describe(settings: Settings) -> dict[str, Any]:
+    """Every setting in force as plain values, in the form of appliance.yaml, secrets masked."""
+    described: dict[str, Any] = mask((), settings.model_dump(mode="json"))
+    return described

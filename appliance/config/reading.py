@@ -1,0 +1,317 @@
+"""A file becomes settings, or all that is wrong with it is told: where, what, what was meant."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ValidationError,
+)
+from pydantic_core import ErrorDetails
+
+from appliance.config.printing import mask
+from appliance.config.quantities import (
+    Bind,
+    either,
+    format_duration,
+    format_size,
+    parse_seconds,
+    parse_size,
+)
+from appliance.config.settings import (
+    ActionRoute,
+    Bridge,
+    ParameterRoute,
+    Route,
+    ServiceRoute,
+    Settings,
+    TopicRoute,
+)
+from appliance.config.values import OF_NODE, InListError
+from appliance.document import Document, KeyPath, Problem
+from appliance.environment import of_service
+
+SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
+"""Where the configuration is looked for when no file is named; the first that exists is used."""
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; `problems` has everything that is wrong with it."""
+
+    def __init__(self, problems: list[Problem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = problems
+
+
+def find(path: Path | None = None) -> Path:
+    """The configuration file to use: `path`, else the first of SEARCH_PATH. Raises ConfigError."""
+    for candidate in (path,) if path else SEARCH_PATH:
+        try:
+            if candidate.is_file():
+                return candidate
+        except PermissionError:
+            text = "may not be looked at: run this as the appliance's user, or as root"
+            raise ConfigError([Problem(candidate, 0, "", text)]) from None
+    missing = path or SEARCH_PATH[0]
+    places = "no such file" if path else f"not found, nor {SEARCH_PATH[1]}"
+    raise ConfigError([Problem(missing, 0, "", f"{places}; `appliance init` writes one")])
+
+
+def load(path: Path | None = None) -> Settings:
+    """The settings of that file, or of the first of SEARCH_PATH. Raises ConfigError.
+
+    Those of the service are read with its variables, too: a shell of its administrator has none.
+    """
+    file = find(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
+        raise ConfigError([Problem(file, 0, "", f"cannot be read: {reason}")]) from None
+    return loads(text, file, {**of_service(file), **os.environ})
+
+
+def load_control(path: Path | None = None) -> Settings:
+    """The defaults, with nothing but `control` of a file that `load` finds something wrong with.
+
+    The running one goes on with what it has read before, and can still be asked.
+    """
+    text, file = "", path or SEARCH_PATH[0]
+    with suppress(ConfigError, OSError):
+        file = find(path)
+        found = re.search(r"^control:.*", file.read_text(encoding="utf-8", errors="replace"), re.M)
+        text = found[0] if found else ""
+        return loads(text, file, {**of_service(file), **os.environ})
+    return loads("", file)
+
+
+def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:
+    """The settings in `text`; `file` names it in errors and is what paths are relative to."""
+    document = Document(text, file, os.environ if environment is None else environment)
+    problems = document.problems
+    try:
+        settings = Settings.model_validate(
+            document.values, context={"directory": file.absolute().parent}
+        )
+    except ValidationError as error:
+        for detail in error.errors(include_url=False):
+            if detail["loc"] not in document.faulty:
+                path = _place(detail)
+                problems.append(document.problem(path, _explain(detail, document.written(path))))
+    else:
+        problems += [document.problem(path, what) for path, what in _cross_check(settings)]
+        settings._file = file.absolute()
+    if problems:
+        raise ConfigError(sorted(problems, key=lambda problem: problem.line))
+    return settings
+
+
+def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | None, str]:
+    """What two routes must not have in common; patterns may differ in the type alone."""
+    return route.ros, route.type if route.is_pattern else None, route.topic(robot)
+
+
+def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
+    seen: dict[Bind, int] = {}
+    for number, listener in enumerate(settings.broker.listeners):
+        first = seen.setdefault(listener.bind, number)
+        if first != number and (listener.bind.port or listener.bind.path):
+            path = ("broker", "listeners", number, "bind")
+            yield path, f"broker.listeners[{first}] listens there already"
+    tls = settings.broker.tls
+    if tls.username_from != "none" and not any(
+        listener.tls and settings.broker.client_certificates(listener) != "off"
+        for listener in settings.broker.listeners
+    ):
+        problem = "needs a listener with tls: true that asks for client certificates"
+        yield ("broker", "tls", "username_from"), problem
+    yield from _cross_check_routes(settings.bridge)
+    ways: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
+    for number, route in enumerate(settings.bridge.topics):
+        if route.is_exclusion:
+            continue
+        first = ways.setdefault(_way(route, settings.robot), number)
+        if route.to == "mqtt":
+            for key in route.command_keys:
+                yield ("bridge", "topics", number, key), "is for routes to ROS only"
+        elif "lease" in route.command_keys and not route.exclusive:
+            yield ("bridge", "topics", number, "lease"), "needs exclusive: true beside it"
+        if first != number:
+            yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
+    yield from _cross_check_called(settings.bridge)
+    yield from _cross_check_bus(settings.bridge)
+
+
+def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    """What ROS 1 and ROS 2 do not have in common."""
+    is_ros1 = bridge.bus == "ros1"
+    foreign, own = ("cdr", "ros1") if is_ros1 else ("ros1", "cdr")
+    sections: tuple[tuple[str, Sequence[TopicRoute | ServiceRoute | ActionRoute]], ...] = (
+        ("topics", bridge.topics),
+        ("services", bridge.services),
+        ("actions", bridge.actions),
+    )
+    for section, routes in sections:
+        for number, route in enumerate(routes):
+            if route.encoding == foreign and not route.is_exclusion:
+                text = f"must be {own}: that is what ROS's own bytes are with bus: {bridge.bus}"
+                yield ("bridge", section, number, "encoding"), text
+    for number, parameter in enumerate(bridge.parameters):
+        if not is_ros1 and any(name.rpartition("/")[0] in ("", "!") for name in parameter.names):
+            yield ("bridge", "parameters", number, "ros"), OF_NODE
+    ros2_only = {"domain_id": bridge.domain_id is not None, "use_sim_time": bridge.use_sim_time}
+    for key, is_set in ros2_only.items():
+        if is_ros1 and is_set:
+            instead = "ROS_MASTER_URI" if key == "domain_id" else "the parameter /use_sim_time"
+            yield ("bridge", key), f"is for ROS 2 only; in ROS 1 it is {instead}"
+
+
+def _cross_check_routes(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    """What holds for the routes of every section."""
+    sections: dict[str, Sequence[Route]] = {
+        "topics": bridge.topics,
+        "services": bridge.services,
+        "actions": bridge.actions,
+        "parameters": bridge.parameters,
+    }
+    for section, routes in sections.items():
+        placeholder = "{node}" if section == "parameters" else "{ros}"
+        has_pattern = any("*" in name for route in routes for name in route.names if name[0] != "!")
+        for number, route in enumerate(routes):
+            path: KeyPath = ("bridge", section, number)
+            if route.is_exclusion:
+                more = sorted(route.model_fields_set - {"ros"})
+                for key in more:
+                    yield (*path, key), "has no meaning for what is left out"
+                if not (more or has_pattern):
+                    problem = f"leaves nothing out: there is no pattern in bridge.{section}"
+                    yield (*path, "ros"), problem
+            elif route.is_pattern and placeholder not in route.mqtt:
+                problem = f"needs {placeholder} in it, or all that the route is for would be one"
+                yield (*path, "mqtt"), problem
+
+
+def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+    sections: dict[str, Sequence[ServiceRoute | ActionRoute | ParameterRoute]] = {
+        "services": bridge.services,
+        "actions": bridge.actions,
+        "parameters": bridge.parameters,
+    }
+    for section, routes in sections.items():
+        seen: dict[str, int] = {}
+        topics: dict[str, tuple[str, int]] = {}
+        for number, route in enumerate(routes):
+            path: KeyPath = ("bridge", section, number)
+            for name in route.names:
+                base = name.rpartition("/")[0] if section == "parameters" else name
+                if name.startswith("!") or "*" in base:
+                    continue
+                topic = route.mqtt.replace("{node}", base).replace("{ros}", base)
+                other, taken = topics.setdefault(topic, (base, number))
+                if other != base:
+                    yield (*path, "mqtt"), f"is the topic of bridge.{section}[{taken}]"
+            for position, name in enumerate(route.names):
+                if name.startswith("!") and not route.is_exclusion:
+                    continue
+                first = seen.setdefault(name, number)
+                if first != number:
+                    where: KeyPath = () if isinstance(route.ros, str) else (position,)
+                    yield (*path, "ros", *where), f"is the same as in bridge.{section}[{first}]"
+            kind = None if isinstance(route, ParameterRoute) else route.type
+            if kind is not None and "*" in kind and not route.is_pattern:
+                yield (*path, "type"), "can be a pattern only when ros is one"
+            if isinstance(route, ServiceRoute) and route.to == "mqtt":
+                if route.is_pattern:
+                    yield (*path, "to"), "must be ros when ros is a pattern or a list"
+                elif route.type is None and not route.is_exclusion:
+                    yield (*path, "type"), "is needed when to is mqtt"
+            elif isinstance(route, ServiceRoute) and route.on_error is not None:
+                yield (*path, "on_error"), "is for services that MQTT answers: to: mqtt"
+
+
+def _place(detail: ErrorDetails) -> KeyPath:
+    """The path of what is wrong, down to the entry of a list that was checked as a whole."""
+    error = detail.get("ctx", {}).get("error")
+    return (*detail["loc"], error.position) if isinstance(error, InListError) else detail["loc"]
+
+
+_PLAIN = {
+    "missing": "is needed",
+    "string_type": "must be text (in quotes, when it looks like a number or a yes or no)",
+    "int_type": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+    "list_type": "must be a list",
+    "dict_type": "must be keys with values",
+    "model_type": "must be keys with values",
+}
+
+
+_BOUNDS = {
+    "greater_than": ("gt", "must be more than"),
+    "greater_than_equal": ("ge", "must be at least"),
+    "less_than": ("lt", "must be less than"),
+    "less_than_equal": ("le", "must be at most"),
+}
+
+
+def _explain(detail: ErrorDetails, written: str | None) -> str:
+    """One of pydantic's errors in this project's words, with what was written, masked."""
+    kind, path, context = detail["type"], detail["loc"], detail.get("ctx", {})
+    if kind == "extra_forbidden":
+        known = list(_section_at(path[:-1]).model_fields)
+        return f"unknown key{_did_you_mean(str(path[-1]), known) or '; known: ' + ', '.join(known)}"
+    if kind == "missing":
+        return _PLAIN[kind]
+    if kind == "value_error":
+        what = str(context["error"])
+    elif kind == "literal_error":
+        choices = re.findall(r"'([^']*)'", context["expected"])
+        what = f"must be {either(choices)}{_did_you_mean(str(detail['input']), choices)}"
+    elif kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        what = f"{words} {_with_unit(context[name], path)}"
+    elif kind == "too_short":
+        what = f"must have at least {context['min_length']}"
+    else:
+        what = _PLAIN.get(kind, detail["msg"])
+    return what if written is None else f"{what} (it says {mask(path, written)!r})"
+
+
+def _section_at(path: KeyPath) -> type[BaseModel]:
+    """The model that describes the mapping at that path."""
+
+    def models(annotation: Any) -> Iterator[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield annotation
+        for argument in get_args(annotation):
+            yield from models(argument)
+
+    section: type[BaseModel] = Settings
+    for part in path:
+        if isinstance(part, str):
+            section = next(models(section.model_fields[part].annotation))
+    return section
+
+
+def _with_unit(value: float, path: KeyPath) -> str:
+    *around, name = path
+    for item in _section_at(tuple(around)).model_fields[str(name)].metadata:
+        if item == BeforeValidator(parse_size):
+            return format_size(int(value))
+        if item == BeforeValidator(parse_seconds):
+            return format_duration(value)
+    return f"{value:g}"
+
+
+def _did_you_mean(word: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
