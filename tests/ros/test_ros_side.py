@@ -218,6 +218,21 @@ async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeyp
     assert house.node._context is not first
 
 
+async def test_a_network_that_comes_while_the_bus_is_joined_is_used(start, peer, monkeypatch):
+    monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
+    monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
+    houses = []
+
+    def reach():
+        is_joined = bool(houses) and houses[0].node._executor is not None
+        return Reach.NETWORK if is_joined else Reach.THIS_COMPUTER
+
+    monkeypatch.setattr(ros2, "reach", reach)
+    houses.append(start(route("/a", "mqtt", "text")))
+    await until(lambda: houses[0].bridge.problem is not None, "the new start")
+    assert houses[0].bridge.problem == "there was no network yet when it was joined, and is now"
+
+
 def test_how_far_one_can_be_heard(monkeypatch):
     up, down = SimpleNamespace(isup=True), SimpleNamespace(isup=False)
     states = {"lo": up, "eth0": down}
