@@ -239,18 +239,18 @@ class _Seen:
     """What a node sees; `look` and `failed` are called on its thread."""
 
     def __init__(self, node: Ros2Node, ours: str | None) -> None:
-        """`ours` is the running appliance's node: others are still waited for when it was seen."""
+        """`ours` is the running appliance's node: it is waited for, and so are others."""
         self.nodes: set[str] = set()
         self.topics: set[str] = set()
         self.problem = ""
         self._node = node
-        self._ours = {node.name, ours}
+        self._ours = ours
         self._is_done = threading.Event()
 
     def look(self) -> None:
         self.nodes = {name for name in self._node.nodes() if name != self._node.name}
         self.topics = set(self._node.topics()) - _OF_EVERY_NODE
-        if self.nodes - self._ours:
+        if self.nodes - {self._ours} and (self._ours is None or self._ours in self.nodes):
             self._is_done.set()
 
     def failed(self, reason: str) -> None:
