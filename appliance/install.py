@@ -520,6 +520,9 @@ class Installation:
                 os.link(place, before)
                 self._undo.append(partial(os.replace, before, place))
             draft.replace(place)
+        except OSError as error:
+            text = f"{place} cannot be written: {error.strerror}; it is as it was before"
+            raise InstallError(text) from None
         finally:
             draft.unlink(missing_ok=True)
         _sync(place.parent)

@@ -318,6 +318,17 @@ def test_it_looks_with_the_environment_of_the_running_one(
     assert os.environ["HOME"] != "/nowhere"
 
 
+def test_the_running_one_may_be_seen_after_others(here: Path) -> None:
+    """That it was not seen at first is no reason to say that nodes do not find each other."""
+    seen_by = SimpleNamespace(name="/me", nodes=lambda: ["/me", "/peer"], topics=dict)
+    seen = ros._Seen(seen_by, "/appliance")  # type: ignore[arg-type]
+    seen.look()
+    assert not seen._is_done.is_set()
+    seen_by.nodes = lambda: ["/me", "/appliance", "/peer"]
+    seen.look()
+    assert seen._is_done.is_set()
+
+
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=1 << 30)
     monkeypatch.setattr(ros.shutil, "disk_usage", lambda folder: usage)

@@ -146,7 +146,14 @@ def out_of_time(path: Path, certificate: x509.Certificate, now: datetime) -> str
 
 def make_directory(directory: Path) -> None:
     """Open to others, who need `ca.crt`; the keys in it are not."""
+    if directory.is_dir():
+        return
     directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        _hand_over(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_key(path: Path, key: ec.EllipticCurvePrivateKey, *, replace: bool = False) -> None:
@@ -172,6 +179,7 @@ def write(path: Path, data: bytes, mode: int, *, replace: bool = True) -> None:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             os.fchmod(descriptor, mode)
+            _hand_over(descriptor)
             file.flush()
             os.fsync(descriptor)
         if replace:
@@ -181,6 +189,15 @@ def write(path: Path, data: bytes, mode: int, *, replace: bool = True) -> None:
     finally:
         temporary.unlink(missing_ok=True)
     _sync_directory(path.parent)
+
+
+def _hand_over(descriptor: int) -> None:
+    """What root makes belongs to whom the folder does: the service must read what is in its own."""
+    if os.geteuid() == 0:
+        # Not of the path that was asked for, which may have become a link to elsewhere meanwhile.
+        with contextlib.suppress(FileNotFoundError):  # an image without /proc has no service yet
+            folder = Path(f"/proc/self/fd/{descriptor}").readlink().parent.stat()
+            os.fchown(descriptor, folder.st_uid, folder.st_gid)
 
 
 def _sync_directory(directory: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import ssl
@@ -55,6 +56,21 @@ def test_files_and_their_modes(made: Path) -> None:
         "issued.jsonl": 0o644,
     }
     assert stat.S_IMODE(made.stat().st_mode) == 0o755
+
+
+def test_what_root_makes_is_the_services(made: Path, tmp_path: Path) -> None:
+    """`sudo appliance cert …` must leave the service its key, and what it renews by itself."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    home = Path(shutil.copytree(made, tmp_path / "certs"))
+    for path in (home, *home.rglob("*")):
+        os.chown(path, 4321, 4322)
+    certs.issue_client(home, "bob")
+    (home / "server.key").unlink()
+    certs.issue_server(home, NAMES, ADDRESSES)
+    assert (home / "clients/bob.key").exists()
+    for path in (home, *home.rglob("*")):
+        assert (path.stat().st_uid, path.stat().st_gid) == (4321, 4322), path
 
 
 def test_the_authority(made: Path) -> None:

@@ -240,6 +240,23 @@ def test_interrupted_it_is_as_before(
     assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
 
 
+def test_a_full_disk(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is told of the file that could not be written, not of the one that was read."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+
+    def full(source: Path, target: Path) -> None:
+        target.write_text("#!/b")
+        raise OSError(28, "No space left on device", str(source))
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    with pytest.raises(InstallError, match=f"{image / COMMAND} cannot be written: No space left"):
+        install(image, single_file(tmp_path, 2))
+    assert (image / COMMAND).read_text() == single_file(tmp_path).read_text()
+    assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
+
+
 def test_the_variables_are_not_for_everyone(image: Path, tmp_path: Path) -> None:
     if os.geteuid():
         pytest.skip("gives files to another user, as root only may")
