@@ -144,6 +144,8 @@ class Ros2Node:
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
+        #: Who could be heard when the bus was joined.
+        self._reach = Reach.NOBODY
         self._loop: asyncio.AbstractEventLoop | None = None
         self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
@@ -192,6 +194,8 @@ class Ros2Node:
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
+        # First: a network that comes meanwhile is not, or not for certain, among those it has.
+        self._reach = reach()
         look_again()
         self._rclpy = rclpy
         self._context = Context()
@@ -221,7 +225,6 @@ class Ros2Node:
         from rclpy.executors import ExternalShutdownException
         from rclpy.task import Future
 
-        began_with = reach()
         look_at = time.monotonic() + NETWORK_INTERVAL
         poll()
         never: Any = Future(executor=self._executor)
@@ -230,9 +233,9 @@ class Ros2Node:
                 # A finite time-out also mends EventsExecutor, whose endless wait overflows.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
-                if began_with < Reach.NETWORK and time.monotonic() >= look_at:
+                if self._reach < Reach.NETWORK and time.monotonic() >= look_at:
                     look_at = time.monotonic() + NETWORK_INTERVAL
-                    if reach() > began_with:
+                    if reach() > self._reach:
                         raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
