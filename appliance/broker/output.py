@@ -50,6 +50,8 @@ class Output:
         #: That of the client's CONNECT, and what else was agreed with it.
         self.version = 0
         self.maximum_packet_size = 0
+        #: Whether what is published has to be looked at: for its size, or for what it passes.
+        self._looks = False
         self.explains = False
         #: The batch of the store that what it is answered depends on, and what waits for which.
         self.batch = 0
@@ -74,8 +76,13 @@ class Output:
         self.session = session
         self._alias_maximum = aliases
         self._aliases = {} if aliases else None
-        self._mirrors = not (self.maximum_packet_size or aliases)
         self.explains = explains
+        self._look_at_all(False)
+
+    def _look_at_all(self, has_waiting: bool) -> None:
+        """`has_waiting`: large messages wait, and newer ones are not to pass them unseen."""
+        self._looks = has_waiting or bool(self.maximum_packet_size)
+        self._mirrors = not (self._looks or self._alias_maximum)
 
     # --- the Link of the session ---------------------------------------------------------------
 
@@ -93,7 +100,7 @@ class Output:
         if dup:
             first |= 8
         version = self.version
-        if self.maximum_packet_size and self._too_large(first, message, subscription_ids):
+        if self._looks and self._is_refused(first, message, subscription_ids):
             self._counters.publish_dropped += 1
             if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
                 self.session.give_up(packet_id)
@@ -133,8 +140,10 @@ class Output:
         """Whether the network has yet to take what it was given, or will be at the flush."""
         if self._out_size > LARGE_MESSAGE:
             self._full = True
-            return True
-        return self.wire.is_behind()
+        elif not self.wire.is_behind():
+            return False
+        self._look_at_all(True)
+        return True
 
     def _wait_for_its_turn(
         self, message: Message, first: int, subscription_ids: list[int] | None
@@ -144,7 +153,8 @@ class Output:
         What comes then, and is newer or smaller, is not behind it.
         """
         session = self.session
-        if first & 0x06 or session is None or not self.is_behind():
+        # With `keep` there is a queue, which nothing may pass.
+        if first & 0x06 or session is None or self._ledger.limits.keep or not self.is_behind():
             return False
         session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
         return True
@@ -180,6 +190,18 @@ class Output:
         return message.encode_for(
             first, packet_id, subscription_ids, self._ledger.now, alias, named=named
         )
+
+    def _is_refused(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
+        """Whether the client does not take a message of that size. One that is sent takes the place
+        of an older one of its topic that waits [MQTT-4.6.0-6]."""
+        if self.maximum_packet_size and self._too_large(first, message, subscription_ids):
+            return True
+        session = self.session
+        if session is not None and not first & 0x07:  # what is retained may be the older of the two
+            session.overtake(message.topic)
+            if not session.large:
+                self._look_at_all(False)
+        return False
 
     def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
         limit = self.maximum_packet_size

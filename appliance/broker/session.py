@@ -457,7 +457,7 @@ class Session:
     def _pump_latest(self, link: Link) -> None:
         while link.writable and (waiting := self.latest or self.large):
             oldest = next(iter(waiting))
-            if waiting[oldest][0].size > LARGE_MESSAGE and link.is_behind():
+            if waiting is self.large and link.is_behind():
                 return
             message, _, retain, subscription_ids, _ = waiting.pop(oldest)
             self._uncount(message)
@@ -495,6 +495,13 @@ class Session:
             return True
         self._drop(message)
         return False
+
+    def overtake(self, topic: str) -> None:
+        """A newer QoS 0 message of the topic is sent: a large one that waits comes too late."""
+        waiting = self.large.pop(topic, None)
+        if waiting is not None:
+            self._uncount(waiting[0])
+            self._drop(waiting[0])
 
     def _drop(self, message: Message) -> None:
         """Count a message that the client was too slow for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from dataclasses import dataclass, field
 
@@ -517,6 +518,47 @@ def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_
     peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE + b"2"]
+
+
+@pytest.mark.parametrize("keep", [None, 10])
+def test_a_large_message_does_not_come_behind_a_newer_one_of_its_topic(
+    broker: Broker, join: Join, version: int, keep: int | None
+):
+    broker.ledger.limits = dataclasses.replace(broker.ledger.limits, keep=keep or 0)
+    peer, publisher = join(version=version), join("publisher")
+    peer.subscribe("#")
+    peer.wire.behind = True
+    origin, counted = broker.attach("inside", Recorder()), Counted()
+    broker.publish(watched("a", LARGE, counted), origin)
+    broker.publish(Message("b", LARGE), origin)
+    publisher.send(Publish("a", b"1"))
+    broker.publish(Message("a", b"2"), origin)
+    broker.flush()
+    peer.wire.behind = False
+    peer.client.output.caught_up()
+    broker.publish(Message("a", b"3"), origin)
+    broker.flush()
+    if keep:
+        assert peer.payloads() == [LARGE, LARGE, b"1", b"2", b"3"]
+    else:
+        assert peer.payloads() == [b"1", b"2", LARGE, b"3"]
+        assert counted.skipped == broker.counters.publish_dropped == 1
+    check_accounts(broker)
+
+
+def test_one_that_waited_for_a_pause_to_end_does_not_either(broker: Broker, join: Join):
+    peer, origin = join(), broker.attach("inside", Recorder())
+    peer.subscribe("#")
+    peer.slow()
+    broker.publish(Message("a", LARGE), origin)
+    peer.wire.behind = True
+    peer.fast()
+    broker.publish(Message("a", b"1"), origin)
+    peer.wire.behind = False
+    peer.client.output.caught_up()
+    broker.flush()
+    assert peer.payloads() == [b"1"]
+    check_accounts(broker)
 
 
 def test_large_messages_go_one_by_one_and_behind_small_ones(broker: Broker, join: Join):
