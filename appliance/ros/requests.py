@@ -25,9 +25,9 @@ Key = tuple[str, str]
 
 @dataclass(eq=False, slots=True)
 class _Request:
-    """A request under way; `cdr` is empty once it was sent, or given up."""
+    """A request under way; `cdr` is None once it was sent, or given up: a request may be empty."""
 
-    cdr: bytes
+    cdr: bytes | None
     answer: asyncio.Future[bytes]
     give_up: Callable[[], None] | None = None
 
@@ -83,7 +83,7 @@ class Requests:
         try:
             return await waiting.answer
         finally:
-            waiting.cdr = b""
+            waiting.cdr = None
             if waiting.answer.cancelled():
                 self._soon(partial(self._give_up, key, waiting))
 
@@ -179,7 +179,7 @@ class Requests:
         return remote
 
     def _begin(self, key: Key, request: _Request) -> None:
-        if not request.cdr:
+        if request.cdr is None:
             return
         if key not in self._remotes and not self._is_seen(key):
             self._fail(request, *self._unavailable(key))
@@ -196,8 +196,8 @@ class Requests:
             self._fail(request, *self._unavailable(key))
 
     def _send(self, remote: _Remote, request: _Request) -> None:
-        cdr, request.cdr = request.cdr, b""
-        if not cdr:
+        cdr, request.cdr = request.cdr, None
+        if cdr is None:
             return
 
         def done(response: bytes | BusError) -> None:

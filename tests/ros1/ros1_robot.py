@@ -4,6 +4,8 @@
 |---|---|---|
 | `/robot/switch` | std_srvs/SetBool | says the contrary |
 | `/robot/sleep` | std_srvs/Trigger | never answers |
+| `/robot/greet` | std_srvs/Trigger | |
+| `/robot/rest` | std_srvs/Empty | |
 | `/robot/map` | std_msgs/String | latched |
 | `/robot/own` | own_msgs/Own | a type that is installed nowhere |
 | `/robot/work` | actionlib/TestAction | so many steps; -1 fails |
@@ -27,7 +29,7 @@ import genpy.dynamic
 import rospy
 from actionlib.msg import TestAction, TestFeedback, TestResult
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, SetBoolResponse, Trigger
+from std_srvs.srv import Empty, SetBool, SetBoolResponse, Trigger
 
 STEP = 0.05
 OWN = "string name\nuint8[] data\nown_msgs/Part[] parts\n" + "=" * 80 + "\n"
@@ -43,6 +45,8 @@ class Robot:
         self.received = {}
         self.publishers = {}
         rospy.Service("/robot/switch", SetBool, lambda asked: SetBoolResponse(not asked.data, "so"))
+        rospy.Service("/robot/greet", Trigger, lambda asked: (True, "hello"))
+        rospy.Service("/robot/rest", Empty, lambda asked: ())
         rospy.Service("/robot/sleep", Trigger, lambda asked: threading.Event().wait())
         self.map = rospy.Publisher("/robot/map", String, latch=True, queue_size=1)
         self.map.publish("a map")

@@ -176,6 +176,9 @@ def test_services_both_ways(world: World, robot: Node, appliance: Ros1Appliance)
             "code": "bad_request",
             "message": "data: expected true or false, got 1",
         }
+        # In ROS 1 these are no bytes at all.
+        assert call("r2d2/robot/greet", {}) == {"success": True, "message": "hello"}
+        assert call("r2d2/robot/rest", {}) == {}
         assert call("r2d2/robot/sleep", {})["error"]["code"] == "timeout"  # type: ignore[index]
         said = world.run("rosservice", "call", "/ask_nobody", "true", check=False)
         assert "nobody on MQTT answered" in said
