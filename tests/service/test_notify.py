@@ -58,7 +58,7 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
         notify.messages.clear()
         os.kill(appliance.pid, signal.SIGHUP)
         notify.wait(lambda: notify.all("READY"), "READY=1 after the reload")
-        assert "not reloaded" in appliance.log
+        appliance.wait_for_log("not reloaded")
     finally:
         appliance.stop()
     assert notify.messages[-1][1] == {"STOPPING": "1", "STATUS": "stopping"}
