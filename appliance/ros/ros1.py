@@ -12,6 +12,7 @@ import asyncio
 import logging
 import os
 import queue
+import socket
 import sys
 import threading
 import time
@@ -23,6 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 from typing import Any
+from weakref import WeakSet
 
 from appliance.ros.definitions import PACKED, TypeDescription, UnknownTypeError
 from appliance.ros.node import (
@@ -240,6 +242,7 @@ class Ros1Node:
             disable_rosout=True,
             disable_signals=True,
         )
+        _Servers(rospy)
         self.name = rospy.get_name()
         self._uri = rospy.core.get_node_uri()
         self._master.caller = self.name
@@ -569,6 +572,38 @@ def _fresh_rospy() -> Any:
     for name in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
         del sys.modules[name]
     return import_module("rospy")
+
+
+class _Servers:
+    """The two servers of a node, to be ended with all their threads. rospy closes the sockets that
+    these wait at, which they do not notice, and keeps the connections, and others their ends."""
+
+    def __init__(self, rospy: Any) -> None:
+        from rosgraph.xmlrpc import XmlRpcNode
+
+        owners = [getattr(hook, "__self__", None) for hook in rospy.core._shutdown_hooks]
+        self._node = next(owner for owner in owners if isinstance(owner, XmlRpcNode))
+        self._tcpros = rospy.impl.tcpros_base._tcpros_server
+        self._connections: WeakSet[socket.socket] = WeakSet()
+        self._process = self._node.server.process_request
+        self._node.server.process_request = self._note_and_process
+        rospy.core.add_preshutdown_hook(self._end)
+
+    def _note_and_process(self, request: socket.socket, address: object) -> None:
+        self._connections.add(request)
+        self._process(request, address)
+
+    def _end(self, _reason: str) -> None:
+        self._node.is_shutdown = True
+        self._node.server.shutdown()
+        for connection in list(self._connections):
+            with suppress(OSError):  # one that has ended
+                connection.shutdown(socket.SHUT_RD)  # what it has asked for is answered
+        tcp = self._tcpros.tcp_ros_server
+        if tcp is not None:
+            tcp.is_shutdown = True
+            tcp.server_sock.shutdown(socket.SHUT_RDWR)  # wakes accept()
+            tcp.server_sock.close()
 
 
 @cache

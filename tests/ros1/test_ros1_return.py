@@ -3,6 +3,7 @@ know the robot."""
 
 from __future__ import annotations
 
+import socket
 from functools import partial
 
 import psutil
@@ -15,11 +16,27 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+def ports(process: psutil.Process) -> set[int]:
+    return {
+        found.laddr.port
+        for found in process.net_connections("inet")
+        if found.status == psutil.CONN_LISTEN
+    }
+
+
+def is_used(port: int, process: psutil.Process) -> bool:
+    """Whether somebody still listens at a port, or the process has connections there."""
+    with socket.socket() as probe:
+        if probe.connect_ex(("127.0.0.1", port)) == 0:
+            return True
+    return any(found.laddr.port == port for found in process.net_connections("inet"))
+
+
 def test_it_joins_again_and_leaves_another_its_name(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
     process = psutil.Process(appliance.pid)
-    threads = process.num_threads()
+    before_ports = ports(process)
     joined, offered = "on ROS as /appliance", "/robot/switch can be called"
     before = {text: appliance.log.count(text) for text in (joined, offered)}
     # The Master lets another node take the name.
@@ -37,8 +54,11 @@ def test_it_joins_again_and_leaves_another_its_name(
         assert answer == {"success": False, "message": "so"}
         robot.do("publish", "/many", "std_msgs/String", "again")
         client.next("r2d2/many", {"data": "again"})
-    # Connections have threads, which end with them.
-    eventually(lambda: process.num_threads() <= threads + 5, "their threads have ended, too")
+    # Nothing is left of the node that was: its servers, the connections to them, their threads.
+    left = before_ports - ports(process)
+    assert len(left) == 2, "that of XML-RPC, and that of TCPROS"
+    for port in left:
+        eventually(lambda port=port: not is_used(port, process), f"port {port} is free")  # type: ignore[misc]
 
 
 def test_a_master_that_is_killed_and_comes_back(
