@@ -18,7 +18,8 @@ from appliance.ros.convert import Converters
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.parameter_server import ServerParameters
-from appliance.ros.parameters import ParameterRoutes, ParameterSettings
+from appliance.ros.parameter_topics import ParameterSettings
+from appliance.ros.parameters import ParameterRoutes
 from appliance.ros.requests import Requests
 from appliance.ros.services import ServiceRoutes, ServiceSettings
 from appliance.ros.skips import Skip

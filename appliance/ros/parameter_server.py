@@ -13,28 +13,18 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from functools import partial
 from time import monotonic
 from typing import Any
 
 import pybase64
 
-from appliance.broker.message import Message
-from appliance.mqtt.codec import Properties, Property
-from appliance.ros.calls import Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls import Call, CallError, Switchboard
 from appliance.ros.node import BusError, ParameterServer, RosNode
-from appliance.ros.parameters import (
-    LONGEST_NAME,
-    ParameterSettings,
-    shorten,
-    to_bytes,
-    value_of,
-    values_of,
-)
-from appliance.ros.patterns import Names, is_plain
-from appliance.ros.payloads import CONTENT_TYPE, dumps
+from appliance.ros.parameter_topics import Holder, ParameterTopics, shorten, to_bytes
+from appliance.ros.patterns import is_plain
+from appliance.ros.payloads import dumps
 from appliance.ros.skips import Skip
 
 log = logging.getLogger(__name__)
@@ -48,24 +38,11 @@ DEEPEST = 16
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
-@dataclass(eq=False, slots=True)
-class _Namespace:
-    """Parameters that stand beside each other: by name, what is retained."""
+class ServerParameters(ParameterTopics[Holder]):
+    """The routes of parameters; for the loop's thread, where it does not say otherwise.
 
-    name: str
-    base: str
-    route: ParameterSettings
-    wanted: list[Names]
-    shown: dict[str, bytes] = field(default_factory=dict)
-    offers: list[Offer] = field(default_factory=list)
-
-    def wants(self, parameter: str) -> bool:
-        """Whether it is shown, and may be set."""
-        return any(parameter in names for names in self.wanted)
-
-
-class ServerParameters:
-    """The routes of parameters; for the loop's thread, where it does not say otherwise."""
+    What stands for a node is a namespace: parameters that are beside each other.
+    """
 
     def __init__(
         self,
@@ -76,14 +53,11 @@ class ServerParameters:
         changed: Callable[[], None],
     ) -> None:
         """`changed` is called when what `bridged` gives has changed."""
-        self._board = board
+        super().__init__(board)
         self._node = node
         self._loop = loop
         self._post = post
         self._changed = changed
-        self._counters: dict[ParameterSettings, CallCounters] = {}
-        self._routes: Sequence[ParameterSettings] = ()
-        self._namespaces: dict[str, _Namespace] = {}
         #: All parameters of the last look, by namespace, and the values of those that are wanted.
         self._names: dict[str, list[str]] = {}
         self._values: dict[str, Any] = {}
@@ -93,32 +67,11 @@ class ServerParameters:
         # The ROS thread's.
         self._looked_at = 0.0
 
-    def start(self) -> None:
-        """Nothing is known of the bus yet."""
-        for route in self._counters:
-            self._board.clear(route.mqtt, "{node}", ".+")
-
-    def replace(self, routes: Sequence[ParameterSettings]) -> None:
-        """Have these routes from now on."""
-        if list(routes) == list(self._routes):
-            return
-        self._routes = routes
-        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
-        for namespace in list(self._namespaces.values()):
-            self._leave(namespace)
+    def _look_again(self) -> None:
         self._looked_at = 0.0
 
     def follow(self) -> None:
         """Services have come or gone: no matter."""
-
-    def _find(self, name: str) -> _Namespace | None:
-        """The namespace `/arm`, as the routes want it; None when they do not."""
-        wanted = {route: names for route in self._counters if (names := route.of(name))}
-        if not wanted:
-            return None
-        route = next(iter(wanted))
-        base = route.mqtt.replace("{node}", name)
-        return _Namespace(name, base, route, list(wanted.values()))
 
     def _take(self, names: dict[str, list[str]], values: dict[str, Any]) -> None:
         """What there is now."""
@@ -131,16 +84,17 @@ class ServerParameters:
         for full_name, value in values.items():
             space, _, name = full_name.rpartition("/")
             found.setdefault(space, {})[name] = value
-        for shown in list(self._namespaces.values()):
+        for shown in list(self._holders.values()):
             if shown.name not in found:
                 self._leave(shown)
                 has_changed = True
         for name, own in found.items():
-            namespace = self._namespaces.get(name) or self._find(name)
+            namespace = self._holders.get(name) or self._find(name, Holder)
             if namespace is None:  # the routes have changed meanwhile
                 continue
-            if name not in self._namespaces:
+            if name not in self._holders:
                 self._join(namespace)
+                log.info("the parameters of %s are at %s", name or "/", namespace.base)
                 has_changed = True
             for parameter in namespace.shown.keys() - own.keys():
                 self._show(namespace, parameter, None)
@@ -157,38 +111,7 @@ class ServerParameters:
             self._is_blind, self._problem = False, problem
             self._changed()
 
-    def _join(self, namespace: _Namespace) -> None:
-        self._namespaces[namespace.name] = namespace
-
-        async def set_one(call: Call) -> Answer:
-            values = {call.topic.split("/")[-2]: value_of(call)}
-            return await self._set(namespace, values, call)
-
-        async def set_all(call: Call) -> Answer:
-            return await self._set(namespace, values_of(call), call)
-
-        route = namespace.route
-        for topic, handle in (("+/set", set_one), ("_set", set_all)):
-            offer = Offer(
-                f"{namespace.base}/{topic}",
-                f"the parameters of {namespace.name or '/'}",
-                route.timeout,
-                self._counters[route],
-                handle,
-                route.encoding,
-            )
-            namespace.offers.append(offer)
-            self._board.offer(offer)
-        log.info("the parameters of %s are at %s", namespace.name or "/", namespace.base)
-
-    def _leave(self, namespace: _Namespace) -> None:
-        del self._namespaces[namespace.name]
-        for offer in namespace.offers:
-            self._board.withdraw(offer)
-        for parameter in list(namespace.shown):
-            self._show(namespace, parameter, None)
-
-    def _show(self, namespace: _Namespace, name: str, value: Any) -> None:
+    def _show(self, namespace: Holder, name: str, value: Any) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
         encoding = namespace.route.encoding
         try:
@@ -200,22 +123,10 @@ class ServerParameters:
         except TypeError:  # an integer too large for JSON
             log.debug("%s/%s cannot be shown", namespace.name, name)
             return
-        is_topic = not set("+#\0") & set(name) and len(name) <= LONGEST_NAME
-        if payload == namespace.shown.get(name, b"") or not is_topic:
-            return
-        if payload:
-            namespace.shown[name] = payload
-        else:
-            del namespace.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
-        self._board.publish(Message(f"{namespace.base}/{name}", payload, 1, True, properties))
+        self._publish(namespace, name, payload)
 
-    async def _set(self, namespace: _Namespace, values: dict[str, Any], call: Call) -> Answer:
-        full_names = {f"{namespace.name}/{name}": value for name, value in values.items()}
-        for name in values:
-            if "/" in name or not namespace.wants(name):
-                text = f"the parameter {namespace.name}/{name} is not among bridge.parameters"
-                raise CallError("not_authorized", text)
+    async def _set(self, holder: Holder, values: dict[str, Any], call: Call, at_once: bool) -> str:
+        full_names = {f"{holder.name}/{name}": value for name, value in values.items()}
         for full_name, value in full_names.items():
             if isinstance(value, dict) or not _is_value(value):
                 text = f"{full_name}: no parameter can have the value {shorten(value)}"
@@ -232,28 +143,7 @@ class ServerParameters:
         except BusError as error:
             raise CallError("ros_error", str(error)) from None
         await done
-        said = {"successful": True, "reason": ""}
-        return Answer(dumps(said, call.encoding), call.encoding)
-
-    def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
-        """Each route, what it has counted, and the namespaces that it shows now."""
-        return [
-            (route, counters, [name for name in self._namespaces if route.of(name)])
-            for route, counters in self._counters.items()
-        ]
-
-    def bridged(self) -> list[dict[str, str]]:
-        """Entries for `{robot}/_appliance/routes`."""
-        return [
-            {
-                "ros": namespace.name or "/",
-                "mqtt": namespace.base,
-                "type": "",
-                "direction": "parameters",
-                "encoding": namespace.route.encoding,
-            }
-            for namespace in self._namespaces.values()
-        ]
+        return ""
 
     def skips(self) -> list[Skip]:
         """The parameters that routes name and are not there."""
@@ -275,8 +165,7 @@ class ServerParameters:
     def _forget(self) -> None:
         self._names, self._values = {}, {}
         self._is_blind = True
-        for namespace in list(self._namespaces.values()):
-            self._leave(namespace)
+        self._leave_all()
 
     # The ROS thread
 
@@ -301,7 +190,7 @@ class ServerParameters:
             while space:
                 space = space.rpartition("/")[0]
                 names.setdefault(space, [])
-        spaces = {space: self._find(space) for space in names}
+        spaces = {space: self._find(space, Holder) for space in names}
         wanted = [
             f"{space}/{name}"
             for space, found in names.items()

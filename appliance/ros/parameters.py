@@ -12,29 +12,23 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-import orjson
 import pybase64
 
-from appliance.broker.message import Message
-from appliance.mqtt.codec import Properties, Property
 from appliance.ros.calls import (
-    WITHOUT_RAW,
-    Answer,
     Call,
-    CallCounters,
     CallError,
-    Offer,
     Switchboard,
 )
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
-from appliance.ros.patterns import Names, compile_pattern, is_plain
-from appliance.ros.payloads import CONTENT_TYPE, CallEncoding, dumps, loads
+from appliance.ros.parameter_topics import Holder, ParameterTopics, shorten, to_bytes, unlike
+from appliance.ros.patterns import is_plain
+from appliance.ros.payloads import CallEncoding, dumps
 from appliance.ros.requests import Requests
 from appliance.ros.skips import Skip
 
@@ -52,9 +46,6 @@ RETRY = 2.0
 
 #: The longest that a node may take to tell them, in seconds.
 PATIENCE = 5.0
-
-#: Longer names, in characters, are not shown: they would be no topics.
-LONGEST_NAME = 1024
 
 #: Parameters that are asked for at a time.
 CHUNK = 200
@@ -76,53 +67,21 @@ _NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING, _BYTES = range(6)
 _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterSettings:
-    """Parameters, by names and patterns such as `/node/parameter`; what begins with `!` is left
-    out.
-
-    `mqtt` is the topic above a node's values; a `{node}` in it stands for the node's full name.
-    `timeout` is for setting, in seconds.
-    """
-
-    names: tuple[str, ...]
-    mqtt: str
-    timeout: float = 5.0
-    encoding: Literal["json", "cbor"] = "json"
-
-    def of(self, node: str) -> Names | None:
-        """Those that are wanted of a node; None for none at all."""
-        mine: list[str] = []
-        for text in self.names:
-            pattern, _, name = text.removeprefix("!").rpartition("/")
-            if compile_pattern(pattern).fullmatch(node):
-                mine.append(f"!{name}" if text.startswith("!") else name)
-        return Names(mine) if any(not name.startswith("!") for name in mine) else None
-
-
 @dataclass(eq=False, slots=True)
-class _Node:
-    """A node whose parameters are shown: by name, what is retained."""
+class _Node(Holder):
+    """A node, and how its values are read."""
 
-    name: str
-    base: str
-    route: ParameterSettings
-    wanted: list[Names]
-    shown: dict[str, bytes] = field(default_factory=dict)
-    offers: list[Offer] = field(default_factory=list)
     is_loading: bool = False
     is_stale: bool = True
     is_gone: bool = False
     #: Why its parameters cannot be read.
     problem: str | None = None
 
-    def wants(self, parameter: str) -> bool:
-        """Whether it is shown, and may be set."""
-        return any(parameter in names for names in self.wanted)
 
-
-class ParameterRoutes:
+class ParameterRoutes(ParameterTopics[_Node]):
     """The routes of parameters; for the loop's thread, where it does not say otherwise."""
+
+    type_name = "rcl_interfaces/msg/ParameterValue"
 
     def __init__(
         self,
@@ -133,15 +92,12 @@ class ParameterRoutes:
         loop: asyncio.AbstractEventLoop,
         post: Callable[..., None],
     ) -> None:
-        self._board = board
+        super().__init__(board)
         self._requests = requests
         self._converters = converters
         self._node = node
         self._loop = loop
         self._post = post
-        self._counters: dict[ParameterSettings, CallCounters] = {}
-        self._routes: Sequence[ParameterSettings] = ()
-        self._nodes: dict[str, _Node] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_stopped = False
         # Both threads'.
@@ -151,19 +107,7 @@ class ParameterRoutes:
         self._subscription: RosSubscription | None = None
         self._is_refused = False
 
-    def start(self) -> None:
-        """Nothing is known of the bus yet."""
-        for route in self._counters:
-            self._board.clear(route.mqtt, "{node}", ".+")
-
-    def replace(self, routes: Sequence[ParameterSettings]) -> None:
-        """Have these routes from now on."""
-        if list(routes) == list(self._routes):
-            return
-        self._routes = routes
-        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
-        for node in list(self._nodes.values()):  # which patterns a value is of has to be asked anew
-            self._leave(node)
+    def _look_again(self) -> None:
         self.follow()
 
     def follow(self) -> None:
@@ -173,71 +117,18 @@ class ParameterRoutes:
             for service, types in self._requests.services.items()
             if service.endswith(GET) and "rcl_interfaces/srv/GetParameters" in types
         }
-        for node in list(self._nodes.values()):
+        for node in list(self._holders.values()):
             if node.name not in there:
                 self._leave(node)
-        for name in sorted(there - self._nodes.keys()):
-            self._join(name)
-
-    def _join(self, name: str) -> None:
-        wanted = {route: names for route in self._counters if (names := route.of(name))}
-        if not wanted or name == self._node.name:
-            return
-        route = next(iter(wanted))
-        node = _Node(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
-        self._nodes[name] = node
-
-        async def set_one(call: Call) -> Answer:
-            parameter = call.topic.split("/")[-2]
-            return await self._set(node, {parameter: value_of(call)}, call, at_once=False)
-
-        async def set_all(call: Call) -> Answer:
-            return await self._set(node, values_of(call), call, at_once=True)
-
-        counters = self._counters[route]
-        for topic, handle in (("+/set", set_one), ("_set", set_all)):
-            what = f"{name}'s parameters"
-            offer = Offer(
-                f"{node.base}/{topic}",
-                what,
-                route.timeout,
-                counters,
-                handle,
-                route.encoding,
-                WITHOUT_RAW,
-            )
-            node.offers.append(offer)
-            self._board.offer(offer)
-        self._load(node)
+        for name in sorted(there - self._holders.keys() - {self._node.name}):
+            found = self._find(name, _Node)
+            if found is not None:
+                self._join(found)
+                self._load(found)
 
     def _leave(self, node: _Node) -> None:
-        del self._nodes[node.name]
         node.is_gone = True
-        for offer in node.offers:
-            self._board.withdraw(offer)
-        for parameter in node.shown:
-            self._board.publish(Message(f"{node.base}/{parameter}", b"", 0, True))
-        node.shown.clear()
-
-    def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
-        """Each route, what it has counted, and the nodes that it shows now."""
-        return [
-            (route, counters, [name for name in self._nodes if route.of(name)])
-            for route, counters in self._counters.items()
-        ]
-
-    def bridged(self) -> list[dict[str, str]]:
-        """Entries for `{robot}/_appliance/routes`."""
-        return [
-            {
-                "ros": node.name,
-                "mqtt": node.base,
-                "type": "rcl_interfaces/msg/ParameterValue",
-                "direction": "parameters",
-                "encoding": node.route.encoding,
-            }
-            for node in self._nodes.values()
-        ]
+        super()._leave(node)
 
     def skips(self) -> list[Skip]:
         """The nodes that routes name and are not there, or do not tell their parameters."""
@@ -245,13 +136,13 @@ class ParameterRoutes:
             return []
         skips = [
             Skip(node.name, "parameters", "", "problem", node.problem)
-            for node in self._nodes.values()
+            for node in self._holders.values()
             if node.problem is not None
         ]
         named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
         return skips + [
             Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
-            for node in sorted(named - self._nodes.keys())
+            for node in sorted(named - self._holders.keys())
             if is_plain(node)
         ]
 
@@ -261,8 +152,7 @@ class ParameterRoutes:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for node in list(self._nodes.values()):
-            self._leave(node)
+        self._leave_all()
 
     # Values
 
@@ -334,25 +224,16 @@ class ParameterRoutes:
 
     def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        if set("+#\0") & set(name) or len(name) > LONGEST_NAME or not node.wants(name):
-            return
-        encoding = node.route.encoding
-        payload = b"" if value is None else _to_payload(value, encoding)
-        if payload == node.shown.get(name, b""):
-            return
-        if payload:
-            node.shown[name] = payload
-        else:
-            del node.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[encoding]}
-        self._board.publish(Message(f"{node.base}/{name}", payload, 1, True, properties))
+        if node.wants(name):
+            payload = b"" if value is None else _to_payload(value, node.route.encoding)
+            self._publish(node, name, payload)
 
     def _take_events(self) -> None:
         self._is_awake = False
         events = self._events
         if len(events) >= WAITING_EVENTS:
             events.clear()
-            for node in self._nodes.values():
+            for node in self._holders.values():
                 self._load(node)
             return
         while events:
@@ -361,7 +242,7 @@ class ParameterRoutes:
             except (ConversionError, UnknownTypeError) as error:
                 log.warning("%s: a message cannot be read: %s", EVENTS, error)
                 continue
-            known = self._nodes.get(said["node"])
+            known = self._holders.get(said["node"])
             if known is None:
                 continue
             if known.is_loading:
@@ -374,13 +255,7 @@ class ParameterRoutes:
 
     # Setting
 
-    async def _set(
-        self, node: _Node, values: dict[str, Any], call: Call, *, at_once: bool
-    ) -> Answer:
-        for name in values:
-            if not node.wants(name):
-                text = f"{node.name}'s parameter {name!r} is not among bridge.parameters"
-                raise CallError("not_authorized", text)
+    async def _set(self, node: _Node, values: dict[str, Any], call: Call, at_once: bool) -> str:
         names = list(values)
         said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
         descriptors = {one["name"]: one for one in said["descriptors"]}
@@ -399,8 +274,7 @@ class ParameterRoutes:
         if not result.get("successful"):
             reason = result.get("reason") or "it gives no reason"
             raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
-        said = {"successful": True, "reason": result["reason"]}
-        return Answer(dumps(said, call.encoding), call.encoding)
+        return str(result["reason"])
 
     # The ROS thread
 
@@ -431,24 +305,6 @@ class ParameterRoutes:
         self._is_refused = False
 
 
-def value_of(call: Call) -> Any:
-    """The value in a call. Raises CallError."""
-    try:
-        return loads(call.payload, call.encoding)
-    except ConversionError as error:
-        raise CallError("bad_request", str(error)) from None
-
-
-def values_of(call: Call) -> dict[str, Any]:
-    """The values in a call, by the names of parameters. Raises CallError."""
-    values = value_of(call)
-    is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
-    if not is_mapping or not values:
-        raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-    named: dict[str, Any] = values
-    return named
-
-
 def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
     """The payload of a ParameterValue; empty when the parameter is not set."""
     kind = value["type"]
@@ -476,10 +332,10 @@ def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, 
         value = to_bytes(name, value)
     elif kind in (_BOOLS, _INTEGERS, _DOUBLES, _STRINGS):
         if not isinstance(value, list) or not all(_is(kind - 5, item) for item in value):
-            raise _unlike(name, expected, value)
+            raise unlike(name, expected, value)
         value = [float(item) for item in value] if kind == _DOUBLES else value
     elif not _is(kind, value):
-        raise _unlike(name, expected, value)
+        raise unlike(name, expected, value)
     elif kind == _DOUBLE:
         value = float(value)
     return {"type": kind, field_name: value}
@@ -496,18 +352,6 @@ def _is(kind: int, value: Any) -> bool:
     return isinstance(value, (int, float))
 
 
-def to_bytes(name: str, value: Any) -> bytes:
-    """The bytes that a value of JSON or CBOR stands for. Raises CallError."""
-    try:
-        if isinstance(value, str):
-            return pybase64.b64decode(value, validate=True)
-        if isinstance(value, (bytes, list)):
-            return bytes(value)
-    except (TypeError, ValueError):
-        pass
-    raise _unlike(name, "an array of bytes, as base64 or a list", value)
-
-
 def _type_of(name: str, value: Any) -> int:
     for kind in (_BOOL, _INTEGER, _DOUBLE, _STRING):
         if _is(kind, value):
@@ -515,16 +359,3 @@ def _type_of(name: str, value: Any) -> int:
         if isinstance(value, list) and value and all(_is(kind, item) for item in value):
             return kind + 5
     raise CallError("bad_request", f"{name}: no parameter can have the value {shorten(value)}")
-
-
-def _unlike(name: str, expected: str, value: Any) -> CallError:
-    return CallError("bad_request", f"{name}: expected {expected}, got {shorten(value)}")
-
-
-def shorten(value: Any) -> str:
-    """A value as an error shows it."""
-    try:
-        text = orjson.dumps(value).decode()
-    except TypeError:  # what only CBOR has
-        text = repr(value)
-    return text if len(text) <= 60 else f"{text[:60]}…"

@@ -26,8 +26,9 @@ from appliance_process import HOST, ROBOT, BrokerProcess, eventually
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
 pytest.importorskip("PyInstaller")
+from robot_process import Robot
 from test_own_interfaces import DRIVE, VALUE, build_workspace
-from test_robot import TURTLE, V5, Client, Robot
+from test_robot import TURTLE, V5, Client
 from test_ros2 import Peer, domain, string, until
 
 __all__ = ["domain"]  # a fixture for all tests here

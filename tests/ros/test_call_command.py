@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -17,13 +16,12 @@ from appliance_process import ApplianceProcess, eventually
 
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
-from test_robot import Robot
+from robot_process import DEADLINE
 
 from appliance import cli
 from appliance.environment import for_other_programs
 from appliance.init import initialise
 
-DEADLINE = 20.0
 BRIDGE = {
     "node": "bridge",
     "services": ["/turtle/*", {"ros": "/turtle/think", "timeout": "300 ms"}, "/absent"],
@@ -41,22 +39,6 @@ user carol
 topic write r2d2/turtle/pen/_call/#
 pattern read r2d2/turtle/pen/_reply/%c/#
 """
-
-
-@pytest.fixture(scope="module")
-def domain():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(domain):
-    robot = Robot()
-    robot.wait()
-    yield robot
-    robot.stop()
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +121,11 @@ def test_a_goal_to_its_end(run):
     first, *between, last = output.splitlines()
     assert code == 0, errors
     assert len(first.split()[1]) == 32 and first.startswith("goal ")
-    assert between and all(line.startswith("feedback {") for line in between)
-    assert json.loads(between[0].partition(" ")[2])["sequence"] == [0, 1, 1]
+    # The first is missed when ROS has not yet found the route's new subscription.
+    every = [
+        f'feedback {{"sequence":{text}}}' for text in ("[0,1,1]", "[1,1,2]", "[1,2,3]", "[2,3,5]")
+    ]
+    assert len(between) >= 2 and between == every[-len(between) :]
     assert last == 'succeeded {"sequence":[0,1,1,2,3,5]}'
 
 
@@ -195,7 +180,7 @@ def test_what_has_no_json_is_named(run, appliance):
             _, *between, last = output.splitlines()
             if text is not before:
                 assert last == "succeeded (application/cdr, 92 bytes)"
-                assert re.fullmatch(r"feedback \(application/cdr, \d+ bytes\)", between[-1])
+                assert set(between) == {"feedback (application/cdr, 20 bytes)"}  # three numbers
             else:
                 assert last.startswith('succeeded {"sequence":[0,1,1,2,3,')
             code, _, errors = run("goal", "/turtle/walk", '{"order": 2}', "-V", "311")
@@ -218,7 +203,7 @@ def test_parameters_are_read_and_set(run):
         (("mode", "mad"), "/turtle does not set mode: there is no mode mad"),
         (("serial", "x"), "rejected: serial is read-only"),
         (("speed", "[1]"), "bad_request: speed: expected a double, got [1]"),
-        (("gains", "[1]"), "not_authorized: /turtle's parameter 'gains' is not among"),
+        (("gains", "[1]"), "not_authorized: the parameter /turtle/gains is not among"),
     ):
         code, output, errors = run("param", "set", "/turtle", *arguments)
         assert (code, output) == (1, "") and what in errors, errors

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import queue
 import signal
 import socket
 import subprocess
@@ -23,10 +22,10 @@ pytest.importorskip("test_msgs.action")
 import paho.mqtt.client as paho
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
+from robot_process import DEADLINE
 
 from appliance.environment import for_other_programs
 
-DEADLINE = 15.0
 V5, V311 = paho.MQTTv5, paho.MQTTv311
 both = pytest.mark.parametrize("version", [V5, V311], ids=["v5", "v311"])
 
@@ -62,49 +61,6 @@ topic write r2d2/turtle/walk/_cancel/#
 pattern read r2d2/turtle/walk/_reply/%c/#
 topic readwrite answers/#
 """
-
-
-class Robot:
-    """robot.py in a process of its own."""
-
-    def __init__(self):
-        self.told = queue.Queue()
-        self._answers = queue.Queue()
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parent / "robot.py")],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=for_other_programs(),
-        )
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self):
-        for line in self._process.stdout:
-            kind, *rest = json.loads(line)
-            (self._answers if kind == "ok" else self.told).put([kind, *rest])
-
-    def wait(self):
-        return self._answers.get(timeout=DEADLINE)[1]
-
-    def hear(self, *expected):
-        """Wait until it has told that by itself."""
-        while self.told.get(timeout=DEADLINE)[: len(expected)] != [*expected]:
-            pass
-
-    def do(self, *command):
-        self._process.stdin.write(json.dumps(command) + "\n")
-        self._process.stdin.flush()
-        return self.wait()
-
-    def stop(self):
-        self._process.stdin.close()
-        try:
-            self._process.wait(DEADLINE)
-        finally:
-            self._process.kill()
-            self._process.wait()
-            self._process.stdout.close()
 
 
 class Client:
@@ -248,22 +204,6 @@ class Client:
     def leave(self):
         self.paho.disconnect()
         self.paho.loop_stop()
-
-
-@pytest.fixture(scope="module")
-def domain():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        yield
-
-
-@pytest.fixture(scope="module")
-def robot(domain):
-    robot = Robot()
-    robot.wait()
-    yield robot
-    robot.stop()
 
 
 @pytest.fixture(scope="module")
@@ -627,7 +567,7 @@ def test_parameters_are_shown_and_set(client_of, robot, version):
     assert client.error(f"{PARAM}/nothing/set", 1)[0] == "rejected"
     assert client.error(f"{PARAM}/gains/set", [1]) == (
         "not_authorized",
-        "/turtle's parameter 'gains' is not among bridge.parameters",
+        "the parameter /turtle/gains is not among bridge.parameters",
     )
     # Several of them: all, or none.
     code, message = client.error(f"{PARAM}/_set", {"speed": 0.5, "mode": "lazy"})
