@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance import cli, console
+from appliance import cli
 from appliance.access import Passwords
+from appliance.commands import connection
 from appliance.store import database
 
 
@@ -268,10 +269,7 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
     monkeypatch.setenv("APPLIANCE_PASSWORD", "secret")
 
     def target(**options: str | int | Path | None) -> object:
-        given = {"config": None, "port": None, "ca": None, "user": "alice"} | options
-        return console.connect_to(
-            **given, host="h", password_file=None, client_id="", version="5", insecure=False
-        )
+        return connection.Connection(host="h", user="alice", **options).target()  # type: ignore[arg-type]
 
     from appliance.client import Target
 

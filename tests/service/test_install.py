@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from appliance import install_command
+from appliance.commands.install import install as install_command
 from appliance.config import load
 from appliance.init import Credentials
 from appliance.install import Installation, InstallError
@@ -322,7 +322,7 @@ def test_the_command_keeps_the_user_of_before(
     (image / "opt").mkdir()
     (image / "opt/appliance").touch()
     monkeypatch.setattr(sys, "argv", ["/opt/appliance"])
-    install_command.install(dry_run=True, root=image)
+    install_command(dry_run=True, root=image)
     assert "\nUser=robot\nGroup=drivers\n" in capsys.readouterr().out
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.console import (
+from appliance.commands.console import (
     CommandError,
     ConfigOption,
     GenerateOption,

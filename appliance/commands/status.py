@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.console import CommandError, ConfigOption
-from appliance.console import load as load_settings
+from appliance.commands.console import CommandError, ConfigOption
+from appliance.commands.console import load as load_settings
 
 #: What certificates are called here.
 _WHAT = {"server": "the server's certificate", "ca": "the CA", "crl": "the revocation list"}

@@ -5,103 +5,23 @@ They are what `ros2 service call`, `ros2 action send_goal` and `ros2 param` are 
 
 from __future__ import annotations
 
-import inspect
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from appliance.console import (
-    CaOption,
-    CertOption,
-    ClientIdOption,
-    ClientPasswordOption,
-    CommandError,
-    ConfigOption,
-    HostOption,
-    InsecureOption,
-    KeyOption,
-    PortOption,
-    UserOption,
-    VersionOption,
-    connect_to,
-    load,
-)
+from appliance.commands.connection import Reach, connecting
+from appliance.commands.console import CommandError
 
 if TYPE_CHECKING:
     from appliance.caller import Caller
-    from appliance.client import Target
 
 param_app = typer.Typer(no_args_is_help=True, help="Parameters of the robot's nodes, over MQTT.")
-
-
-class Reach:
-    """The broker that a command connects to, and the robot that it means."""
-
-    def __init__(self, target: Target, robot: str | None, config: Path | None) -> None:
-        self.target = target
-        self._robot = robot
-        self._config = config
-
-    def topic(self, name: str) -> str:
-        """Where a service, an action or a node is on MQTT: `/arm/grip` is `r2d2/arm/grip`."""
-        if not name.startswith("/"):
-            return name
-        # Of ROS 1, parameters may be at the top: those of /.
-        return f"{self._robot or self._configured()}{name.rstrip('/')}"
-
-    def _configured(self) -> str:
-        from appliance.config import SEARCH_PATH
-
-        if self._config is None and not any(path.is_file() for path in SEARCH_PATH):
-            raise CommandError(
-                "which robot? Say --robot NAME, or give the MQTT topic: r2d2/arm/grip for /arm/grip"
-            )
-        return load(self._config).robot
-
-
-def _reach(
-    robot: Annotated[
-        str | None,
-        typer.Option(help="The robot, the first level of its topics; else the configuration's."),
-    ] = None,
-    host: HostOption = "localhost",
-    port: PortOption = None,
-    ca: CaOption = None,
-    cert: CertOption = None,
-    key: KeyOption = None,
-    user: UserOption = None,
-    password_file: ClientPasswordOption = None,
-    client_id: ClientIdOption = "",
-    mqtt_version: VersionOption = "5",
-    insecure: InsecureOption = False,
-    config: ConfigOption = None,
-) -> Reach:
-    target = connect_to(
-        config, host, port, ca, user, password_file, client_id, mqtt_version, insecure, cert, key
-    )
-    return Reach(target, robot, config)
-
-
-def _connecting(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of `_reach`, and what that returns in its first argument."""
-    _, *own = inspect.signature(command, eval_str=True).parameters.values()
-    options = inspect.signature(_reach, eval_str=True).parameters
-
-    def run(**given: Any) -> None:
-        reach = _reach(**{name: given.pop(name) for name in options})
-        command(reach, **given)
-
-    every = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*own, *options.values())]
-    run.__dict__["__signature__"] = inspect.Signature(every)
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    return run
 
 
 @contextmanager
@@ -110,7 +30,7 @@ def _caller(reach: Reach) -> Iterator[Caller]:
     from appliance.client import ClientError
 
     try:
-        caller = Caller(reach.target)
+        caller = Caller(reach.target())
         try:
             yield caller
         finally:
@@ -144,7 +64,7 @@ def _print(line: bytes) -> None:
     write_line(sys.stdout.buffer, line)
 
 
-@_connecting
+@connecting
 def call(
     reach: Reach,
     service: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
@@ -167,7 +87,7 @@ def call(
         _print(caller.call(topic, payload, timeout))
 
 
-@_connecting
+@connecting
 def goal(
     reach: Reach,
     action: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
@@ -235,7 +155,7 @@ ShownTimeout = Annotated[
 
 
 @param_app.command("get")
-@_connecting
+@connecting
 def param_get(
     reach: Reach,
     node: NodeArgument,
@@ -255,7 +175,7 @@ def param_get(
 
 
 @param_app.command("list")
-@_connecting
+@connecting
 def param_list(reach: Reach, node: NodeArgument, timeout: ShownTimeout = 3.0) -> None:
     """Print a node's parameters and their values, one a line.
 
@@ -278,7 +198,7 @@ def _not_shown(topic: str, timeout: float) -> str:
 
 
 @param_app.command("set")
-@_connecting
+@connecting
 def param_set(
     reach: Reach,
     node: NodeArgument,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.console import ConfigOption
+from appliance.commands.console import ConfigOption
 
 _COLOURS = {"ok": "green", "warning": "yellow", "problem": "red"}
 
@@ -18,8 +18,11 @@ def doctor(
     config: ConfigOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a finding.")] = False,
 ) -> None:
-    """Look at ports, clock, certificates, disk, ROS and all else that the appliance needs, change
-    nothing, and say what to do; exit code 1 when there is a problem."""
+    """Look at all that the appliance needs, change nothing, and say what to do.
+
+    At ports, clock, certificates, disk, permissions, memory and ROS. The exit
+    code is 1 when there is a problem.
+    """
     from appliance.doctor.examination import examine
 
     counts: Counter[str] = Counter()

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.console import CommandError, ConfigOption, load
+from appliance.commands.console import CommandError, ConfigOption, load
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from appliance.console import CommandError
+from appliance.commands.console import CommandError
 
 if TYPE_CHECKING:
     from appliance.install import Installation, Step
@@ -51,9 +51,10 @@ def install(
 ) -> None:
     """Make this a service that systemd keeps running; run again, it upgrades it.
 
-    The command goes to /usr/local/bin, configuration and keys to /etc/appliance, data to
-    /var/lib/appliance. What is there of configuration, keys and data is kept. If the new version
-    does not start, the one before runs on.
+    The command goes to /usr/local/bin, configuration and keys to
+    /etc/appliance, data to /var/lib/appliance. What is there of configuration,
+    keys and data is kept. If the new version does not start, the one before
+    runs on.
     """
     from appliance.access import AccessFileError
     from appliance.certs import CertificateError

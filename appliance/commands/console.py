@@ -1,0 +1,75 @@
+"""What the commands share: their errors, options that several have, and secrets that are typed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from appliance.config import Settings
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        "-c",
+        metavar="FILE",
+        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
+    ),
+]
+PasswordFileOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
+]
+GenerateOption = Annotated[
+    bool, typer.Option("--generate", help="Make a random password, and show it once.")
+]
+
+
+class CommandError(Exception):
+    """Told to the user as it is; the command ends with exit code 1."""
+
+
+def load(config: Path | None) -> Settings:
+    """The settings; CommandError when they cannot be used."""
+    from appliance.config import ConfigError
+    from appliance.config import load as load_settings
+
+    try:
+        return load_settings(config)
+    except ConfigError as error:
+        raise CommandError(f"the configuration cannot be used\n{error}") from None
+
+
+def new_password(whose: str, file: str | None, generate: bool) -> str:
+    """A password that is to be: made, read from a file or asked for, never on the command line."""
+    if generate and file:
+        raise typer.BadParameter("--generate and --password-file exclude each other")
+    if generate:
+        from appliance.init import generate_password
+
+        return generate_password()
+    if file:
+        return read_password(file)
+    if sys.stdin.isatty():
+        prompt = f"Password of {whose}"
+        password: str = typer.prompt(prompt, hide_input=True, confirmation_prompt=True)
+        return password
+    raise CommandError("no terminal to ask on; use --generate or --password-file")
+
+
+def read_password(file: str) -> str:
+    """The first line of the file; - is standard input."""
+    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
+    return text.split("\n", 1)[0].rstrip("\r")
+
+
+def shown(path: Path) -> str:
+    """The path as a user of this folder would type it."""
+    try:
+        return str(path.absolute().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,113 @@
+"""The command `appliance store`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.commands.console import CommandError, ConfigOption, load, shown
+
+store_app = typer.Typer(help="What outlives a restart.")
+
+
+@store_app.callback(invoke_without_command=True)
+def store_show(context: typer.Context, config: ConfigOption = None) -> None:
+    """What outlives a restart: sessions, what waits for them, retained messages."""
+    if context.invoked_subcommand is not None:
+        return
+    path = _store_path(config)
+    from datetime import datetime
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from appliance.config import format_size
+    from appliance.mqtt.codec import quote
+    from appliance.store import StoreError
+    from appliance.store.inspection import summarise
+
+    try:
+        summary = summarise(path)
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+    def when(moment: float | None) -> str:
+        return "" if moment is None else f"{datetime.fromtimestamp(moment):%Y-%m-%d %H:%M:%S}"
+
+    table = Table("client id", "user", "subscriptions", "messages", "bytes", "oldest", "ends")
+    for session in summary.sessions:
+        table.add_row(
+            escape(quote(session.client_id)),
+            "" if session.username is None else escape(quote(session.username)),
+            str(session.subscriptions),
+            str(session.messages),
+            str(session.size),
+            when(session.oldest),
+            when(session.ends_at) or "connected",
+        )
+    if summary.sessions:
+        Console().print(table)
+    typer.echo(
+        f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
+        f"{summary.retained_size} bytes; all {summary.messages} messages have "
+        f"{summary.payload_size} bytes, {shown(path)} has {format_size(summary.file_size)}"
+    )
+
+
+@store_app.command("export")
+def store_export(config: ConfigOption = None) -> None:
+    """Print all of it as JSON, one session or retained message a line."""
+    path = _store_path(config)
+    import json
+
+    from appliance.store import StoreError
+    from appliance.store.inspection import export
+
+    try:
+        for entry in export(path):
+            typer.echo(json.dumps(entry, ensure_ascii=False))
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+
+@store_app.command("prune")
+def store_prune(
+    older_than: Annotated[
+        str | None,
+        typer.Option(metavar="DURATION", help="Messages that wait for longer, such as 7 d."),
+    ] = None,
+    client: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Of this client only; else its whole session. Repeatable."),
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Delete sessions, or what has waited too long for them, while the appliance is stopped."""
+    if older_than is None and not client:
+        raise typer.BadParameter("say what: --older-than, --client, or both")
+    path = _store_path(config)
+    import sqlite3
+
+    from appliance.config import parse_duration
+    from appliance.store import StoreError
+    from appliance.store.inspection import prune
+
+    try:
+        age = None if older_than is None else parse_duration(older_than)
+    except ValueError as error:
+        raise typer.BadParameter(f"--older-than {error}") from None
+    try:
+        sessions, messages = prune(path, age, client or [])
+    except (StoreError, sqlite3.Error) as error:
+        raise CommandError(str(error)) from None
+    typer.echo(f"{sessions} sessions and {messages} messages deleted")
+
+
+def _store_path(config: Path | None) -> Path:
+    store = load(config).broker.store
+    if store.durability == "off":
+        raise CommandError("nothing is stored: broker.store.durability is off")
+    return store.path
