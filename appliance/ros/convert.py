@@ -40,7 +40,9 @@ from appliance.ros.definitions import (
     Sequence,
     String,
     TypeDescription,
+    UnknownTypeError,
     WideString,
+    may_be_large,
     select,
 )
 from appliance.ros.generate import MISFIT, Binary, generate, generate_binary
@@ -270,6 +272,7 @@ class Converters:
         self._load = load
         self._now = now
         self._converters: dict[tuple[str, tuple[str, ...]], Converter] = {}
+        self._large: dict[str, bool] = {}
 
     def get(self, type_name: str, fields: tuple[str, ...] = ()) -> Converter:
         """The converter of a type by its name, `std_msgs/msg/String`, or of some of its fields."""
@@ -279,6 +282,17 @@ class Converters:
             converter = Converter(self._load(type_name), self._now, fields)
             self._converters[type_name, fields] = converter
         return converter
+
+    def may_be_large(self, type_name: str) -> bool:
+        """Whether messages of the type can be pictures or the like; so can those of one that is not
+        known."""
+        known = self._large.get(type_name)
+        if known is None:
+            try:
+                known = self._large[type_name] = may_be_large(self._load(type_name))
+            except UnknownTypeError:  # it may be known later
+                return True
+        return known
 
 
 def _text_type(description: TypeDescription) -> Primitive | String | WideString | None:

@@ -150,6 +150,17 @@ class TypeDescription:
 ItemType = Primitive | String | WideString | TypeDescription
 FieldType = ItemType | Array | Sequence
 
+
+def may_be_large(type_: FieldType) -> bool:
+    """Whether it can hold any number of numbers, as a picture, a cloud of points or a map does."""
+    if isinstance(type_, TypeDescription):
+        return any(may_be_large(field.type) for field in type_.fields)
+    if isinstance(type_, Sequence):
+        is_open = type_.bound is None and isinstance(type_.item, Primitive)
+        return is_open or may_be_large(type_.item)
+    return isinstance(type_, Array) and may_be_large(type_.item)
+
+
 #: Some fields of a type by their names, and of these all (None) or some in turn.
 Selection: TypeAlias = "dict[str, Selection | None]"
 

@@ -263,7 +263,7 @@ class Flow(ABC):
         if not endpoints and self._wanted is not None and self._wanted[0] == type_name:
             return False  # they have left; all stays as it is for their return
         hashes = [endpoint.type_hash for endpoint in endpoints if endpoint.type_hash]
-        wanted = (type_name, self._choose_qos(endpoints), min(hashes, default=None))
+        wanted = (type_name, self._choose_qos(endpoints, type_name), min(hashes, default=None))
         before = self.bridged
         if wanted == self._wanted and (before is not None or self._problem is None):
             return False
@@ -342,7 +342,7 @@ class Flow(ABC):
         """The endpoints of other nodes that tell type and QoS."""
 
     @abstractmethod
-    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
+    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
         """The QoS to use with them."""
 
     @abstractmethod
@@ -408,8 +408,9 @@ class ToMqtt(Flow):
     def _find(self, node: RosNode) -> list[Endpoint]:
         return node.publishers(self.ros)
 
-    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
-        return subscription_qos(endpoints, self._lane.keep)
+    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
+        is_small = not self._converters.may_be_large(type_name)
+        return subscription_qos(endpoints, self._lane.keep, is_small=is_small)
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         self.close()
@@ -541,7 +542,7 @@ class ToRos(Flow):
             return node.publishers(self.ros)  # whoever is there knows the type
         return found
 
-    def _choose_qos(self, endpoints: list[Endpoint]) -> QosProfile:
+    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
         return publisher_qos(endpoints, self.settings.samples)
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:

@@ -9,15 +9,21 @@ from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
 #: ROS's own default, and enough for a reader that is fast.
 DEPTH = 10
 
+#: For messages that are small: a burst of them, or a second of 1 kHz in which nobody took any.
+BURST = 1000
+
 #: Publishers' depths add up to no more than this: a stalled reader holds so many samples.
 MAX_DEPTH = 100
 
 
-def subscription_qos(publishers: Sequence[Endpoint], keep: int = 1) -> QosProfile:
+def subscription_qos(
+    publishers: Sequence[Endpoint], keep: int = 1, *, is_small: bool = False
+) -> QosProfile:
     """What to subscribe with, to be matched with all of `publishers` and lose the least.
 
     Without publishers: best effort and volatile, which matches whatever appears. `keep` is how many
-    samples the route wants to queue; the middleware holds at least as many.
+    samples the route wants to queue; the middleware holds at least as many, and a burst of messages
+    of a type that `is_small`: what it has no room for is lost, whoever listens on MQTT.
     """
     reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
     latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
@@ -28,7 +34,7 @@ def subscription_qos(publishers: Sequence[Endpoint], keep: int = 1) -> QosProfil
     return QosProfile(
         Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,
         Durability.TRANSIENT_LOCAL if publishers and latched else Durability.VOLATILE,
-        max(keep, DEPTH, min(kept, MAX_DEPTH)),
+        max(keep, BURST if is_small else DEPTH, min(kept, MAX_DEPTH)),
     )
 
 

@@ -8,6 +8,7 @@ import json
 import logging
 import struct
 import time
+from dataclasses import replace
 
 import pytest
 from house import until
@@ -194,7 +195,7 @@ async def test_subscription_is_made_anew_when_publishers_change(house, caplog):
     caplog.set_level(logging.INFO, "appliance.ros")
     house.start(to_mqtt("/a", type=STRING))
     profiles = [house.node.subscriptions[0].endpoint.qos]
-    assert profiles == [BEST_EFFORT]  # matches whatever appears
+    assert profiles == [replace(BEST_EFFORT, depth=1000)]  # matches whatever appears
     reliable = house.node.add_publisher("/a", STRING)
     profiles.append(house.node.subscriptions[0].endpoint.qos)
     best_effort = house.node.add_publisher("/a", STRING, BEST_EFFORT)
@@ -212,7 +213,7 @@ async def test_subscription_is_made_anew_when_publishers_change(house, caplog):
     await house.settle()
     lines = [r.getMessage() for r in caplog.records if "/a →" in r.getMessage()]
     assert len(lines) == 3
-    assert "ROS reliable, volatile, depth 10; MQTT QoS 1" in lines[1]
+    assert "ROS reliable, volatile, depth 1000; MQTT QoS 1" in lines[1]
 
 
 async def test_a_publisher_replaced_between_two_looks_is_found(house):

@@ -704,6 +704,15 @@ def test_text_in_cdr_keeps_to_its_bound():
     assert converters.get("std_msgs/msg/String").checked(cdr) == cdr
 
 
+def test_types_whose_messages_may_be_large():
+    converters = Converters(load_description)
+    small = ("std_msgs/msg/String", "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseArray")
+    assert not any(map(converters.may_be_large, small))
+    large = ("sensor_msgs/msg/Image", "nav_msgs/msg/OccupancyGrid", "absent_msgs/msg/Absent")
+    assert all(map(converters.may_be_large, large))
+    assert converters.may_be_large("visualization_msgs/msg/MarkerArray")  # in what is in it
+
+
 def test_a_type_name_does_not_get_just_anything_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "broken_msgs" / "msg").mkdir(parents=True)

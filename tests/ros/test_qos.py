@@ -82,6 +82,12 @@ def test_depth_of_volatile_publishers_changes_nothing():
     assert subscription_qos(ends(QosProfile(depth=1), QosProfile(depth=50))).depth == 10
 
 
+def test_a_burst_of_small_messages_has_room():
+    found = ends(QosProfile(depth=1))
+    assert subscription_qos(found, is_small=True).depth == 1000
+    assert subscription_qos(found, 5000, is_small=True).depth == 5000
+
+
 def test_published_commands_are_kept_for_late_subscribers_only_where_one_asks():
     assert publisher_qos([]) == QosProfile(RELIABLE, VOLATILE, 10)
     volatile, latched = QosProfile(BEST_EFFORT, VOLATILE), QosProfile(RELIABLE, LATCHED)

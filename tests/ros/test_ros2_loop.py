@@ -177,18 +177,32 @@ async def test_two_threads_never_take_at_the_same_time(monkeypatch, taker, peer)
     assert given and set(itertools.accumulate(given)) == {0, 1}
 
 
-async def test_what_a_busy_loop_misses_is_counted(house, peer):
+async def bridged(house, peer, type_name):
     house.start(route("/a", "mqtt", "cdr"))
-    await peer.do("advertise", "/a", STRING)
+    await peer.do("advertise", "/a", type_name)
     await until(house.bridged, "/a")
     await peer.do("matched", "/a")
+
+
+async def test_a_burst_of_small_messages_is_carried_whole(house, peer):
+    await bridged(house, peer, STRING)
+    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 500, 5000))
+    await asyncio.sleep(0.01)
+    time.sleep(0.5)  # noqa: ASYNC251 - as before
+    await publishing
+    await until(lambda: len(house.payloads("r2d2/a")) == 500, "all")
+    assert house.bridge.status()[0].dropped == 0
+
+
+async def test_what_a_busy_loop_misses_is_counted(house, peer):
+    await bridged(house, peer, BYTES)  # which may be pictures: not many of them are held
     for _ in range(5):
-        publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 100, 2000))
+        publishing = asyncio.create_task(peer.do("publish_image", "/a", 10, 100, 2000))
         await asyncio.sleep(0.01)
         time.sleep(0.1)  # noqa: ASYNC251 - as before
         await publishing
-    await peer.do("publish", "/a", string("end").hex())
-    await until(lambda: string("end") in house.payloads("r2d2/a"), "the last")
+    await peer.do("publish_image", "/a", 100, 1, 2000)
+    await until(lambda: any(len(each) > 100 for each in house.payloads("r2d2/a")), "the last")
     arrived = len(house.payloads("r2d2/a"))
     assert arrived < 400
     assert house.bridge.status()[0].dropped == 501 - arrived
