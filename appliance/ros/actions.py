@@ -58,6 +58,8 @@ from appliance.ros.skips import Skip, Why
 log = logging.getLogger(__name__)
 
 SEND_GOAL = "/_action/send_goal"
+GET_RESULT = "/_action/get_result"
+CANCEL_GOAL = "/_action/cancel_goal"
 
 #: By the numbers of action_msgs/srv/CancelGoal.
 _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
@@ -177,10 +179,14 @@ class ActionRoutes:
 
     def follow(self) -> None:
         """Offer what is on the bus now."""
+        services = self._requests.services
+        # Until all is found that it is made of, the result of a goal could not be asked for.
         found = {
-            service.removesuffix(SEND_GOAL): [min(types).removesuffix("_SendGoal")]
-            for service, types in self._requests.services.items()
+            name: [min(types).removesuffix("_SendGoal")]
+            for service, types in services.items()
             if service.endswith(SEND_GOAL)
+            and (name := service.removesuffix(SEND_GOAL))
+            and {f"{name}{GET_RESULT}", f"{name}{CANCEL_GOAL}"} <= services.keys()
         }
         routes = list(self._counters)
 
@@ -365,8 +371,8 @@ class Action:
         """The services that it is made of."""
         if self.type is not None:
             yield f"{self.ros}{SEND_GOAL}", f"{self.type}_SendGoal"
-            yield f"{self.ros}/_action/get_result", f"{self.type}_GetResult"
-        yield f"{self.ros}/_action/cancel_goal", CANCEL
+            yield f"{self.ros}{GET_RESULT}", f"{self.type}_GetResult"
+        yield f"{self.ros}{CANCEL_GOAL}", CANCEL
 
     # Goals
 
@@ -470,7 +476,7 @@ class Action:
     async def _ask_result(self, goal: _Goal, type_name: str) -> tuple[str, bytes]:
         """What became of the goal, and the response of `get_result`. Raises CallError."""
         converter = self._converters.get(f"{type_name}_GetResult_Request")
-        service = f"{self.ros}/_action/get_result"
+        service = f"{self.ros}{GET_RESULT}"
         try:
             response = await self._requests.ask(
                 service,
@@ -563,7 +569,7 @@ class Action:
         request = self._converters.get(f"{CANCEL}_Request").from_dict(
             {"goal_info": {"goal_id": {"uuid": id_}, "stamp": stamp or {}}}
         )
-        response = await self._requests.ask(f"{self.ros}/_action/cancel_goal", CANCEL, request)
+        response = await self._requests.ask(f"{self.ros}{CANCEL_GOAL}", CANCEL, request)
         said = self._converters.get(f"{CANCEL}_Response").to_dict(response)
         canceling = [goals.id_of(info["goal_id"]).hex() for info in said["goals_canceling"]]
         if said["return_code"] in _NOT_CANCELLED:

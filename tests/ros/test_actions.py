@@ -130,12 +130,29 @@ async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
 
 async def test_a_server_that_ends_before_it_could_be_asked_for_the_result(house):
     walks, client = await begin(house)
+    walks.accepting = False
+    calling = asyncio.create_task(client.call(GOAL, {"order": 3}))
+    await until(lambda: walks.late, "the goal")
     walks.services[1].remove()
-    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    walks.late.pop()({"accepted": True})
+    goal = (await calling)[1]["goal_id"]
     house.node.spin()
     await until(lambda: results(client), "the result")
     (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
+
+
+@pytest.mark.parametrize("part", ["send_goal", "get_result", "cancel_goal"])
+async def test_an_action_is_there_when_all_of_it_is(house, part):
+    walks, client = await begin(house)
+    (missing,) = (service for service in walks.services if service.name.endswith(part))
+    missing.remove()
+    await asyncio.sleep(0)
+    code, why = await client.error(GOAL, {"order": 3})
+    assert (code, why) == ("unavailable", "there is no action /walk on the bus")
+    house.node.add_service(missing.name, missing.type, missing.handler)
+    await asyncio.sleep(0)
+    assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
 async def test_ros_ends_while_goals_are_under_way(house):

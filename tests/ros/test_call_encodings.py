@@ -517,7 +517,7 @@ async def test_parameters_in_cbor(house):
         (
             b"\0\1\0\0",
             "application/cdr",
-            "a call of /arm's parameters may be json or cbor, not cdr",
+            "a call of the parameters of /arm may be json or cbor, not cdr",
         ),
     ):
         status, answer = await ask(client, "r2d2/arm/_param/speed/set", payload, said)

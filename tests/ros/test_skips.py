@@ -130,6 +130,15 @@ async def test_topics(house):
     assert skipped(house) == {}
 
 
+def action_of(name, kind):
+    """The services of an action, and their types."""
+    return (
+        (f"{name}/_action/send_goal", f"{kind}_SendGoal"),
+        (f"{name}/_action/get_result", f"{kind}_GetResult"),
+        (f"{name}/_action/cancel_goal", "action_msgs/srv/CancelGoal"),
+    )
+
+
 async def test_what_is_called(house):
     node = house.node
     house.start(
@@ -146,8 +155,8 @@ async def test_what_is_called(house):
         ("/odd", "acme_srvs/srv/Odd"),
         ("/trigger", TRIGGER),
         ("/arm/get_parameters", "rcl_interfaces/srv/GetParameters"),
-        ("/walk/_action/send_goal", "test_msgs/action/Fibonacci_SendGoal"),
-        ("/walk_far/_action/send_goal", "test_msgs/action/Far_SendGoal"),
+        *action_of("/walk", "test_msgs/action/Fibonacci"),
+        *action_of("/walk_far", "test_msgs/action/Far"),
     ):
         node.add_service(name, kind, lambda request, respond: None)
     await look(house)
