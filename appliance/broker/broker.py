@@ -668,6 +668,11 @@ class Broker:
             overflowed.pop().close_link(
                 ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
             )
+        if not self.unflushed:
+            # Such as a retained message of the bridge's that had to queue: what a client is sent
+            # later does not depend on it.
+            self.store.fresh = False
+            return
         while self.unflushed:  # what was written makes room for what waited
             outputs = self.unflushed
             self.unflushed = []

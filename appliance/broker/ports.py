@@ -170,7 +170,8 @@ class Store(Protocol):
     What depends on a change is sent only when its batch is committed.
     """
 
-    #: True while there are changes that something may depend on, and that are not committed.
+    #: True while there are changes that something may depend on, and that are not committed, or
+    #: somebody waits for a batch, whatever is in it.
     staged: bool
 
     #: True when such a change was staged since this was last set to False.

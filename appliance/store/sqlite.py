@@ -306,6 +306,8 @@ class SqliteStore:
     def hurry(self) -> None:
         """See `Store`."""
         self._urgent = True
+        # Nothing passes what waits, also when nothing was staged in the batch that it waits for.
+        self.staged = not self._failing
         if self._running and not self._writing and not self._failing:
             self._hand_over()
 

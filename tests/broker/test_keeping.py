@@ -59,6 +59,25 @@ def test_nothing_passes_what_waits(join: Join, store: FakeStore):
     publisher.only(Puback)
 
 
+def test_who_makes_room_does_not_wait_for_what_was_retained_meanwhile(
+    broker: Broker, join: Join, store: FakeStore
+):
+    """Rule 2: what the bridge retains, while a subscriber's window is full, is not its matter."""
+    subscriber, inside = join("subscriber"), broker.attach("inside", FakeLink())
+    subscriber.subscribe("a", 1)
+    window = broker.limits.inflight
+    for number in range(window + 1):
+        broker.publish(Message("a", b"%d" % number, 1), inside)
+    broker.flush()
+    sent = subscriber.messages()
+    assert len(sent) == window
+    store.holding = True
+    broker.publish(Message("b", b"x", 1, True), inside)
+    broker.flush()
+    subscriber.send(Puback(sent[0].packet_id))
+    assert subscriber.payloads() == [b"%d" % window]
+
+
 def test_a_failed_commit_closes_the_connections_concerned(join: Join, store: FakeStore):
     """Rule 2: without an acknowledgement"""
     subscriber, publisher = held_back(join, store)

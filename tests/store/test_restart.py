@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 from broker.conftest import Peer, check_accounts, lasting
+from broker.test_broker import FakeLink
 
+from appliance.broker.message import Message
 from appliance.broker.ports import Limits
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
@@ -291,6 +293,34 @@ async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:
     publisher.publish("$SYS/x", qos=0, retain=True)
     assert len(client.drain()) == 2
     assert not house.store._open and house.store.commits == commits and not house.store.staged
+
+
+async def test_nothing_passes_what_waits_for_a_batch_in_which_there_is_nothing(
+    house: House,
+) -> None:
+    """[MQTT-4.6.0-6]: a client may be held to depend on more than it does."""
+    store, broker = house.store, house.broker
+    client, inside = await house.join("client"), broker.attach("inside", FakeLink())
+    client.send(Subscribe(1, [Subscription("a", 1)]))
+    client.received()
+    for number in range(house.limits.inflight + 1):
+        broker.publish(Message("a", b"%d" % number, 1), inside)
+    broker.flush()
+    sent = client.messages()
+    await house.written()
+    broker.publish(Message("b", b"x", 1, True), inside)
+    store.hurry()  # and the batch is closed that this is in
+    client.send(*(Puback(message.packet_id) for message in sent))
+    assert client.received() == []
+    batch = store.batch
+    for _ in range(1000):
+        if store.committed >= batch - 1:
+            break
+        await asyncio.sleep(0)
+    broker.publish(Message("a", b"last", 1), inside)
+    broker.flush()
+    await house.written()
+    assert client.payloads() == [b"4", b"last"]
 
 
 async def test_a_payload_is_stored_once(house: House) -> None:
