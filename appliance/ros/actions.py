@@ -51,6 +51,7 @@ from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps
+from appliance.ros.qos import BURST
 from appliance.ros.requests import Key, Requests
 from appliance.ros.services import from_ros, to_request
 from appliance.ros.skips import Skip, Why
@@ -649,7 +650,7 @@ class Action:
             self._subscriptions.append(own)
             on_feedback = partial(self._on_feedback, f"{type_name}_Feedback")
             own = node.subscribe_raw(
-                feedback, f"{type_name}_FeedbackMessage", QosProfile(), on_feedback
+                feedback, f"{type_name}_FeedbackMessage", QosProfile(depth=BURST), on_feedback
             )
             self._subscriptions.append(own)
         except (BusError, UnknownTypeError) as error:

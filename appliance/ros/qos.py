@@ -12,6 +12,10 @@ DEPTH = 10
 #: For messages that are small: a burst of them, or a second of 1 kHz in which nobody took any.
 BURST = 1000
 
+#: For requests and answers: many clients may wait for theirs at the same time. With ROS's own depth
+#: of 10, what comes on top of these is lost, and who asked waits in vain.
+CALLS = QosProfile(depth=BURST)
+
 #: Publishers' depths add up to no more than this: a stalled reader holds so many samples.
 MAX_DEPTH = 100
 

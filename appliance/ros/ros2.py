@@ -36,6 +36,7 @@ from appliance.ros.node import (
     RosSubscription,
     TakeLot,
 )
+from appliance.ros.qos import CALLS
 from appliance.ros.reach import Reach, look_again, reach
 from appliance.ros.ros2_loop import (
     FIRST_TIMED,
@@ -397,7 +398,7 @@ class Ros2Node:
     def create_client(self, service: str, type_name: str) -> _Client:
         service_class = import_service(type_name)
         with _as_bus_error():
-            own = self._node.create_client(service_class, service)
+            own = self._node.create_client(service_class, service, qos_profile=_to_rclpy(CALLS))
         return _Client(self._node, own, service_class)
 
     def create_service(
@@ -497,7 +498,9 @@ class _Service:
         self._callback = callback
         self._deserialize, self._serialize = deserialize_message, serialize_message
         with _as_bus_error():
-            self._own = node.create_service(service_class, name, lambda request, _: request)
+            self._own = node.create_service(
+                service_class, name, lambda request, _: request, qos_profile=_to_rclpy(CALLS)
+            )
         # The executor sends what the callback returns. To answer later, or not at all, without
         # a coroutine that the executor would keep for ever, its way out is taken over.
         self._send = self._own.send_response

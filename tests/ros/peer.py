@@ -18,6 +18,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import SetBool
 
 
 def load(type_name):
@@ -76,6 +77,35 @@ class Peer:
 
         qos = profile(reliability, durability)
         self.node.create_subscription(load(type_name), topic, received, qos, raw=True)
+
+    def gather(self, service, count):
+        """Offer a std_srvs/srv/SetBool that answers when so many have asked, and all at once."""
+        asked = []
+
+        def answer(response, header):
+            asked.append((response, header))
+            if len(asked) == count:
+                time.sleep(0.1)  # whoever has asked waits by now
+                for response, header in asked:
+                    send(response, header)
+
+        own = self.node.create_service(
+            SetBool, service, self._echo, qos_profile=QoSProfile(depth=count)
+        )
+        send, own.send_response = own.send_response, answer
+
+    def _echo(self, request, response):
+        response.success = request.data
+        return response
+
+    def ask(self, service, count):
+        """Call a std_srvs/srv/SetBool so often in one go; each answer is told as received."""
+        client = self.node.create_client(SetBool, service, qos_profile=QoSProfile(depth=count))
+        if not client.wait_for_service(10):
+            raise TimeoutError(f"there is no {service}")
+        for _ in range(count):
+            future = client.call_async(SetBool.Request())
+            future.add_done_callback(lambda done: say("received", service, done.result().message))
 
 
 def main():

@@ -30,6 +30,7 @@ DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing
 DEADLINE = 15.0
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 BYTES = "std_msgs/msg/UInt8MultiArray"
+SET_BOOL = "std_srvs/srv/SetBool"
 
 
 @pytest.fixture(autouse=True)
@@ -120,6 +121,54 @@ async def test_no_request_ends_the_thread():
     await until(lambda: told[-1] == "still there" or failures, "what comes behind a fault")
     assert failures == []
     await asyncio.to_thread(node.stop)
+
+
+@contextlib.asynccontextmanager
+async def looking(look):
+    """A node that does so on its thread, again and again; it is not to end before its time."""
+    node, failures = ros2.Ros2Node(), []
+    node.start(lambda: look(node), failures.append)
+    try:
+        yield
+        assert failures == []
+    finally:
+        await asyncio.to_thread(node.stop)
+
+
+async def test_many_answers_at_once_all_arrive(peer):
+    await peer.do("gather", "/gather", 200)
+    clients, answers = [], []
+
+    def look(node):
+        if not clients:
+            clients.append(node.create_client("/gather", SET_BOOL))
+        elif len(clients) == 1 and clients[0].is_ready():
+            clients.append(None)
+            for number in range(200):
+                clients[0].call(b"\0\1\0\0" + bytes([number % 2]), answers.append)
+
+    async with looking(look):
+        await until(lambda: len(answers) == 200, "all answers")
+    assert sum(answer[4] for answer in answers) == 100
+
+
+async def test_many_requests_at_once_all_arrive(peer):
+    services, requests = [], []
+
+    def respond(request, answer):
+        if not requests:
+            time.sleep(0.3)  # they come while nobody takes them
+        requests.append(request)
+        answer(b"\0\1\0\0\1\0\0\0\3\0\0\0ok\0")
+
+    def look(node):
+        if not services:
+            services.append(node.create_service("/offered", SET_BOOL, respond))
+
+    async with looking(look):
+        await peer.do("ask", "/offered", 200)
+        await until(lambda: len(peer.received) == 200, "all answers")
+    assert len(requests) == 200
 
 
 async def test_names_that_only_dds_takes_are_passed_over():
