@@ -202,6 +202,11 @@ bridge:
     ("route", "problem"),
     [
         ("to: mqtt, expire: 1 s", ".expire: is for routes to ROS only"),
+        ("to: ros, rate: 10", ".rate: is for routes to MQTT only"),
+        ("to: ros, bytes_per_second: 1 KiB", ".bytes_per_second: is for routes to MQTT only"),
+        ("to: ros, qos: 0", ".qos: is for routes to MQTT only"),
+        ("to: ros, retain: false", ".retain: is for routes to MQTT only"),
+        ("to: ros, fields: [x]", ".fields: is for routes to MQTT only"),
         ("to: ros, lease: 1 s", ".lease: needs exclusive: true"),
         ("to: ros, clamp: {x: 3}", ".clamp: x must have its least and its most"),
         ("to: ros, clamp: {x: [.nan, 1]}", ".clamp: x must have its least before its most"),
@@ -228,6 +233,17 @@ def test_routes_take_what_they_do_not_say_from_the_defaults() -> None:
         ("cdr", None, None, 3),
     ]
     assert routes[0].topic("r2d2") == "r2d2/a"
+
+
+def test_routes_to_ros_take_nothing_that_is_of_mqtt() -> None:
+    text = (
+        "bridge: {defaults: {rate: 5, encoding: cdr, retain: true, keep: 7}, "
+        "topics: [{ros: /a, to: ros, qos: auto}]}"
+    )
+    (route,) = loads(text).bridge.topics
+    assert (route.encoding, route.keep, route.rate, route.retain) == ("cdr", 7, None, None)
+    again = config.loads(yaml.safe_dump(config.describe(loads(text))), HERE)
+    assert again.bridge.topics == [route]
 
 
 def test_the_same_way_twice_is_a_mistake() -> None:

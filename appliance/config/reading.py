@@ -144,6 +144,9 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
                 yield ("bridge", "topics", number, key), "is for routes to ROS only"
         elif "lease" in route.command_keys and not route.exclusive:
             yield ("bridge", "topics", number, "lease"), "needs exclusive: true beside it"
+        if route.to == "ros":
+            for key in route.mqtt_keys:
+                yield ("bridge", "topics", number, key), "is for routes to MQTT only"
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)

@@ -79,6 +79,9 @@ COMMAND_KEYS = (
 )
 """The keys of a route that say when a command may reach ROS, and with what in it."""
 
+MQTT_KEYS = ("fields", "rate", "bytes_per_second", "qos", "retain")
+"""Those that say what is published on MQTT, and have no meaning on the way to ROS."""
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -303,8 +306,16 @@ class TopicRoute(RouteDefaults, Route):
     @property
     def command_keys(self) -> list[str]:
         """Those of COMMAND_KEYS that say something else than their default."""
+        return self._said(COMMAND_KEYS)
+
+    @property
+    def mqtt_keys(self) -> list[str]:
+        """Those of MQTT_KEYS that do."""
+        return self._said(MQTT_KEYS)
+
+    def _said(self, keys: tuple[str, ...]) -> list[str]:
         fields = TopicRoute.model_fields
-        return [key for key in COMMAND_KEYS if getattr(self, key) != fields[key].default]
+        return [key for key in keys if getattr(self, key) != fields[key].default]
 
 
 class _CalledRoute(Route):
@@ -383,14 +394,12 @@ class Bridge(_Section):
         if defaults is None:  # they are wrong themselves, and that is told
             return topics
         shared = {name: getattr(defaults, name) for name in RouteDefaults.model_fields}
-        return [
-            route
-            if route.is_exclusion
-            else route.model_copy(
-                update={k: v for k, v in shared.items() if k not in route.model_fields_set}
-            )
-            for route in topics
-        ]
+
+        def completed(route: TopicRoute) -> TopicRoute:
+            own = {*route.model_fields_set, *(MQTT_KEYS if route.to == "ros" else ())}
+            return route.model_copy(update={k: v for k, v in shared.items() if k not in own})
+
+        return [route if route.is_exclusion else completed(route) for route in topics]
 
 
 class Log(_Section):
