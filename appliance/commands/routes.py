@@ -13,7 +13,7 @@ from appliance.commands.console import CommandError, ConfigOption, load
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
-FIGURES = ("HZ", "BYTES", "LOST", "SLOW", "THROTTLED", "ERRORS", "MS")
+FIGURES = ("HZ", "BYTES", "LOST", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
 
 #: In the summary, by what `why` says.
 WHY = {
@@ -70,11 +70,13 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
     if way not in ARROWS:  # services, actions and parameters have no figures
         return about
     latency = entry["latency_ms"]
-    counts = (entry[key] for key in ("size", "dropped", "skipped", "throttled", "errors"))
+    counts = (entry[key] for key in ("size", "dropped", "skipped", "throttled"))
     return (
         *about,
         f"{entry['rate']:g}",
         *map(str, counts),
+        str(entry["expired"] + entry["refused"]),
+        str(entry["errors"]),
         f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
     )
 

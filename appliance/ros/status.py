@@ -23,7 +23,8 @@ class TopicStatus:
     """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
 
     `rate` is in messages a second, `size` the mean payload in bytes, `latency_ms` from the
-    publisher on ROS to the broker, None while none was measured. Counts are since the topic came.
+    publisher on ROS to the broker, None while none was measured. Counts are since the topic came, and
+    those that `Counters` has.
     """
 
     ros: str
@@ -38,6 +39,8 @@ class TopicStatus:
     throttled: int
     skipped: int
     errors: int
+    expired: int
+    refused: int
     latency_ms: LatencyStatus | None
 
 
@@ -85,6 +88,8 @@ def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
         counters.throttled,
         counters.skipped,
         counters.errors,
+        counters.expired,
+        counters.refused,
         latency_status(counters.latency),
     )
 

@@ -161,6 +161,7 @@ async def test_message_expiry(house):
     driver.drive(properties={Property.MESSAGE_EXPIRY_INTERVAL: 0})
     assert house.robot.received == [twist(0.5)]
     assert house.counters().expired == 1
+    assert [topic.expired for topic in house.bridge.topics()] == [1]
 
 
 async def test_what_is_sent_again_is_old(house):
@@ -277,6 +278,8 @@ async def test_one_client_at_a_time(house, caplog):
     old.drive(b'{"linear":{"x":9}}')  # 3.1.1 and QoS 0 cannot be told
     assert house.robot.received == [twist(0.5)]
     assert house.counters().refused == 2
+    (topic,) = house.bridge.topics()
+    assert (topic.messages, topic.refused, topic.errors) == (1, 2, 0)
     assert "client 'a' (user 'user') commands /cmd_vel, and the route is exclusive" in caplog.text
     # For as long as it goes on.
     for _ in range(4):
