@@ -51,6 +51,7 @@ from appliance.ros.payloads import (
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 from appliance.ros.rules import CommandRules
 from appliance.ros.skips import Skip, Why
+from appliance.ros.transforms import TYPES, StaticTransforms
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 
@@ -395,6 +396,7 @@ class ToMqtt(Flow):
         self._budget_at = 0.0
         self._subscription: RosSubscription | None = None
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
+        self._transforms: StaticTransforms | None = None
         self._topic_wire = encode_string(self.mqtt)
         #: The properties of the last message, most often those of the next, and their bytes.
         self._properties: Properties = {}
@@ -422,10 +424,14 @@ class ToMqtt(Flow):
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        self._pack = packer(converter, settings.encoding, settings.compression, about)
+        self._pack = pack = packer(converter, settings.encoding, settings.compression, about)
         wanted_qos, wanted_retain = settings.qos, settings.retain
         self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
         self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        if type_name in TYPES and self._retain and mqtt_retain(qos):
+            known = self._transforms or StaticTransforms(self._converters.get(type_name))
+            self._transforms = known
+            self._pack = lambda cdr: pack(known.add(cdr))
         self._subscription = node.subscribe_raw(
             self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
         )
@@ -439,7 +445,7 @@ class ToMqtt(Flow):
 
     def lost(self) -> None:
         super().lost()
-        self._subscription = None
+        self._subscription = self._transforms = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
         """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""

@@ -23,7 +23,10 @@ from std_srvs.srv import SetBool
 
 def load(type_name):
     package, _, name = type_name.split("/")
-    return getattr(import_module(f"{package}.msg"), name)
+    try:
+        return getattr(import_module(f"{package}.msg"), name)
+    except ImportError:  # there is no more than its definition
+        return import_module("appliance.ros.ros2").load_message(type_name)
 
 
 def profile(reliability, durability):

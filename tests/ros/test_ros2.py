@@ -21,6 +21,7 @@ from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros import installation, ros2
 from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.ros.convert import compile_converter
 from appliance.ros.node import BusError, QosProfile
 from appliance.store import MemoryStore
 
@@ -30,6 +31,7 @@ DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing
 DEADLINE = 15.0
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 BYTES = "std_msgs/msg/UInt8MultiArray"
+TF = "tf2_msgs/msg/TFMessage"
 SET_BOOL = "std_srvs/srv/SetBool"
 
 
@@ -329,6 +331,43 @@ async def test_latched_samples_are_retained(house, peer):
     retained = house.broker.retained
     await until(lambda: (m := retained.get("r2d2/map")) and m.payload == b"new", "the new map")
     assert house.received[-1][1] == 1
+
+
+async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, tmp_path):
+    folder = tmp_path / "share/tf2_msgs/msg"
+    folder.mkdir(parents=True)
+    (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{sys.prefix}")
+    converter = compile_converter(ros2.describe(ros2.load_message(TF), ros2.load_message))
+
+    def transform(child, x):
+        return {"child_frame_id": child, "transform": {"translation": {"x": x}}}
+
+    async def publish(peer, *transforms):
+        cdr = converter.from_dict({"transforms": transforms})
+        await peer.do("publish", "/tf_static", cdr.hex())
+
+    def retained():
+        message = house.broker.retained.get("r2d2/tf_static")
+        return message and {
+            each["child_frame_id"]: each["transform"]["translation"]["x"]
+            for each in json.loads(message.payload)["transforms"]
+        }
+
+    peers = [await Peer().start(name) for name in ("base", "lidar")]
+    try:
+        for peer in peers:
+            await peer.do("advertise", "/tf_static", TF, "reliable", "transient_local")
+        await publish(peers[0], transform("base", 1.0), transform("wheel", 2.0))
+        await publish(peers[1], transform("lidar", 3.0))
+        house.start(route("/tf_static", "mqtt"))
+        everything = {"base": 1.0, "wheel": 2.0, "lidar": 3.0}
+        await until(lambda: retained() == everything, "the transforms of both")
+        await publish(peers[0], transform("wheel", 4.0))
+        await until(lambda: retained() == everything | {"wheel": 4.0}, "the one that has changed")
+    finally:
+        for peer in peers:
+            await peer.stop()
 
 
 async def test_publishers_that_change_are_followed(house, peer):
