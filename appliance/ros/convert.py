@@ -36,13 +36,14 @@ from appliance.ros import cbor
 from appliance.ros.careful import ConversionError, accept, decode, pick
 from appliance.ros.definitions import (
     PRIMITIVES,
+    Bulk,
     Primitive,
     Sequence,
     String,
     TypeDescription,
     UnknownTypeError,
     WideString,
-    may_be_large,
+    bulk,
     select,
 )
 from appliance.ros.generate import MISFIT, Binary, generate, generate_binary
@@ -272,7 +273,7 @@ class Converters:
         self._load = load
         self._now = now
         self._converters: dict[tuple[str, tuple[str, ...]], Converter] = {}
-        self._large: dict[str, bool] = {}
+        self._bulk: dict[str, Bulk] = {}
 
     def get(self, type_name: str, fields: tuple[str, ...] = ()) -> Converter:
         """The converter of a type by its name, `std_msgs/msg/String`, or of some of its fields."""
@@ -283,15 +284,14 @@ class Converters:
             self._converters[type_name, fields] = converter
         return converter
 
-    def may_be_large(self, type_name: str) -> bool:
-        """Whether messages of the type can be pictures or the like; so can those of one that is not
-        known."""
-        known = self._large.get(type_name)
+    def bulk(self, type_name: str) -> Bulk:
+        """What can make messages of the type large; bytes, if it is not known."""
+        known = self._bulk.get(type_name)
         if known is None:
             try:
-                known = self._large[type_name] = may_be_large(self._load(type_name))
+                known = self._bulk[type_name] = bulk(self._load(type_name))
             except UnknownTypeError:  # it may be known later
-                return True
+                return Bulk.BYTES
         return known
 
 

@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -151,14 +152,22 @@ ItemType = Primitive | String | WideString | TypeDescription
 FieldType = ItemType | Array | Sequence
 
 
-def may_be_large(type_: FieldType) -> bool:
-    """Whether it can hold any number of numbers, as a picture, a cloud of points or a map does."""
+class Bulk(IntEnum):
+    """What can make messages of a type large: any number of numbers, as a scan or the states of
+    joints have, or of bytes, as a picture, a cloud of points or a map."""
+
+    NOTHING = 0
+    NUMBERS = 1
+    BYTES = 2
+
+
+def bulk(type_: FieldType) -> Bulk:
+    """What can make such values large."""
     if isinstance(type_, TypeDescription):
-        return any(may_be_large(field.type) for field in type_.fields)
-    if isinstance(type_, Sequence):
-        is_open = type_.bound is None and isinstance(type_.item, Primitive)
-        return is_open or may_be_large(type_.item)
-    return isinstance(type_, Array) and may_be_large(type_.item)
+        return max((bulk(field.type) for field in type_.fields), default=Bulk.NOTHING)
+    if isinstance(type_, Sequence) and type_.bound is None and isinstance(type_.item, Primitive):
+        return Bulk.BYTES if type_.item.size == 1 else Bulk.NUMBERS
+    return bulk(type_.item) if isinstance(type_, (Array, Sequence)) else Bulk.NOTHING
 
 
 #: Some fields of a type by their names, and of these all (None) or some in turn.

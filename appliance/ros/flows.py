@@ -411,8 +411,7 @@ class ToMqtt(Flow):
         return node.publishers(self.ros)
 
     def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
-        is_small = not self._converters.may_be_large(type_name)
-        return subscription_qos(endpoints, self._lane.keep, is_small=is_small)
+        return subscription_qos(endpoints, self._lane.keep, self._converters.bulk(type_name))
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         self.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from appliance.ros.definitions import Bulk
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
 
 #: ROS's own default, and enough for a reader that is fast.
@@ -11,6 +12,9 @@ DEPTH = 10
 
 #: For messages that are small: a burst of them, or a second of 1 kHz in which nobody took any.
 BURST = 1000
+
+#: What a subscription has room for, by what can make its messages large.
+ROOM = {Bulk.NOTHING: BURST, Bulk.NUMBERS: 100, Bulk.BYTES: DEPTH}
 
 #: For requests and answers: many clients may wait for theirs at the same time. With ROS's own depth
 #: of 10, what comes on top of these is lost, and who asked waits in vain.
@@ -21,13 +25,13 @@ MAX_DEPTH = 100
 
 
 def subscription_qos(
-    publishers: Sequence[Endpoint], keep: int = 1, *, is_small: bool = False
+    publishers: Sequence[Endpoint], keep: int = 1, bulk: Bulk = Bulk.BYTES
 ) -> QosProfile:
     """What to subscribe with, to be matched with all of `publishers` and lose the least.
 
     Without publishers: best effort and volatile, which matches whatever appears. `keep` is how many
     samples the route wants to queue; the middleware holds at least as many, and a burst of messages
-    of a type that `is_small`: what it has no room for is lost, whoever listens on MQTT.
+    as far as their `bulk` allows: what it has no room for is lost, whoever listens on MQTT.
     """
     reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
     latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
@@ -38,7 +42,7 @@ def subscription_qos(
     return QosProfile(
         Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,
         Durability.TRANSIENT_LOCAL if publishers and latched else Durability.VOLATILE,
-        max(keep, BURST if is_small else DEPTH, min(kept, MAX_DEPTH)),
+        max(keep, ROOM[bulk], min(kept, MAX_DEPTH)),
     )
 
 

@@ -23,8 +23,8 @@ class TopicStatus:
     """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
 
     `rate` is in messages a second, `size` the mean payload in bytes, `latency_ms` from the
-    publisher on ROS to the broker, None while none was measured. Counts are since the topic came, and
-    those that `Counters` has.
+    publisher on ROS to the broker, None while none was measured. Counts are since the topic came;
+    for what is counted see `Counters`.
     """
 
     ros: str

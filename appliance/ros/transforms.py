@@ -1,4 +1,4 @@
-"""Static transforms, which several nodes latch on one topic, for MQTT, which retains one message."""
+"""Static transforms of several nodes that latch on one topic, of which MQTT retains one message."""
 
 from __future__ import annotations
 

@@ -23,6 +23,7 @@ from appliance.ros.definitions import (
     PRIMITIVES,
     TIME,
     Array,
+    Bulk,
     Field,
     Sequence,
     String,
@@ -704,13 +705,19 @@ def test_text_in_cdr_keeps_to_its_bound():
     assert converters.get("std_msgs/msg/String").checked(cdr) == cdr
 
 
-def test_types_whose_messages_may_be_large():
+@pytest.mark.parametrize(
+    ("bulk", "types"),
+    [
+        (Bulk.NOTHING, ["std_msgs/String", "sensor_msgs/Imu", "geometry_msgs/PoseArray"]),
+        (Bulk.NUMBERS, ["sensor_msgs/JointState", "sensor_msgs/Joy", "sensor_msgs/LaserScan"]),
+        (Bulk.NUMBERS, ["trajectory_msgs/JointTrajectory"]),  # in what is in it
+        (Bulk.BYTES, ["sensor_msgs/Image", "nav_msgs/OccupancyGrid", "absent_msgs/Absent"]),
+        (Bulk.BYTES, ["visualization_msgs/MarkerArray"]),  # as well
+    ],
+)
+def test_what_can_make_messages_large(bulk, types):
     converters = Converters(load_description)
-    small = ("std_msgs/msg/String", "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseArray")
-    assert not any(map(converters.may_be_large, small))
-    large = ("sensor_msgs/msg/Image", "nav_msgs/msg/OccupancyGrid", "absent_msgs/msg/Absent")
-    assert all(map(converters.may_be_large, large))
-    assert converters.may_be_large("visualization_msgs/msg/MarkerArray")  # in what is in it
+    assert {converters.bulk(name.replace("/", "/msg/")) for name in types} == {bulk}
 
 
 def test_a_type_name_does_not_get_just_anything_imported(tmp_path, monkeypatch):

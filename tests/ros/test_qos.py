@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from appliance.ros.definitions import Bulk
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 
@@ -82,10 +83,12 @@ def test_depth_of_volatile_publishers_changes_nothing():
     assert subscription_qos(ends(QosProfile(depth=1), QosProfile(depth=50))).depth == 10
 
 
-def test_a_burst_of_small_messages_has_room():
+def test_a_burst_has_room_as_far_as_messages_are_small():
     found = ends(QosProfile(depth=1))
-    assert subscription_qos(found, is_small=True).depth == 1000
-    assert subscription_qos(found, 5000, is_small=True).depth == 5000
+    assert subscription_qos(found, 1, Bulk.NOTHING).depth == 1000
+    assert subscription_qos(found, 5000, Bulk.NOTHING).depth == 5000
+    assert subscription_qos(found, 1, Bulk.NUMBERS).depth == 100
+    assert subscription_qos(found, 1, Bulk.BYTES).depth == 10
 
 
 def test_published_commands_are_kept_for_late_subscribers_only_where_one_asks():

@@ -14,8 +14,12 @@ pytest.importorskip("rclpy")
 from test_ros2 import BYTES, STRING, domain, house, peer, route, string, until
 
 from appliance.ros import ros2, ros2_loop
+from appliance.ros.convert import compile_converter
+from appliance.ros.definitions import load_description
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import QosProfile
+
+JOINTS = "sensor_msgs/msg/JointState"
 
 __all__ = ["domain", "house", "peer"]  # fixtures
 
@@ -191,6 +195,17 @@ async def test_a_burst_of_small_messages_is_carried_whole(house, peer):
     time.sleep(0.5)  # noqa: ASYNC251 - as before
     await publishing
     await until(lambda: len(house.payloads("r2d2/a")) == 500, "all")
+    assert house.bridge.status()[0].dropped == 0
+
+
+async def test_a_burst_of_the_states_of_joints_is_carried_whole(house, peer):
+    await bridged(house, peer, JOINTS)
+    cdr = compile_converter(load_description(JOINTS)).from_dict({"position": [0.5] * 7})
+    publishing = asyncio.create_task(peer.do("publish", "/a", cdr.hex(), 90, 5000))
+    await asyncio.sleep(0.01)
+    time.sleep(0.3)  # noqa: ASYNC251 - as before
+    await publishing
+    await until(lambda: len(house.payloads("r2d2/a")) == 90, "all")
     assert house.bridge.status()[0].dropped == 0
 
 
