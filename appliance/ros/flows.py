@@ -62,6 +62,9 @@ REPORT_INTERVAL = 60.0
 ECHO_TIME = 2.0
 ECHO_SAMPLES = 1000
 
+#: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
+QUIET = 1.0
+
 _TURNS = itertools.count()
 
 
@@ -394,6 +397,10 @@ class ToMqtt(Flow):
         #: Bytes that may be sent now; fewer than none when a message was larger than that.
         self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
         self._budget_at = 0.0
+        #: The newest of those that were above these, and when it came. For both threads, of which
+        #: one at a time lets a message in.
+        self._held: tuple[bytes, float] | None = None
+        self._admission = threading.Lock()
         self._subscription: RosSubscription | None = None
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._transforms: StaticTransforms | None = None
@@ -437,14 +444,20 @@ class ToMqtt(Flow):
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
     def close(self) -> None:
-        self.bridged = None
+        self.bridged = self._held = None
         if self._subscription is not None:
             self._subscription.destroy()
             self._subscription = None
 
+    def look(self, node: RosNode, thorough: bool) -> bool:
+        has_changed = super().look(node, thorough)
+        if self._held is not None:
+            self._catch_up(monotonic())
+        return has_changed
+
     def lost(self) -> None:
         super().lost()
-        self._subscription = self._transforms = None
+        self._subscription = self._transforms = self._held = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
         """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
@@ -476,8 +489,29 @@ class ToMqtt(Flow):
         """
         if self.echo is not None and self.echo.is_own(cdr):
             return None
-        if (self._interval or self._bytes_per_second) and not self._admit(monotonic()):
-            return None
+        if self._interval or self._bytes_per_second:
+            now = monotonic()
+            with self._admission:
+                is_admitted = self._admit(now)
+                self._held = None if is_admitted else (cdr, now)
+            if not is_admitted:
+                return None
+        return self._message(cdr, published_at)
+
+    def _catch_up(self, now: float) -> None:
+        """Send what was held back, if nothing has come since: what a topic says last holds on."""
+        with self._admission:
+            held = self._held
+            if held is None or now < held[1] + (self._interval or QUIET):
+                return
+            if self._admit(now):
+                self._held = None
+                message = self._message(held[0], 0)
+                if message is not None:
+                    self._mailbox.put(self._lane, message)
+            self.counters.throttled -= 1  # once was enough
+
+    def _message(self, cdr: bytes, published_at: int) -> Message | None:
         try:
             payload, properties = self._pack(cdr)
         except ConversionError as error:

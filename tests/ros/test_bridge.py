@@ -312,6 +312,27 @@ async def test_rate_is_kept_before_conversion(house, monkeypatch):
     assert status.throttled == 200 - status.messages
 
 
+async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    house.start(to_mqtt("/a", encoding="text", rate=10), to_mqtt("/b", bytes_per_second=20))
+    peer, other = (house.node.add_publisher(name, STRING) for name in ("/a", "/b"))
+    for number in range(10):
+        peer.publish(string(str(number)))
+        other.publish(string(str(number)))
+    for elapsed, expected in ((0.05, [b"0"]), (0.15, [b"0", b"9"]), (5.0, [b"0", b"9"])):
+        now = 100 + elapsed
+        house.node.spin()
+        await house.settle()
+        assert house.client.payloads("r2d2/a") == expected
+    assert json.loads(house.client.payloads("r2d2/b")[-1]) == {"data": "9"}
+    assert [topic.throttled for topic in house.bridge.topics()] == [8, 7]
+    now = 105.01
+    peer.publish(string("next"))  # nothing is saved up
+    await house.settle()
+    assert house.client.payloads("r2d2/a")[2:] == [b"next"]
+
+
 async def test_keep_latest_and_keep_n(house):
     house.start(to_mqtt("/a"), to_mqtt("/b", keep=3))
     a, b = house.node.add_publisher("/a", STRING), house.node.add_publisher("/b", STRING)
