@@ -50,13 +50,14 @@ def publisher_qos(subscribers: Sequence[Endpoint], keep: int = 1) -> QosProfile:
     """What to publish with, to be matched with all of `subscribers`.
 
     Reliable is matched with every subscription. Transient local would be too, but it hands the last
-    message, which may be an old command, to whoever subscribes late: only where one asks for it.
+    message, which may be an old command, to whoever subscribes late: only where one asks for it,
+    and no more of them than the `keep` of the route.
     """
     latched = any(end.qos.durability is Durability.TRANSIENT_LOCAL for end in subscribers)
     return QosProfile(
         Reliability.RELIABLE,
         Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
-        max(keep, DEPTH),
+        keep if latched else max(keep, DEPTH),
     )
 
 

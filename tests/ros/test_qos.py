@@ -95,7 +95,8 @@ def test_published_commands_are_kept_for_late_subscribers_only_where_one_asks():
     assert publisher_qos([]) == QosProfile(RELIABLE, VOLATILE, 10)
     volatile, latched = QosProfile(BEST_EFFORT, VOLATILE), QosProfile(RELIABLE, LATCHED)
     assert publisher_qos(ends(volatile)).durability is VOLATILE
-    assert publisher_qos(ends(volatile, latched)).durability is LATCHED
+    assert publisher_qos(ends(volatile, latched)) == QosProfile(RELIABLE, LATCHED, 1)
+    assert publisher_qos(ends(latched), 5).depth == 5
 
 
 def test_mqtt_qos_and_retain():

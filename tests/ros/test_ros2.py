@@ -299,6 +299,25 @@ async def test_mqtt_to_ros(house, peer):
     assert len(peer.received) > before
 
 
+async def test_who_subscribes_late_is_given_the_last_command_alone(house, peer):
+    house.start(route("/mode", "ros", "text"))
+    await peer.do("subscribe", "/mode", STRING, "reliable", "transient_local")
+    await until(house.bridged, "/mode")
+    for text in ("one", "two", "three"):
+        house.send("r2d2/mode", text.encode())
+    await until(lambda: len(peer.received) == 3, "the commands")
+    late = await Peer().start("late")
+    try:
+        await late.do("subscribe", "/mode", STRING, "reliable", "transient_local")
+        await until(lambda: late.received, "the last command")
+        house.send("r2d2/mode", b"four")
+        await until(lambda: len(late.received) == 2, "another one")
+        for (_, cdr), text in zip(late.received, ("three", "four"), strict=True):
+            assert cdr.startswith(string(text).hex())
+    finally:
+        await late.stop()
+
+
 async def test_both_ways_without_an_echo(house, peer):
     house.start(route("/chat", "both", "text", keep=100))
     await peer.do("advertise", "/chat", STRING)
