@@ -4,6 +4,7 @@ know the robot."""
 from __future__ import annotations
 
 import socket
+from contextlib import ExitStack
 from functools import partial
 
 import psutil
@@ -32,6 +33,21 @@ def is_used(port: int, process: psutil.Process) -> bool:
     return any(found.laddr.port == port for found in process.net_connections("inet"))
 
 
+def test_a_caller_that_says_nothing_keeps_nobody_away(
+    world: World, robot: Node, appliance: Ros1Appliance
+) -> None:
+    with Mqtt(appliance) as client, ExitStack() as silent:
+        for port in ports(psutil.Process(appliance.pid)):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+        echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
+        try:
+            greet = partial(client.paho.publish, "r2d2/hear", '{"data": "hello"}')
+            assert "hello" in output(echo, greet)
+        finally:
+            if echo.poll() is None:
+                end(echo)
+
+
 def test_it_joins_again_and_leaves_another_its_name(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
@@ -39,6 +55,7 @@ def test_it_joins_again_and_leaves_another_its_name(
     before_ports = ports(process)
     joined, offered = "on ROS as /appliance", "/robot/switch can be called"
     before = {text: appliance.log.count(text) for text in (joined, offered)}
+    silent = [socket.create_connection(("127.0.0.1", port)) for port in before_ports]
     # The Master lets another node take the name.
     other = world.begin("rostopic", "echo", "/none", "__name:=appliance")
     try:
@@ -59,6 +76,8 @@ def test_it_joins_again_and_leaves_another_its_name(
     assert len(left) == 2, "that of XML-RPC, and that of TCPROS"
     for port in left:
         eventually(lambda port=port: not is_used(port, process), f"port {port} is free")  # type: ignore[misc]
+    for caller in silent:
+        caller.close()
 
 
 def test_a_master_that_is_killed_and_comes_back(
