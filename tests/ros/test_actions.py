@@ -156,7 +156,7 @@ async def test_an_action_is_there_when_all_of_it_is(house, part):
 
 
 async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_again(house):
-    walks, client = await begin(house)
+    walks, _ = await begin(house)
     said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
     status = house.node.add_publisher("/walk/_action/status", STATUS, latched)
