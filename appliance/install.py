@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import pwd
@@ -612,7 +613,11 @@ def _hand_over(tree: Path, account: _Account, owner: int) -> None:
 
 def _remove(place: Path) -> None:
     if place.is_dir() and not place.is_symlink():
-        shutil.rmtree(place)
+        try:
+            shutil.rmtree(place)
+        except OSError as error:  # where a disk of its own is mounted only what is on it can go
+            if error.errno != errno.EBUSY or any(place.iterdir()):
+                raise
     else:
         place.unlink()
 

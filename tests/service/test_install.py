@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shlex
@@ -392,6 +393,35 @@ def run_script(image: Path, name: str, *arguments: str) -> list[str]:
     subprocess.run(["sh", "-c", text, name, *arguments], env=environment, check=True)
     lines = called.read_text().splitlines() if called.exists() else []
     return [line.removeprefix(f"{image}/") for line in lines]
+
+
+def test_a_disk_that_is_mounted_there_does_not_keep_it_from_being_purged(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    programs, data = image / "programs", image / "var/lib/appliance"
+    programs.mkdir()
+    busy = f'#!/bin/sh\ncase "$*" in *{data}) exit 1;; esac\nexec /bin/rm "$@"\n'
+    (programs / "rm").write_text(busy)
+    (programs / "rm").chmod(0o755)
+    for folder in (image / "etc/appliance", data):
+        folder.mkdir(parents=True)
+    run_script(image, "postrm", "purge")
+    assert not (image / "etc/appliance").exists()
+
+    install(image, single_file(tmp_path))
+    (data / "store.db").touch()
+    rmdir = os.rmdir
+
+    def refuse(path: Any, **options: Any) -> None:
+        if str(path) == str(data):
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        rmdir(path, **options)
+
+    monkeypatch.setattr(os, "rmdir", refuse)
+    list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    assert list(data.iterdir()) == [] and not (image / "etc/default/appliance").exists()
 
 
 def test_the_package_runs_its_own_command(image: Path) -> None:
