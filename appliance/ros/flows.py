@@ -452,11 +452,15 @@ class ToMqtt(Flow):
         if message is not None:
             self._mailbox.put(self._lane, message)
 
-    def on_lot(self, lot: list[tuple[bytes, int]], lost: int) -> None:
+    def on_lot(self, lot: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
         """The same for messages that the loop's thread has taken itself. Nobody else has them then,
-        and but for those that may still be in the mailbox they go straight to the broker."""
-        self.counters.dropped += lost
+        and but for those that may still be in the mailbox they go straight to the broker. Of those
+        that are late the newest goes, unless the route asks for more."""
         lane = self._lane
+        if is_late and lane.keep == 1:
+            lost += len(lot) - 1
+            lot = lot[-1:]
+        self.counters.dropped += lost
         batch = []
         for cdr, published_at in lot:
             message = self._convert(cdr, published_at)

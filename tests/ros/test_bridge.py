@@ -910,6 +910,6 @@ async def test_what_there_was_no_room_for_on_ros_is_counted(house):
     house.node.add_publisher("/a", STRING)
     house.start(to_mqtt("/a", encoding="text"))
     (subscription,) = house.node.subscriptions
-    subscription.on_loop([(string("x"), 0)], 3)
+    subscription.on_loop([(string("x"), 0)], 3, False)
     assert house.status().dropped == 3
     assert house.client.payloads("r2d2/a") == [b"x"]
