@@ -4,13 +4,21 @@ know the robot."""
 from __future__ import annotations
 
 import socket
+import threading
+import time
 from contextlib import ExitStack
 from functools import partial
+from xmlrpc.client import ServerProxy
+from xmlrpc.server import SimpleXMLRPCServer
 
 import psutil
 import pytest
 from appliance_process import eventually
 from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, end, is_installed, output
+
+from appliance.ros.node import BusError
+from appliance.ros.ros1 import POLL_INTERVAL
+from appliance.ros.ros1_peers import ask_publisher
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -46,6 +54,42 @@ def test_a_caller_that_says_nothing_keeps_nobody_away(
         finally:
             if echo.poll() is None:
                 end(echo)
+
+
+@pytest.mark.parametrize(
+    "address", ["rosrpc://127.0.0.1:99999", "rosrpc://[x", f"rosrpc://{'a' * 80}:80", "rosrpc://"]
+)
+def test_a_service_whose_address_is_none_is_left_out(
+    world: World, robot: Node, appliance: Ros1Appliance, address: str
+) -> None:
+    before = appliance.log.count("there is no bridge to ROS")
+    with ServerProxy(world.environment["ROS_MASTER_URI"]) as master, Mqtt(appliance) as client:
+        assert master.registerService("/bad", "/robot/bad", address, "http://127.0.0.1:1/")[0] == 1  # type: ignore[index]
+        try:
+            time.sleep(4 * POLL_INTERVAL)
+            assert client.call("r2d2/robot/switch", {"data": True})
+        finally:
+            master.unregisterService("/bad", "/robot/bad", address)
+    assert appliance.log.count("there is no bridge to ROS") == before
+
+
+@pytest.mark.parametrize("port", ["abc", -1, "9" * 30, [80], ""])
+def test_a_publisher_whose_port_is_none_is_left_out(port: object) -> None:
+    def told(*_: object) -> object:
+        return [1, "", ["TCPROS", "127.0.0.1", port]]
+
+    with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
+        uri = f"http://127.0.0.1:{server.server_address[1]}"
+        server.register_function(lambda *_: [1, "", uri], "lookupNode")
+        server.register_function(told, "requestTopic")
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            with pytest.raises(BusError, match="/other cannot be reached"):
+                ask_publisher(uri, "/me", "/other", "/odd")
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def test_it_joins_again_and_leaves_another_its_name(
