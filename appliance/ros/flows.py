@@ -455,9 +455,11 @@ class ToMqtt(Flow):
     def on_lot(self, lot: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
         """The same for messages that the loop's thread has taken itself. Nobody else has them then,
         and but for those that may still be in the mailbox they go straight to the broker. Of those
-        that are late the newest goes, unless the route asks for more."""
-        lane = self._lane
-        if is_late and lane.keep == 1:
+        that are late the newest goes, unless the route asks for more, or they are latched: then
+        each may be another publisher's last."""
+        lane, wanted = self._lane, self._wanted
+        is_latched = wanted is not None and mqtt_retain(wanted[1])
+        if is_late and lane.keep == 1 and not is_latched:
             lost += len(lot) - 1
             lot = lot[-1:]
         self.counters.dropped += lost

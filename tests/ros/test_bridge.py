@@ -204,6 +204,19 @@ async def test_few_are_held_of_what_turns_out_to_be_large(house):
     assert house.client.payloads("r2d2/text")[-1] == b'{"data":"small"}'
 
 
+async def test_of_what_is_late_the_newest_is_carried(house):
+    house.node.takes_on_loop = True
+    house.start(to_mqtt("/a"), to_mqtt("/three", keep=3), to_mqtt("/map"))
+    for topic, qos in (("/a", None), ("/three", None), ("/map", LATCHED)):
+        house.node.add_publisher(topic, STRING, qos)
+    for own in house.node.subscriptions:
+        own.on_loop([(string(text), 0) for text in "xyz"], 1, True)
+    every = [b'{"data":"x"}', b'{"data":"y"}', b'{"data":"z"}']
+    assert house.client.payloads("r2d2/a") == every[-1:]
+    assert house.client.payloads("r2d2/three") == house.client.payloads("r2d2/map") == every
+    assert sorted(status.dropped for status in house.bridge.status()) == [1, 1, 3]
+
+
 async def test_samples_from_before_the_bridge_arrive(house):
     house.node.add_publisher("/map", STRING, LATCHED).publish(string("early"))
     house.start(to_mqtt("/map"))
