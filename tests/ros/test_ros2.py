@@ -122,6 +122,21 @@ async def test_no_request_ends_the_thread():
     await asyncio.to_thread(node.stop)
 
 
+def test_two_nodes_with_services_of_one_name_and_different_types():
+    node = ros2.Ros2Node()
+    types = {"a": "std_srvs/srv/Trigger", "b": "std_srvs/srv/SetBool", "c": "std_srvs/srv/SetBool"}
+
+    class Graph:
+        def get_node_names_and_namespaces(self):
+            return [(name, "/") for name in types]
+
+        def get_service_names_and_types_by_node(self, name, namespace):
+            return [("/x", [types[name]])]
+
+    node._node = Graph()
+    assert node.services() == {"/x": ["std_srvs/srv/SetBool", "std_srvs/srv/Trigger"]}
+
+
 async def test_names_that_only_dds_takes_are_passed_over():
     """Of another vendor's tools, or by a stranger: asking ROS about one ended the bridge."""
     node = ros2.Ros2Node()
