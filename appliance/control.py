@@ -74,6 +74,7 @@ class Control:
             await asyncio.wait_for(writer.drain(), REQUEST_TIMEOUT)
         except (OSError, asyncio.TimeoutError) as error:
             log.debug("no answer could be given: %s", error)
+            writer.transport.abort()  # else the rest of it waits for a reader for ever
         finally:
             writer.close()
 
@@ -83,7 +84,7 @@ class Control:
             request = json.loads(line)
         except asyncio.TimeoutError:
             return {"error": f"no request within {REQUEST_TIMEOUT:g} s"}
-        except ValueError:  # too long, not JSON, or not UTF-8
+        except (ValueError, RecursionError):  # too long, not JSON, too deep, or not UTF-8
             return {"error": "the request must be one line of JSON"}
         name = request.get("command") if isinstance(request, dict) else None
         command = self._commands.get(name) if isinstance(name, str) else None

@@ -18,6 +18,7 @@ import platform
 import threading
 import time
 import traceback
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,7 +27,8 @@ from typing import Any
 import yaml
 
 from appliance import logs
-from appliance.config import Settings, describe
+from appliance.amqtt_broker.guard import redacted
+from appliance.config import Settings, describe, secrets_in
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,9 @@ log = logging.getLogger(__name__)
 KEPT = 5
 OF_ONE_RUN = 3
 LARGEST = 256 * 1024
+
+#: A secret of fewer characters is not looked for in a report: it is in many words.
+SHORTEST_SECRET = 6
 
 _enable = faulthandler.enable
 
@@ -56,6 +61,8 @@ class CrashReports:
         self._settings = settings
         self._running: int | None = None
         self._reported = 0
+        secrets = secrets_in(settings.broker.plugins)
+        self._secrets = [secret for secret in secrets if len(secret) >= SHORTEST_SECRET]
 
     def start(self) -> None:
         """Find out how the last run ended, and be ready for the end of this one."""
@@ -91,7 +98,8 @@ class CrashReports:
         """The run ends with an exception that nothing caught."""
         path = self.report(error, "the appliance crashed")
         if self._running is not None and path is not None:
-            _write(self._running, f"{_REPORTED}{path.name}\n")
+            with suppress(OSError):  # the disk is full: the next start takes it for a power cut
+                _write(self._running, f"{_REPORTED}{path.name}\n")
             self._close()
 
     def watch(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -105,14 +113,14 @@ class CrashReports:
         self._reported += 1
         lines = "".join(traceback.format_exception(error))[-LARGEST // 2 :]
         text = "\n".join(logs.recent)[-LARGEST // 4 :]
+        told = f"{what}\n{lines}\n-- the last lines of the log --\n{text}\n"
         try:
-            path = self._save(
-                f"{self._head()}{what}\n{lines}\n-- the last lines of the log --\n{text}\n".encode()
-            )
+            path = self._save(_encoded(f"{self._head()}{redacted(told, self._secrets)}"))
         except OSError as failure:
             log.error("%s, and no report can be written: %s", what, failure)
             return None
-        log.critical("%s: %s: %s; the report is %s", what, type(error).__name__, error, path)
+        why = redacted(f"{type(error).__name__}: {error}", self._secrets)
+        log.critical("%s: %s; the report is %s", what, why, path)
         return path
 
     def _find_previous(self) -> Path | None:
@@ -156,6 +164,9 @@ class CrashReports:
         try:
             _write(descriptor, data[:LARGEST])
             os.fsync(descriptor)
+        except OSError:  # half a report would take the place of a whole one
+            path.unlink(missing_ok=True)
+            raise
         finally:
             os.close(descriptor)
         # By when they were written: a clock that was set back must not delete the newest.
@@ -186,6 +197,11 @@ class CrashReports:
 
 
 def _write(descriptor: int, data: bytes | str) -> None:
-    rest = memoryview(data.encode() if isinstance(data, str) else data)
+    rest = memoryview(_encoded(data) if isinstance(data, str) else data)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
+
+
+def _encoded(text: str) -> bytes:
+    """UTF-8, also of what is none: a file's name with other bytes may be in any error."""
+    return text.encode(errors="backslashreplace")

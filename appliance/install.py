@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import pwd
@@ -188,13 +189,15 @@ class Installation:
             return
         lock = self._at(_LOCK)
         lock.parent.mkdir(parents=True, exist_ok=True)
+        is_alone = False
         descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
-            try:
+            with contextlib.suppress(BlockingIOError):
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                text = "another `appliance install` is at work; wait for its end"
-                raise InstallError(text) from None
+                # One that has just ended has removed it, and a third may have made its own.
+                is_alone = os.fstat(descriptor).st_nlink > 0
+            if not is_alone:
+                raise InstallError("another `appliance install` is at work; wait for its end")
             yield
             lock.unlink(missing_ok=True)
         finally:
@@ -247,7 +250,8 @@ class Installation:
             raise InstallError("this needs root (sudo); --dry-run only shows it")
         if not self.root.is_dir():
             raise InstallError(f"there is no directory {self.root}")
-        for path in (CONFIGURATION, DATA):
+        files = (COMMAND, UNIT_FILE, _ENABLED, ENVIRONMENT, _LOCK)
+        for path in (CONFIGURATION, DATA, *(file.parent for file in files)):
             target = self._at(path).resolve()
             if not target.is_relative_to(self.root):
                 raise InstallError(f"{self._at(path)} leads out of {self.root}, to {target}")
@@ -331,8 +335,7 @@ class Installation:
                 return _Account(found.pw_uid, found.pw_gid, _group(Path("/"), found.pw_gid))
             return None
         with contextlib.suppress(FileNotFoundError):
-            for line in self._at(Path("/etc/passwd")).read_text().splitlines():
-                name, _, uid, gid, *_ = line.split(":")
+            for name, uid, gid in _entries(self._at(Path("/etc/passwd")), 2, 3):
                 if name == self.user:
                     return _Account(int(uid), int(gid), _group(self.root, int(gid)))
         return None
@@ -572,11 +575,19 @@ def _before(place: Path) -> Path:
 
 def _group(root: Path, gid: int) -> str:
     with contextlib.suppress(FileNotFoundError):
-        for line in (root / "etc/group").read_text().splitlines():
-            name, _, number, *_ = line.split(":")
+        for name, number in _entries(root / "etc/group", 2):
             if number == str(gid):
                 return name
     return str(gid)
+
+
+def _entries(file: Path, *fields: int) -> Iterator[list[str]]:
+    """Names, and these fields beside them, of what passwd(5) and group(5) have; a line may be
+    empty, or `+` for those of NIS, and comments are in any encoding."""
+    for line in file.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
+        parts = line.split(":")
+        if len(parts) > max(fields):
+            yield [parts[0], *(parts[number] for number in fields)]
 
 
 def _same(one: Path, other: Path) -> bool:
@@ -602,7 +613,11 @@ def _hand_over(tree: Path, account: _Account, owner: int) -> None:
 
 def _remove(place: Path) -> None:
     if place.is_dir() and not place.is_symlink():
-        shutil.rmtree(place)
+        try:
+            shutil.rmtree(place)
+        except OSError as error:  # where a disk of its own is mounted only what is on it can go
+            if error.errno != errno.EBUSY or any(place.iterdir()):
+                raise
     else:
         place.unlink()
 

@@ -20,6 +20,14 @@ log = logging.getLogger(__name__)
 #: Seconds between two looks at what STATUS= is to say.
 STATUS_INTERVAL = 10.0
 
+#: Characters of a line, which may take four bytes each: of datagrams with more than 4096 systemd
+#: takes nothing at all (NOTIFY_BUFFER_MAX), not even READY=1.
+LONGEST_LINE = 900
+
+#: What systemd takes for a line's end, which in a value would begin another one, and the character
+#: with which it takes nothing of a datagram.
+_ENDS = dict.fromkeys(map(ord, "\n\r\0"), " ")
+
 #: Seconds that a change of state may wait for systemd to take it; a sign of life never waits.
 PATIENCE = 1.0
 
@@ -107,8 +115,7 @@ class Notifier:
         """Returns whether systemd takes it."""
         if self._socket is None:
             return False
-        # A line's end in a value would begin another one.
-        text = "\n".join(line.replace("\n", " ") for line in lines)
+        text = "\n".join(line[:LONGEST_LINE].translate(_ENDS) for line in lines)
         try:
             self._socket.settimeout(PATIENCE if wait else 0)
             self._socket.send(text.encode(errors="replace"))

@@ -275,6 +275,17 @@ def test_secrets_are_masked_in_every_print() -> None:
     assert shown == {"password": config.MASK, "url": f"sql://me:{config.MASK}@db/x", "n": [1]}
     assert settings.broker.plugins["a.b.C"]["password"] == "hunter2"
     assert "hunter2" not in repr(settings)
+    for plugin in (
+        "{url: 'sql://me:hun/ter2@db/x'}",
+        "{url: 'sql://me:hun@ter2@db/x'}",
+        "{urls: ['sql://me:hunter2@db/x', 1]}",
+        "{tokens: {alice: hunter2}, credentials: {user: me, value: [hunter2]}}",
+    ):
+        settings = loads(f"broker: {{plugins: {{my.token.Plugin: {plugin}, b.C: {{n: 1}}}}}}")
+        said = str(config.describe(settings)["broker"]["plugins"])
+        assert "ter2" not in said and config.MASK in said and "'b.C': {'n': 1}" in said
+    settings = loads("broker: {plugins: {my.token.Plugin: {path: /a, n: 1}}}")
+    assert config.describe(settings)["broker"]["plugins"] == settings.broker.plugins
     found = problems("broker: {listeners: [{bind: '${SECRET}'}]}", SECRET="hunter2")
     assert "hunter2" not in "".join(found)
 

@@ -49,7 +49,11 @@ async def test_what_cannot_be_done_is_told(path):
 
 
 @pytest.mark.parametrize(
-    "request_line", [b"\n", b"{}\n", b"[]\n", b'{"command": 1}\n', b"\xff\n", b"x" * 70000 + b"\n"]
+    "request_line",
+    [
+        *(b"\n", b"{}\n", b"[]\n", b'{"command": 1}\n', b"\xff\n"),
+        *(b"x" * 70000 + b"\n", b"[" * 60000 + b"\n"),
+    ],
 )
 async def test_bad_requests_are_answered_and_harm_nothing(path, request_line):
     def talk() -> bytes:
@@ -71,6 +75,29 @@ async def test_who_says_nothing_is_not_waited_for_for_ever(path, monkeypatch):
             return connection.makefile("rb").readline()
 
     assert b"no request" in await asyncio.to_thread(wait)
+
+
+async def test_who_does_not_read_is_not_waited_for_for_ever(tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "REQUEST_TIMEOUT", 0.1)
+
+    async def talk():
+        return "x" * 10_000_000
+
+    def open_files():
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    served = Control(tmp_path / "s", {"talk": talk})
+    await served.start()
+    before = open_files()
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.connect(str(tmp_path / "s"))
+        connection.sendall(b'{"command": "talk"}\n')
+        for _ in range(100):
+            await asyncio.sleep(0.02)
+            if open_files() == before + 1:
+                break
+        assert open_files() == before + 1, "this end alone"
+    await served.stop()
 
 
 async def test_a_second_appliance_does_not_take_the_place_of_the_first(path):

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 def bridge_cells() -> list[str]:
     """The names of those among CELLS that measure the bridge."""
-    from appliance.bench.cells import CELLS, BridgeCell
+    from appliance.bench.cells import CELLS, RosCell
 
-    return [cell.name for cell in CELLS if isinstance(cell, BridgeCell)]
+    return [cell.name for cell in CELLS if isinstance(cell, RosCell)]
 
 
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:

@@ -24,6 +24,7 @@ from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site
 REPEATS = 3  # of each broker, in turn, so that both see the same disturbances; the median counts
 GRACE_SECONDS = 90.0  # a run's connecting and settling, above the time it measures
 PACE = 1000.0  # messages a second of the bridge's rows
+IMAGE_PACE = 30.0  # the same of images
 PACES = [round(2000 * 1.5**step) for step in range(9)]  # up to 51,258; the sender's end is near
 PACE_SECONDS = 2.0
 BACKLOG_US = 50_000.0  # of median latency: no loss yet, but only because a queue is growing
@@ -162,7 +163,8 @@ class BridgeSide:
     send: Sequence[str]
     receive: Sequence[str]
     environment: Mapping[str, str]
-    maximum: bool
+    maximum: bool = False
+    pace: float = PACE
 
     @property
     def name(self) -> str:
@@ -172,7 +174,7 @@ class BridgeSide:
     def measure(self, seconds: float) -> Result:
         """Run at the usual pace, or at ever higher ones up to the last that is kept up with."""
         if not self.maximum:
-            return self._measure(seconds, PACE)
+            return self._measure(seconds, self.pace)
         best: Result | None = None
         for pace in PACES:
             result = self._measure(min(seconds, PACE_SECONDS), pace)
@@ -196,7 +198,18 @@ class BridgeSide:
 
 
 @dataclass(frozen=True, slots=True)
-class BridgeCell(Cell):
+class RosCell(Cell):
+    """A row of the bridge, for which ROS 2 has to be there."""
+
+    def missing(self) -> str | None:
+        for module in ("rclpy", "std_msgs", "sensor_msgs"):
+            if importlib.util.find_spec(module) is None:
+                return f"needs ROS 2: no Python module {module}; source it, or install .[ros]"
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeCell(RosCell):
     """Paced std_msgs/String through the bridge, against the tutorial node with mosquitto."""
 
     send: Sequence[str] = ()
@@ -207,12 +220,6 @@ class BridgeCell(Cell):
     def queue(self) -> int:
         """Messages that may wait for the bridge: ten as tutorials have it, or no obstacle."""
         return 1000 if self.maximum else 10
-
-    def missing(self) -> str | None:
-        for module in ("rclpy", "std_msgs"):
-            if importlib.util.find_spec(module) is None:
-                return f"needs ROS 2: no Python module {module}; source it, or install .[ros]"
-        return None
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
@@ -235,6 +242,81 @@ class BridgeCell(Cell):
                 yield BridgeSide(both, self.send, self.receive, environment, self.maximum)
 
 
+@dataclass(frozen=True, slots=True)
+class ListeningSide:
+    """A bare raw subscription of rclpy, which does nothing."""
+
+    site: Site
+    send: Sequence[str]
+    environment: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """Whose figures these are."""
+        return "rclpy"
+
+    def measure(self, seconds: float) -> Result:
+        """Start a sender, and stop it when the subscription has measured itself."""
+        sending = [*self.send, "--rate", str(IMAGE_PACE), "--seconds", str(GRACE_SECONDS)]
+        command = [sys.executable, "-m", "appliance.bench.ends", *sending]
+        with peers.running(
+            "the sender", command, self.environment, self.site.directory / "sender.log"
+        ):
+            listening = ["ends", "ros-listen", "--topic", CAMERA, "--image"]
+            return run_measuring(listening, self.site, seconds, self.environment)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageCell(RosCell):
+    """Images of 1 MB as CDR to one MQTT client, against a subscription that does nothing."""
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        route = {"ros": f"/{CAMERA}", "to": "mqtt", "encoding": "cdr", "qos": 0}
+        environment = image_environment(0)
+        receive = ("mqtt-receive", "--topic", f"bench/{CAMERA}")
+        with peers.appliance(site, [route], environment) as server:
+            yield BridgeSide(server, SEND_IMAGES, receive, environment, pace=IMAGE_PACE)
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        yield ListeningSide(site, SEND_IMAGES, image_environment(1))
+
+    def note(self, site: Site) -> str | None:
+        """What is in the peer's column."""
+        return "in the peer's column: a raw subscription of rclpy that does nothing"
+
+
+@dataclass(frozen=True, slots=True)
+class ConversionSide:
+    """One way to JSON, alone in a process."""
+
+    name: str
+    site: Site
+    how: str
+
+    def measure(self, seconds: float) -> Result:
+        """Convert for so long."""
+        return run_measuring(["conversion", self.how], self.site, seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class ConversionCell(RosCell):
+    """A message's conversion to JSON, against deserializing it and walking its fields."""
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        yield ConversionSide("appliance", site, "ours")
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        yield ConversionSide("rclpy", site, "rclpy")
+
+    def note(self, site: Site) -> str | None:
+        """What is in the peer's column."""
+        return "in the peer's column: rclpy's deserialize, its fields walked, json"
+
+
 def ros_environment(number: int) -> dict[str, str]:
     """An environment whose ROS sees this computer only, in a domain of its own for each number."""
     # Domains above 101 use ports that Linux gives to clients.
@@ -245,6 +327,13 @@ def ros_environment(number: int) -> dict[str, str]:
         "ROS_LOCALHOST_ONLY": "1",  # Humble's name for it
         "ROS_DOMAIN_ID": str(domain),
     }
+
+
+def image_environment(number: int) -> dict[str, str]:
+    """The same where images pass through shared memory, for who sends them, too."""
+    profile = str(Path(__file__).parent.parent / "fastdds.xml")
+    names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+    return {**ros_environment(number), **dict.fromkeys(names, profile)}
 
 
 def run_measuring(
@@ -279,6 +368,8 @@ FIVEFOLD = {CPU: 5.0, "p50_us": 2.0, "p99_us": 2.0}
 THREEFOLD = {CPU: 3.0, "p50_us": 2.0, "p99_us": 2.0}
 TO_MQTT = (("ros-send", "--topic", "chatter"), ("mqtt-receive", "--topic", "bench/chatter"))
 TO_ROS = (("mqtt-send", "--topic", "bench/command"), ("ros-receive", "--topic", "command"))
+CAMERA = "camera"
+SEND_IMAGES = ("ros-send", "--topic", CAMERA, "--image")
 CELLS: tuple[Cell, ...] = (
     LoadCell("qos0-pair", "QoS 0, one pair, one at a time", {CPU: 1.0}, "qos0-pair"),
     LoadCell("qos0-pipelined", "QoS 0, one pair, pipelined", {CPU: 3.0}, "qos0-pipelined"),
@@ -297,6 +388,8 @@ CELLS: tuple[Cell, ...] = (
     BridgeCell("mqtt-to-ros", "MQTT → ROS, String at 1 kHz", THREEFOLD, *TO_ROS),
     BridgeCell("ros-to-mqtt-max", "ROS → MQTT, highest rate", {"rate": 6.0}, *TO_MQTT, True),
     BridgeCell("mqtt-to-ros-max", "MQTT → ROS, highest rate", {"rate": 3.0}, *TO_ROS, True),
+    ConversionCell("imu-json", "sensor_msgs/Imu to JSON, alone", {CPU: 8.0}),
+    ImageCell("image-cdr", "ROS → MQTT, 1 MB Image as CDR at 30 Hz", {CPU: 0.77}),
 )
 
 

@@ -5,6 +5,9 @@ and what is missing::
 
     python -m appliance.bench.ends mqtt-receive --port 1883 --topic bench/chatter --pid PID
     python -m appliance.bench.ends ros-send --topic chatter --rate 1000
+
+With `--image` it is the end of an image's bytes; `ros-listen` is a bare subscription, which is both
+the receiver and what is between.
 """
 
 from __future__ import annotations
@@ -24,10 +27,12 @@ from appliance.bench.client import Client, LoadError, Target, publish_packet
 from appliance.bench.load import Result, cpu_seconds, percentile, pin
 
 TEXT_BYTES = 64
+IMAGE_BYTES = 1_000_000
 FIRST_SECONDS = 30.0  # discovery, on a computer that has other things to do
 SETTLE_SECONDS = 1.0  # after the first message: the backlog of the start has gone through
-RECEIVE_BYTES = 1 << 16
+RECEIVE_BYTES = 1 << 21
 QUEUE = 1000  # of the ROS ends: they must not be what loses messages
+IMAGES = 10  # the same for images
 
 
 def text(number: int) -> str:
@@ -111,8 +116,7 @@ def mqtt_send(target: Target, topic: str, rate: float, seconds: float) -> None:
 
 def mqtt_receive(target: Target, topic: str, meter: Meter, seconds: float) -> None:
     """Subscribe with QoS 0 and measure."""
-    size = len(publish_packet(topic, bytes(TEXT_BYTES)))
-    buffer, filled = memoryview(bytearray(RECEIVE_BYTES)), 0
+    buffer, filled, size = memoryview(bytearray(RECEIVE_BYTES)), 0, 0
     with closing(Client(target, f"bench-receive-{os.getpid()}")) as client:
         client.connected()
         client.subscribe(topic, 0)
@@ -123,29 +127,57 @@ def mqtt_receive(target: Target, topic: str, meter: Meter, seconds: float) -> No
                 filled += client.transport.recv_into(buffer[filled:])
             except TimeoutError:
                 return  # which the meter puts into words
-            whole = filled - filled % size
-            for end in range(size, whole + 1, size):
+            if not size and filled >= 5:  # a PUBLISH and its length; they are all as long
+                size = packet_size(buffer)
+            whole = filled - filled % size if size else 0
+            for end in range(size, whole + 1, size or 1):
                 meter.add(bytes(buffer[end - TEXT_BYTES : end]))
             buffer[: filled - whole] = bytes(buffer[whole:filled])
             filled -= whole
 
 
+def packet_size(head: memoryview) -> int:
+    """The size of the packet that begins so, in bytes (MQTT 3.1.1, section 2.2.3)."""
+    length = 0
+    for position in range(1, 5):
+        length |= (head[position] & 0x7F) << 7 * (position - 1)
+        if not head[position] & 0x80:
+            return 1 + position + length
+    raise LoadError("what comes is no MQTT")
+
+
 # --- ROS ---
 
 
-def ros_send(topic: str, rate: float, seconds: float) -> None:
-    """Publish std_msgs/String."""
+def texts() -> tuple[Any, int, Callable[[str], Any]]:
+    """The type of texts, how many may wait, and the message of a text."""
+    string = import_module("std_msgs.msg").String
+    return string, QUEUE, lambda data: string(data=data)
+
+
+def images() -> tuple[Any, int, Callable[[str], Any]]:
+    """The same for serialized images, which end with the text."""
+    from rclpy.serialization import serialize_message
+
+    image = import_module("sensor_msgs.msg").Image
+    pixels = bytes(IMAGE_BYTES - TEXT_BYTES)
+    cdr = serialize_message(image(encoding="mono8", data=pixels + bytes(TEXT_BYTES)))
+    return image, IMAGES, lambda data: cdr[:-TEXT_BYTES] + data.encode()
+
+
+def ros_send(topic: str, rate: float, seconds: float, is_image: bool) -> None:
+    """Publish std_msgs/String, or serialized sensor_msgs/Image."""
     import rclpy
 
-    string = import_module("std_msgs.msg").String
     rclpy.init()
     node = rclpy.create_node("bench_send")
-    publisher = node.create_publisher(string, topic, QUEUE)
+    message_type, queue, make = images() if is_image else texts()
+    publisher = node.create_publisher(message_type, topic, queue)
 
     def send(data: str) -> None:
         if not rclpy.ok():  # a signal came
             raise KeyboardInterrupt
-        publisher.publish(string(data=data))
+        publisher.publish(make(data))
 
     try:
         paced(rate, seconds, send)
@@ -156,8 +188,8 @@ def ros_send(topic: str, rate: float, seconds: float) -> None:
         rclpy.try_shutdown()
 
 
-def ros_receive(topic: str, meter: Meter, seconds: float) -> None:
-    """Subscribe to std_msgs/String and measure."""
+def ros_receive(topic: str, meter: Meter, seconds: float, is_image: bool) -> None:
+    """Subscribe to std_msgs/String, or to serialized sensor_msgs/Image, and measure."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.task import Future
@@ -171,11 +203,12 @@ def ros_receive(topic: str, meter: Meter, seconds: float) -> None:
     complete: Any = Future(executor=executor)
 
     def receive(message: Any) -> None:
-        meter.add(message.data)
+        meter.add(message[-TEXT_BYTES:] if is_image else message.data)
         if meter.complete and not complete.done():
             complete.set_result(None)
 
-    node.create_subscription(import_module("std_msgs.msg").String, topic, receive, QUEUE)
+    message_type, queue, _ = images() if is_image else texts()
+    node.create_subscription(message_type, topic, receive, queue, raw=is_image)
     executor.add_node(node)
     try:
         executor.spin_until_future_complete(
@@ -187,7 +220,7 @@ def ros_receive(topic: str, meter: Meter, seconds: float) -> None:
         rclpy.try_shutdown()
 
 
-ROLES = ("mqtt-send", "mqtt-receive", "ros-send", "ros-receive")
+ROLES = ("mqtt-send", "mqtt-receive", "ros-send", "ros-receive", "ros-listen")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -201,6 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--port", type=int, default=1883)
     parser.add_argument("--user", help="user name")
     parser.add_argument("--password-env", metavar="NAME", help="variable that holds the password")
+    parser.add_argument("--image", action="store_true", help="images of 1 MB, on ROS's side")
     parser.add_argument("--rate", type=float, default=1000.0, help="messages a second")
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument(
@@ -210,18 +244,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     password = os.environ[options.password_env].encode() if options.password_env else None
     target = Target(options.host, options.port, None, options.user, password)
-    meter = Meter(options.role, options.pid, options.seconds)
-    pin(options.pid)  # both ends on one core, what is between on another
+    pids = [os.getpid()] if options.role == "ros-listen" else options.pid
+    meter = Meter(options.role, pids, options.seconds)
+    pin(pids)  # both ends on one core, what is between on another
     try:
         if options.role == "mqtt-send":
             mqtt_send(target, options.topic, options.rate, options.seconds)
         elif options.role == "ros-send":
-            ros_send(options.topic, options.rate, options.seconds)
+            ros_send(options.topic, options.rate, options.seconds, options.image)
         else:
             if options.role == "mqtt-receive":
                 mqtt_receive(target, options.topic, meter, options.seconds)
             else:
-                ros_receive(options.topic, meter, options.seconds)
+                ros_receive(options.topic, meter, options.seconds, options.image)
             sys.stdout.write(json.dumps(asdict(meter.result())) + "\n")
     except (LoadError, OSError) as error:
         sys.stderr.write(f"{options.role}: {error}\n")

@@ -12,7 +12,8 @@ from appliance.document import KeyPath
 _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
 
 
-_URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):[^/\s@]+(?=@)")
+# As far as the last @ of a word: people also write passwords with a slash or an @ in them.
+_URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):\S+(?=@)")
 
 
 MASK = "********"
@@ -29,9 +30,16 @@ def mask(path: KeyPath, value: Any) -> Any:
         return {key: mask((*path, key), inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
         return [mask(path, inner) for inner in value]
-    if any(isinstance(part, str) and _SECRET_KEY.search(part) for part in path[-1:]) and value:
+    if _is_secret(path) and value:
         return MASK
     return _URL_PASSWORD.sub(rf"\1:{MASK}", value) if isinstance(value, str) else value
+
+
+def _is_secret(path: KeyPath) -> bool:
+    """Whether a key says so, or one above it that is no plugin's name: `tokens: {alice: …}`."""
+    return any(
+        isinstance(part, str) and "." not in part and _SECRET_KEY.search(part) for part in path
+    )
 
 
 def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
@@ -42,12 +50,15 @@ def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
     elif isinstance(value, (list, tuple)):
         for inner in value:
             yield from secrets_in(inner, path)
-    elif path and isinstance(path[-1], str) and _SECRET_KEY.search(path[-1]):
+    elif _is_secret(path):
         if value:
             yield str(value)
     elif isinstance(value, str):
         for match in _URL_PASSWORD.finditer(value):
-            yield match[0].partition(":")[2]
+            secret = match[0].partition(":")[2]
+            yield secret
+            if "@" in secret:  # it may as well have ended there
+                yield secret.partition("@")[0]
 
 
 def is_open_with_secrets(settings: Settings) -> bool:

@@ -23,7 +23,7 @@ import contextlib
 import logging
 import secrets
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
@@ -183,11 +183,11 @@ class ActionRoutes:
         services = self._requests.services
         # Until all is found that it is made of, the result of a goal could not be asked for.
         found = {
-            name: [min(types).removesuffix("_SendGoal")]
-            for service, types in services.items()
+            name: [min(types)]
+            for service in services
             if service.endswith(SEND_GOAL)
             and (name := service.removesuffix(SEND_GOAL))
-            and {f"{name}{GET_RESULT}", f"{name}{CANCEL_GOAL}"} <= services.keys()
+            and (types := _types(name, services))
         }
         routes = list(self._counters)
 
@@ -309,6 +309,24 @@ class ActionRoutes:
             action.lost()
 
 
+def _types(name: str, services: Mapping[str, Sequence[str]]) -> set[str]:
+    """The types that an action has on the bus, with all of the services that it is made of."""
+    if CANCEL not in services.get(f"{name}{CANCEL_GOAL}", ()):
+        return set()
+    goals_of, results_of = (
+        {
+            found.removesuffix(suffix)
+            for found in services.get(service, ())
+            if found.endswith(suffix)
+        }
+        for service, suffix in (
+            (f"{name}{SEND_GOAL}", "_SendGoal"),
+            (f"{name}{GET_RESULT}", "_GetResult"),
+        )
+    )
+    return goals_of & results_of
+
+
 def _misfit(route: ActionSettings, type_name: str) -> tuple[Why, str] | None:
     """Why a pattern of the route does not take an action of that type; None when it does."""
     if route.type is None or compile_pattern(route.type).fullmatch(type_name):
@@ -327,6 +345,8 @@ class Action:
         self.base = route.mqtt.replace("{ros}", ros)
         self.type: str | None = None
         self.is_there = False
+        #: Whether the status has to be asked for anew: a publisher that stayed says it only once.
+        self._has_forgotten = False
         self._counters = counters
         self._routes = routes
         self._board = routes._board
@@ -366,6 +386,7 @@ class Action:
         """Whether the action is on the bus now."""
         if self.is_there and not is_there:
             self.forget()
+            self._has_forgotten = True
         self.is_there = is_there
 
     def keys(self) -> Iterable[Key]:
@@ -639,8 +660,10 @@ class Action:
         if servers > self._servers and self._subscribed is not None:
             self._routes._post(self._routes.server_came, self.ros)
         self._servers = servers
-        if type_name == self._subscribed:
+        is_old = self._has_forgotten and self.is_there
+        if type_name == self._subscribed and not is_old:
             return
+        self._has_forgotten = False
         self._close_subscriptions()
         self._subscribed = type_name
         latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)

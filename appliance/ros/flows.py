@@ -28,7 +28,7 @@ from appliance.mqtt.codec import (
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import CDR, UnknownTypeError, Wire
 from appliance.ros.figures import Counters, Meter
-from appliance.ros.mailbox import Lane, Mailbox
+from appliance.ros.mailbox import LARGE, Lane, Mailbox
 from appliance.ros.node import (
     BusError,
     Endpoint,
@@ -402,6 +402,8 @@ class ToMqtt(Flow):
         self._held: tuple[bytes, float] | None = None
         self._admission = threading.Lock()
         self._subscription: RosSubscription | None = None
+        #: Whether a message was large, whatever its type says: texts and paths may be, too.
+        self._is_large = False
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._transforms: StaticTransforms | None = None
         self._topic_wire = encode_string(self.mqtt)
@@ -418,7 +420,10 @@ class ToMqtt(Flow):
         return node.publishers(self.ros)
 
     def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
-        return subscription_qos(endpoints, self._lane.keep, self._converters.bulk(type_name))
+        qos = subscription_qos(endpoints, self._lane.keep, self._converters.bulk(type_name))
+        if self._is_large and not mqtt_retain(qos):  # a latched one would only come once more
+            return subscription_qos(endpoints, self._lane.keep)
+        return qos
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         self.close()
@@ -465,11 +470,17 @@ class ToMqtt(Flow):
         if message is not None:
             self._mailbox.put(self._lane, message)
 
-    def on_lot(self, lot: list[tuple[bytes, int]], lost: int) -> None:
+    def on_lot(self, lot: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
         """The same for messages that the loop's thread has taken itself. Nobody else has them then,
-        and but for those that may still be in the mailbox they go straight to the broker."""
+        and but for those that may still be in the mailbox they go straight to the broker. Of those
+        that are late the newest goes, unless the route asks for more, or they are latched: then
+        each may be another publisher's last."""
+        lane, wanted = self._lane, self._wanted
+        is_latched = wanted is not None and mqtt_retain(wanted[1])
+        if is_late and lane.keep == 1 and not is_latched:
+            lost += len(lot) - 1
+            lot = lot[-1:]
         self.counters.dropped += lost
-        lane = self._lane
         batch = []
         for cdr, published_at in lot:
             message = self._convert(cdr, published_at)
@@ -487,6 +498,8 @@ class ToMqtt(Flow):
 
         Nothing may be logged by ROS here: it would feed /rosout.
         """
+        if len(cdr) > LARGE:
+            self._is_large = True  # the next thorough look subscribes for fewer of them
         if self.echo is not None and self.echo.is_own(cdr):
             return None
         if self._interval or self._bytes_per_second:

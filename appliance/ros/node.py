@@ -103,8 +103,9 @@ class RosClient(Protocol):
 
 
 #: Some messages as CDR, each with the time at which it was published, in nanoseconds since the
-#: epoch, or 0; and how many others were lost, as there was no room for more.
-TakeLot: TypeAlias = Callable[[list[tuple[bytes, int]], int], None]
+#: epoch, or 0; how many others were lost, as there was no room for more; and whether newer ones
+#: have been waiting behind them for so long that this is no burst.
+TakeLot: TypeAlias = Callable[[list[tuple[bytes, int]], int, bool], None]
 
 
 #: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
@@ -280,7 +281,7 @@ class FakeSubscription:
     def take(self, cdr: bytes) -> None:
         """A message has come for it."""
         if self.bus.takes_on_loop and self.on_loop is not None:
-            self.on_loop([(cdr, 0)], 0)
+            self.on_loop([(cdr, 0)], 0, False)
         else:
             self.callback(cdr)
 

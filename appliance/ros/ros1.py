@@ -72,6 +72,11 @@ KNOCK_INTERVAL = 0.5
 #: Seconds that rospy may take to leave the bus.
 LEAVE_TIME = 3.0
 
+#: Seconds that a caller of ours may take between two bytes of what it is for, and how many may do
+#: so at a time.
+CALLER_TIME = 5.0
+CALLERS = 200
+
 DEFAULT_MASTER = "http://localhost:11311"
 
 #: Names of topics or services, and the nodes that have them.
@@ -576,22 +581,57 @@ def _fresh_rospy() -> Any:
 
 class _Servers:
     """The two servers of a node, to be ended with all their threads. rospy closes the sockets that
-    these wait at, which they do not notice, and keeps the connections, and others their ends."""
+    these wait at, which they do not notice, and keeps the connections, and others their ends. And
+    it hears one caller at a time out: one that says nothing would keep away all others."""
 
     def __init__(self, rospy: Any) -> None:
         from rosgraph.xmlrpc import XmlRpcNode
 
         owners = [getattr(hook, "__self__", None) for hook in rospy.core._shutdown_hooks]
-        self._node = next(owner for owner in owners if isinstance(owner, XmlRpcNode))
-        self._tcpros = rospy.impl.tcpros_base._tcpros_server
+        node = next((owner for owner in owners if isinstance(owner, XmlRpcNode)), None)
+        if node is None or node.server is None:  # shut down from outside already
+            return
+        self._node = node
         self._connections: WeakSet[socket.socket] = WeakSet()
-        self._process = self._node.server.process_request
-        self._node.server.process_request = self._note_and_process
+        self._process = node.server.process_request
+        node.server.process_request = self._note_and_process
+        base = rospy.impl.tcpros_base
+        self._tcpros = base._tcpros_server
+        #: Connections of which it is not known yet what they are for; a dict for its lock.
+        self._callers: dict[socket.socket, None] = {}
+        self._admit = self._tcpros._tcp_server_callback
+        self._tcpros._tcp_server_callback = self._hear_out
+        if self._tcpros.tcp_ros_server is not None:
+            self._tcpros.tcp_ros_server.inbound_handler = self._hear_out
+        self._read_header = base.read_ros_handshake_header
+        base.read_ros_handshake_header = self._read_header_in_time
         rospy.core.add_preshutdown_hook(self._end)
 
     def _note_and_process(self, request: socket.socket, address: object) -> None:
         self._connections.add(request)
         self._process(request, address)
+
+    def _hear_out(self, caller: socket.socket, address: object) -> None:
+        def admit() -> None:
+            try:
+                self._admit(caller, address)
+            finally:
+                self._callers.pop(caller, None)
+
+        if len(self._callers) >= CALLERS:
+            caller.close()
+            return
+        self._callers[caller] = None
+        threading.Thread(target=admit, name="ros caller", daemon=True).start()
+
+    def _read_header_in_time(self, connection: socket.socket, *more: Any) -> Any:
+        if connection not in self._callers:  # one of our own
+            return self._read_header(connection, *more)
+        connection.settimeout(CALLER_TIME)
+        try:
+            return self._read_header(connection, *more)
+        finally:
+            connection.settimeout(None)
 
     def _end(self, _reason: str) -> None:
         self._node.is_shutdown = True
@@ -604,6 +644,9 @@ class _Servers:
             tcp.is_shutdown = True
             tcp.server_sock.shutdown(socket.SHUT_RDWR)  # wakes accept()
             tcp.server_sock.close()
+        for caller in list(self._callers):
+            with suppress(OSError):
+                caller.shutdown(socket.SHUT_RDWR)
 
 
 @cache

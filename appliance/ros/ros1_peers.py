@@ -154,8 +154,7 @@ def ask_publisher(master_uri: str, caller: str, node: str, topic: str) -> Defini
     if not isinstance(protocol, list) or len(protocol) != 3:
         raise BusError(f"{node} does not publish {topic} over TCP")
     fields = {"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"}
-    address = (str(protocol[1]), int(protocol[2]))
-    with _connect(address, node) as peer:
+    with _connect((str(protocol[1]), protocol[2]), node) as peer:
         header = _shake_hands(peer, fields, node)
     try:
         return Definition(header["type"], header["md5sum"], header["message_definition"])
@@ -249,18 +248,20 @@ class ServiceCall:
 
 
 def _address(uri: object, service: str) -> tuple[str, int]:
-    parts = urlsplit(str(uri))
-    if parts.scheme != "rosrpc" or parts.hostname is None or parts.port is None:
-        raise BusError(f"{service} is at {uri!r}, which is no address of a service")
-    return parts.hostname, parts.port
+    with suppress(ValueError):  # what a node registers nobody checks
+        parts = urlsplit(str(uri))
+        if parts.scheme == "rosrpc" and parts.hostname is not None and parts.port is not None:
+            return parts.hostname, parts.port
+    raise BusError(f"{service} is at {uri!r}, which is no address of a service")
 
 
-def _connect(address: tuple[str, int], who: str) -> socket.socket:
+def _connect(address: tuple[str, Any], who: str) -> socket.socket:
+    host, port = address
     try:
-        peer = socket.create_connection(address, PATIENCE)
+        peer = socket.create_connection((host, int(port)), PATIENCE)
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    except OSError as error:
-        host, port = address
+    # What it tells may be no number, too large a one, or no name of a computer (UnicodeError).
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise BusError(
             f"{who} cannot be reached at {host}:{port}: {error} (it tells the address that its "
             "ROS_HOSTNAME or ROS_IP says)"

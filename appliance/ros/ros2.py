@@ -298,7 +298,10 @@ class Ros2Node:
         for node in self._node.get_node_names_and_namespaces():
             # It has gone meanwhile, or its name is none that ROS takes.
             with suppress(NodeNameNonExistentError, *_errors()):
-                found.update(_named(self._node.get_service_names_and_types_by_node(*node)))
+                named = _named(self._node.get_service_names_and_types_by_node(*node))
+                for service, types in named.items():
+                    # Two nodes may have services of the same name, also of different types.
+                    found[service] = sorted({*found.get(service, ()), *types})
         return found
 
     def count(self, topic: str) -> tuple[int, int]:

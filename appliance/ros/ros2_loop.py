@@ -23,6 +23,10 @@ from appliance.ros.node import BusError, TakeLot
 LOT = 64
 LOT_BYTES = 2 * LARGE
 
+#: Seconds in which there is always more than a lot until it is no burst any more: the loop cannot
+#: keep up, and what it takes gets ever older.
+BEHIND = 0.5
+
 #: So many small messages in a row it takes until a topic with a large one is thought small again.
 SMALL_IN_A_ROW = 16
 
@@ -113,6 +117,8 @@ class LoopSubscription:
         self._lost = 0
         #: How many small messages are missing until the topic is thought small.
         self._large_for = 0
+        #: Since when there is always more than a lot, by the loop's clock; None when there is not.
+        self._behind_since: float | None = None
         self._is_ended = False
         with handle:
             self._doorbell = Doorbell(handle.pointer)
@@ -151,13 +157,20 @@ class LoopSubscription:
         if self._large_for:
             self._hand_over(lot)
             return
-        if has_more:
+        is_late = False
+        if not has_more:
+            self._behind_since = None
+        else:
+            now = self._loop.time()
+            if self._behind_since is None:
+                self._behind_since = now
+            is_late = now > self._behind_since + BEHIND
             # Not by a callback of the loop's: with what comes meanwhile there would be two turns a
             # round, then three, and one that is left when the ROS thread has been given the rest.
             self._owed -= 1
             self._doorbell.ring()
         lost, self._lost = self._lost, 0
-        self._on_loop(lot, lost)
+        self._on_loop(lot, lost, is_late)
 
     def _hand_over(self, lot: list[tuple[bytes, int]]) -> None:
         """Let the ROS thread have these messages and what there is more; until it is done, the
@@ -170,7 +183,7 @@ class LoopSubscription:
         if self._is_ended:
             return
         if lost:
-            self._on_loop([], lost)
+            self._on_loop([], lost, False)
         self._listen()
 
     # The ROS thread

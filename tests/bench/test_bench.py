@@ -19,8 +19,18 @@ import psutil
 import pytest
 
 from appliance import bench
-from appliance.bench import cells, client, command, ends, growth, load, report
-from appliance.bench.cells import CELLS, BridgeCell, Cell, LoadCell, Row, compare, median
+from appliance.bench import cells, client, command, conversion, ends, growth, load, report
+from appliance.bench.cells import (
+    CELLS,
+    BridgeCell,
+    Cell,
+    ConversionCell,
+    ImageCell,
+    LoadCell,
+    Row,
+    compare,
+    median,
+)
 from appliance.bench.client import LoadError, Target
 from appliance.bench.crowd import Crowd
 from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, Statement, grow
@@ -65,7 +75,9 @@ def test_every_load_gives_sane_figures_on_both_brokers(cell: Cell) -> None:
 
 @needs_mosquitto
 @pytest.mark.parametrize(
-    "cell", [cell for cell in CELLS if isinstance(cell, BridgeCell)], ids=lambda cell: cell.name
+    "cell",
+    [cell for cell in CELLS if isinstance(cell, (BridgeCell, ImageCell))],
+    ids=lambda cell: cell.name,
 )
 def test_every_bridge_gives_sane_figures_on_both_sides(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
@@ -79,6 +91,18 @@ def test_every_bridge_gives_sane_figures_on_both_sides(
         assert figures is not None and figures.lost < figures.messages
         check_sane(dataclasses.replace(figures, lost=0))
         assert figures.rate is not None and figures.rate < 2000
+
+
+def test_conversion_gives_sane_figures_and_both_give_the_same_json() -> None:
+    pytest.importorskip("rclpy")
+    (cell,) = (cell for cell in CELLS if isinstance(cell, ConversionCell))
+    row = compare(cell, "mosquitto", 0.3, repeats=1)
+    assert row.problem is None and row.missing is None
+    for figures in (row.ours, row.peer):
+        assert figures is not None and figures.messages > 0
+        assert figures.cpu_us is not None and 0.1 < figures.cpu_us < 10_000
+    cdr = conversion.sample()
+    assert json.loads(conversion.ours()(cdr)) == json.loads(conversion.rclpy()(cdr))
 
 
 @needs_mosquitto
@@ -506,6 +530,17 @@ def test_a_program_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None
 
 
 # The ends of a bridge
+
+
+@pytest.mark.parametrize("payload", [0, 100, 200, 20_000, 3_000_000])
+def test_the_size_of_a_packet_is_read_off_its_head(payload: int) -> None:
+    packet = client.publish_packet("bench/camera", bytes(payload))
+    assert ends.packet_size(memoryview(packet.ljust(5, b"x"))) == len(packet)
+
+
+def test_what_is_no_packet_is_told() -> None:
+    with pytest.raises(LoadError, match="no MQTT"):
+        ends.packet_size(memoryview(b"\x30" + b"\xff" * 4))
 
 
 def test_the_meter_counts_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,6 +74,13 @@ class Peer:
             self.publishers[topic].publish(message)
             time.sleep(1 / rate)
 
+    def publish_times(self, topic, count, rate):
+        """Vectors with the time in their last field."""
+        begun = time.monotonic()
+        for number in range(count):
+            self.publishers[topic].publish(load("geometry_msgs/msg/Vector3")(z=time.time()))
+            time.sleep(max(0, begun + number / rate - time.monotonic()))
+
     def subscribe(self, topic, type_name, reliability="reliable", durability="volatile"):
         def received(cdr):
             say("received", topic, cdr.hex() if len(cdr) <= 10_000 else len(cdr))

@@ -155,6 +155,48 @@ async def test_an_action_is_there_when_all_of_it_is(house, part):
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
+async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_again(house):
+    walks, _ = await begin(house)
+    said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
+    latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
+    status = house.node.add_publisher("/walk/_action/status", STATUS, latched)
+    status.publish(CONVERTERS.get(STATUS).from_dict(said))
+
+    def shown():
+        return house.broker.retained.get("r2d2/walk/_status")
+
+    await until(shown, "the status")
+    missing = walks.services[1]
+    missing.remove()
+    await until(lambda: shown() is None, "the action is not whole")
+    house.node.add_service(missing.name, missing.type, missing.handler)
+    await asyncio.sleep(0)
+    house.node.spin()
+    await until(shown, "the status, which its publisher does not send again")
+    subscriptions = list(house.node.subscriptions)
+    house.node.spin()
+    assert house.node.subscriptions == subscriptions
+
+
+async def test_an_action_is_of_one_type(house):
+    """Others may offer services by the same names, of which ROS takes those of one type for one."""
+    walks, client = await begin(house)
+    other = house.node.add_service("/walk/_action/send_goal", "acme/action/Crawl_SendGoal", None)
+    house.node.add_service("/walk/_action/get_result", "std_srvs/srv/Trigger", None)
+    await asyncio.sleep(0)
+    assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
+    result = walks.services[1]
+    result.remove()
+    await asyncio.sleep(0)
+    assert (await client.error(GOAL, {"order": 3}))[0] == "unavailable"
+    other.remove()
+    await asyncio.sleep(0)
+    assert (await client.error(GOAL, {"order": 3}))[0] == "unavailable"
+    house.node.add_service(result.name, result.type, result.handler)
+    await asyncio.sleep(0)
+    assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
+
+
 async def test_ros_ends_while_goals_are_under_way(house):
     _, client = await begin(house)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]

@@ -20,6 +20,7 @@ from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge, Bridged, RouteSettings
 from appliance.ros.flows import Echo, Route
+from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
 from appliance.store import MemoryStore
 
@@ -172,6 +173,48 @@ async def test_best_effort_is_qos_0_and_transient_local_is_retained(house):
     assert [qos for m, qos in house.client.received if m.topic == "r2d2/fast"] == [0]
     assert house.broker.retained.get("r2d2/fast") is None
     assert house.broker.retained.get("r2d2/map").payload == b'{"data":"new"}'
+
+
+async def test_few_are_held_of_what_turns_out_to_be_large(house):
+    house.start(to_mqtt("/text"), to_mqtt("/robot_description"))
+    text = house.node.add_publisher("/text", STRING)
+    latched = house.node.add_publisher("/robot_description", STRING, LATCHED)
+
+    def depths():
+        return {own.topic: own.endpoint.qos.depth for own in house.node.subscriptions}
+
+    def look():
+        for _ in range(10):
+            house.node.spin()
+
+    for peer in (text, latched):
+        peer.publish(string("small"))
+    look()
+    assert depths() == {"/text": 1000, "/robot_description": 1000}
+    for peer in (text, latched):
+        peer.publish(string("x" * LARGE))
+    look()
+    # What is latched would come once more with a new subscription, and is not sent in bursts.
+    assert depths() == {"/text": 10, "/robot_description": 1000}
+    now = list(house.node.subscriptions)
+    text.publish(string("small"))
+    look()
+    await house.settle()
+    assert house.node.subscriptions == now
+    assert house.client.payloads("r2d2/text")[-1] == b'{"data":"small"}'
+
+
+async def test_of_what_is_late_the_newest_is_carried(house):
+    house.node.takes_on_loop = True
+    house.start(to_mqtt("/a"), to_mqtt("/three", keep=3), to_mqtt("/map"))
+    for topic, qos in (("/a", None), ("/three", None), ("/map", LATCHED)):
+        house.node.add_publisher(topic, STRING, qos)
+    for own in house.node.subscriptions:
+        own.on_loop([(string(text), 0) for text in "xyz"], 1, True)
+    every = [b'{"data":"x"}', b'{"data":"y"}', b'{"data":"z"}']
+    assert house.client.payloads("r2d2/a") == every[-1:]
+    assert house.client.payloads("r2d2/three") == house.client.payloads("r2d2/map") == every
+    assert sorted(status.dropped for status in house.bridge.status()) == [1, 1, 3]
 
 
 async def test_samples_from_before_the_bridge_arrive(house):
@@ -901,6 +944,6 @@ async def test_what_there_was_no_room_for_on_ros_is_counted(house):
     house.node.add_publisher("/a", STRING)
     house.start(to_mqtt("/a", encoding="text"))
     (subscription,) = house.node.subscriptions
-    subscription.on_loop([(string("x"), 0)], 3)
+    subscription.on_loop([(string("x"), 0)], 3, False)
     assert house.status().dropped == 3
     assert house.client.payloads("r2d2/a") == [b"x"]

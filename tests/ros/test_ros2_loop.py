@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import struct
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ pytest.importorskip("rclpy")
 from test_ros2 import BYTES, STRING, domain, house, peer, route, string, until
 
 from appliance.ros import ros2, ros2_loop
+from appliance.ros.bridge import Bridge
 from appliance.ros.convert import compile_converter
 from appliance.ros.definitions import load_description
 from appliance.ros.mailbox import LARGE
@@ -53,7 +56,7 @@ class Taker:
     def _on_message(self, cdr, published_at=0):
         self.taken.append((threading.current_thread().name, cdr))
 
-    def _on_lot(self, lot, lost):
+    def _on_lot(self, lot, lost, is_late):
         self.lots.append(len(lot))
         self.lost += lost
         for cdr, _ in lot:
@@ -207,6 +210,28 @@ async def test_a_burst_of_the_states_of_joints_is_carried_whole(house, peer):
     await publishing
     await until(lambda: len(house.payloads("r2d2/a")) == 90, "all")
     assert house.bridge.status()[0].dropped == 0
+
+
+@pytest.mark.parametrize("keep", ["latest", 2000])
+async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, house, peer, keep):
+    monkeypatch.setattr(ros2_loop, "BEHIND", 0.2)
+    ages, latest = [], keep == "latest"
+
+    def slow(batch):
+        for _, message in batch:
+            ages.append(time.time() - struct.unpack_from("<d", message.payload, 20)[0])
+            time.sleep(0.002)
+
+    monkeypatch.setattr(Bridge, "_publish", lambda self, batch: slow(batch))
+    house.start(replace(route("/a", "mqtt", "cdr"), keep=keep))
+    await peer.do("advertise", "/a", "geometry_msgs/msg/Vector3")
+    await until(house.bridged, "/a")
+    await peer.do("matched", "/a")
+    await peer.do("publish_times", "/a", 1500, 1000)
+    await until(lambda: ages and ages[-1] > 0, "some")
+    status = house.bridge.status()[0]
+    assert (max(ages) < 0.45) is latest
+    assert (status.dropped > 300) is latest
 
 
 async def test_what_a_busy_loop_misses_is_counted(house, peer):

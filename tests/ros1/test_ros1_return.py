@@ -4,12 +4,21 @@ know the robot."""
 from __future__ import annotations
 
 import socket
+import threading
+import time
+from contextlib import ExitStack
 from functools import partial
+from xmlrpc.client import ServerProxy
+from xmlrpc.server import SimpleXMLRPCServer
 
 import psutil
 import pytest
 from appliance_process import eventually
 from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, end, is_installed, output
+
+from appliance.ros.node import BusError
+from appliance.ros.ros1 import POLL_INTERVAL
+from appliance.ros.ros1_peers import ask_publisher
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -32,6 +41,57 @@ def is_used(port: int, process: psutil.Process) -> bool:
     return any(found.laddr.port == port for found in process.net_connections("inet"))
 
 
+def test_a_caller_that_says_nothing_keeps_nobody_away(
+    world: World, robot: Node, appliance: Ros1Appliance
+) -> None:
+    with Mqtt(appliance) as client, ExitStack() as silent:
+        for port in ports(psutil.Process(appliance.pid)):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+        echo = world.begin("rostopic", "echo", "-n", "1", "/hear")
+        try:
+            greet = partial(client.paho.publish, "r2d2/hear", '{"data": "hello"}')
+            assert "hello" in output(echo, greet)
+        finally:
+            if echo.poll() is None:
+                end(echo)
+
+
+@pytest.mark.parametrize(
+    "address", ["rosrpc://127.0.0.1:99999", "rosrpc://[x", f"rosrpc://{'a' * 80}:80", "rosrpc://"]
+)
+def test_a_service_whose_address_is_none_is_left_out(
+    world: World, robot: Node, appliance: Ros1Appliance, address: str
+) -> None:
+    before = appliance.log.count("there is no bridge to ROS")
+    with ServerProxy(world.environment["ROS_MASTER_URI"]) as master, Mqtt(appliance) as client:
+        assert master.registerService("/bad", "/robot/bad", address, "http://127.0.0.1:1/")[0] == 1  # type: ignore[index]
+        try:
+            time.sleep(4 * POLL_INTERVAL)
+            assert client.call("r2d2/robot/switch", {"data": True})
+        finally:
+            master.unregisterService("/bad", "/robot/bad", address)
+    assert appliance.log.count("there is no bridge to ROS") == before
+
+
+@pytest.mark.parametrize("port", ["abc", -1, "9" * 30, [80], ""])
+def test_a_publisher_whose_port_is_none_is_left_out(port: object) -> None:
+    def told(*_: object) -> object:
+        return [1, "", ["TCPROS", "127.0.0.1", port]]
+
+    with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
+        uri = f"http://127.0.0.1:{server.server_address[1]}"
+        server.register_function(lambda *_: [1, "", uri], "lookupNode")
+        server.register_function(told, "requestTopic")
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            with pytest.raises(BusError, match="/other cannot be reached"):
+                ask_publisher(uri, "/me", "/other", "/odd")
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 def test_it_joins_again_and_leaves_another_its_name(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
@@ -39,6 +99,7 @@ def test_it_joins_again_and_leaves_another_its_name(
     before_ports = ports(process)
     joined, offered = "on ROS as /appliance", "/robot/switch can be called"
     before = {text: appliance.log.count(text) for text in (joined, offered)}
+    silent = [socket.create_connection(("127.0.0.1", port)) for port in before_ports]
     # The Master lets another node take the name.
     other = world.begin("rostopic", "echo", "/none", "__name:=appliance")
     try:
@@ -59,6 +120,8 @@ def test_it_joins_again_and_leaves_another_its_name(
     assert len(left) == 2, "that of XML-RPC, and that of TCPROS"
     for port in left:
         eventually(lambda port=port: not is_used(port, process), f"port {port} is free")  # type: ignore[misc]
+    for caller in silent:
+        caller.close()
 
 
 def test_a_master_that_is_killed_and_comes_back(

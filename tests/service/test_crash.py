@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import signal
@@ -73,6 +74,49 @@ def test_secrets_are_masked_and_nobody_else_reads_them(folder: Path) -> None:
     (report,) = reports(folder)
     assert "s3cret-word" not in report.read_text() and "some.Plugin" in report.read_text()
     assert report.stat().st_mode & 0o777 == 0o600 and folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_secrets_in_what_failed_are_masked_too(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    logs.recent.append("cannot log in with s3cret-word")
+    found = started(folder)
+    found.report(ValueError("no connection to sql://me:s3cret-word@db"), "a task failed")
+    found.stop()
+    (report,) = reports(folder)
+    assert "no connection to sql://me:****" in report.read_text()
+    assert "s3cret-word" not in report.read_text() + caplog.text
+
+
+def test_what_is_no_text_is_reported_too(folder: Path) -> None:
+    """A file's name may have any bytes in it, and be in an error."""
+    found = started(folder)
+    found.report(OSError("no such file: \udcff.yaml"), "a task failed")
+    found.stop()
+    (report,) = reports(folder)
+    assert "no such file: \\udcff.yaml" in report.read_text()
+
+
+def test_half_a_report_is_none(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found, write = started(folder), os.write
+    left = [100]
+
+    def full(descriptor: int, data: memoryview) -> int:
+        if left[0] <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = write(descriptor, data[: left[0]])
+        left[0] -= written
+        return written
+
+    monkeypatch.setattr(os, "write", full)
+    assert found.report(ValueError("x"), "a task failed") is None
+    assert reports(folder) == []
+    left[0] = 100_000
+    monkeypatch.setattr(crash, "_REPORTED", "x" * 100_000)
+    found.crash(ValueError("y"))  # there is room for the report, and no more
+    monkeypatch.undo()
+    (report,) = reports(folder)
+    assert "ValueError: y" in report.read_text()
 
 
 def test_they_are_bounded(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

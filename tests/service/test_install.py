@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shlex
@@ -117,6 +118,54 @@ def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
     os.link(secret, home / "hard")
     install(image, single_file(tmp_path))
     assert secret.stat().st_uid == os.geteuid()
+
+
+@pytest.mark.parametrize(
+    "place", ["usr/local/bin", "etc/systemd/system", "etc/default", "run", "var/lib"]
+)
+def test_an_image_does_not_lead_out_of_itself(image: Path, tmp_path: Path, place: str) -> None:
+    """A link in it with a path from the top means the image's own, and led to this computer's."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (image / place).parent.mkdir(parents=True, exist_ok=True)
+    (image / place).symlink_to(outside)
+    with pytest.raises(InstallError, match=f"leads out of {image}, to {outside}"):
+        install(image, single_file(tmp_path))
+    assert list(outside.iterdir()) == [] and not (image / "etc/appliance").exists()
+
+
+@pytest.mark.parametrize("line", [b"\n", b"+\n", b"jos\xe9:x:1:1:Jos\xe9:/:\n"])
+def test_odd_lines_in_a_list_of_users(image: Path, tmp_path: Path, line: bytes) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    for name in ("passwd", "group"):
+        file = image / "etc" / name
+        file.write_bytes(line + file.read_bytes())
+    install(image, single_file(tmp_path), user="robot")
+    assert "User=robot\nGroup=drivers\n" in (image / UNIT).read_text()
+
+
+def test_one_that_looks_as_another_ends(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when the first ends just between the steps of the second's look at its lock."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    first, second = (Installation(Path("/", COMMAND), root=image)._alone() for _ in range(2))
+    first.__enter__()
+    with pytest.raises(InstallError, match=r"another .* is at work"):
+        install(image, single_file(tmp_path))
+
+    def end_first(descriptor: int, how: int) -> None:
+        monkeypatch.undo()
+        first.__exit__(None, None, None)
+
+    monkeypatch.setattr("fcntl.flock", end_first)
+    with pytest.raises(InstallError, match=r"another .* is at work"), second:
+        pass
+    install(image, single_file(tmp_path))
 
 
 def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) -> None:
@@ -344,6 +393,35 @@ def run_script(image: Path, name: str, *arguments: str) -> list[str]:
     subprocess.run(["sh", "-c", text, name, *arguments], env=environment, check=True)
     lines = called.read_text().splitlines() if called.exists() else []
     return [line.removeprefix(f"{image}/") for line in lines]
+
+
+def test_a_disk_that_is_mounted_there_does_not_keep_it_from_being_purged(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    programs, data = image / "programs", image / "var/lib/appliance"
+    programs.mkdir()
+    busy = f'#!/bin/sh\ncase "$*" in *{data}) exit 1;; esac\nexec /bin/rm "$@"\n'
+    (programs / "rm").write_text(busy)
+    (programs / "rm").chmod(0o755)
+    for folder in (image / "etc/appliance", data):
+        folder.mkdir(parents=True)
+    run_script(image, "postrm", "purge")
+    assert not (image / "etc/appliance").exists()
+
+    install(image, single_file(tmp_path))
+    (data / "store.db").touch()
+    rmdir = os.rmdir
+
+    def refuse(path: Any, **options: Any) -> None:
+        if str(path) == str(data):
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        rmdir(path, **options)
+
+    monkeypatch.setattr(os, "rmdir", refuse)
+    list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    assert list(data.iterdir()) == [] and not (image / "etc/default/appliance").exists()
 
 
 def test_the_package_runs_its_own_command(image: Path) -> None:

@@ -114,6 +114,22 @@ async def test_nobody_listens(address: str) -> None:
     notifier.close()
 
 
+async def test_no_status_spoils_what_systemd_is_told(tmp_path: Path) -> None:
+    """It may have in it what a node on the network says. systemd ends lines at `\\r` as well, and
+    takes nothing of a datagram with a NUL or with more than 4096 bytes."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(5)
+        notifier = Notifier(str(tmp_path / "notify"))
+        status = "no ROS:\rMAINPID=1\nWATCHDOG=trigger\0 \ud800" + "€" * 5000
+        notifier.start(asyncio.get_running_loop(), lambda: status)
+        said = listening.recv(65536)
+        notifier.close()
+    assert len(said) < 4096 and b"\0" not in said
+    names = [line.partition(b"=")[0] for line in said.splitlines()]
+    assert names == [b"READY", b"STATUS"]
+
+
 async def test_systemd_does_not_read(tmp_path: Path) -> None:
     """A sign of life that does not fit into the socket's queue holds up nothing."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
