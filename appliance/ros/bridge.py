@@ -30,7 +30,7 @@ from appliance.ros.commands import Commands, Surroundings
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.diagnostics import Diagnostics
-from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings, ToMqtt, ToRos
+from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
@@ -38,6 +38,8 @@ from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
+from appliance.ros.to_mqtt import ToMqtt
+from appliance.ros.to_ros import ToRos
 
 __all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 

@@ -21,9 +21,10 @@ from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.backlog import Backlog
 from appliance.ros.convert import ConversionError, Converter, Converters
-from appliance.ros.flows import REPORT_INTERVAL, Route, Tell, ToRos
+from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.rules import CommandRules, FieldLimits
+from appliance.ros.to_ros import ToRos
 
 #: Seconds until a stop message that ROS would not take is published again.
 RETRY = 0.05

@@ -343,7 +343,7 @@ async def test_a_message_that_cannot_be_converted_is_counted_and_told_once(house
 
 async def test_rate_is_kept_before_conversion(house, monkeypatch):
     now = 100.0
-    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
     house.start(to_mqtt("/a", rate=10, keep=1000))
     peer = house.node.add_publisher("/a", STRING)
     for number in range(200):  # 5 s at 40 Hz, unevenly
@@ -357,7 +357,7 @@ async def test_rate_is_kept_before_conversion(house, monkeypatch):
 
 async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, monkeypatch):
     now = 100.0
-    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
     house.start(to_mqtt("/a", encoding="text", rate=10), to_mqtt("/b", bytes_per_second=20))
     peer, other = (house.node.add_publisher(name, STRING) for name in ("/a", "/b"))
     for number in range(10):

@@ -324,7 +324,7 @@ async def test_schemas_of_what_is_bridged_are_retained(house):
 
 async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now[0])
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now[0])
     house.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
     peer = house.node.add_publisher("/chatter", STRING)
     text = string("x" * 991)  # a thousand bytes
