@@ -87,7 +87,9 @@ def _read_all(connection: sqlite3.Connection) -> Rows:
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
         raise DamagedError(verdict.replace("\n", " "))
-    return [{row[0]: row for row in connection.execute(select(table))} for table in Table]
+    return [
+        {row[0]: row for row in connection.execute(select(table, connection))} for table in Table
+    ]
 
 
 def _read_copy(path: Path, error: Exception) -> Contents:
@@ -168,7 +170,9 @@ def _salvage(path: Path) -> Rows:
             # From both ends, up to what cannot be read.
             for order in ("ASC", "DESC"):
                 with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError):
-                    for row in connection.execute(f"{select(table)} ORDER BY id {order}"):
+                    for row in connection.execute(
+                        f"{select(table, connection)} ORDER BY id {order}"
+                    ):
                         rows[table].setdefault(row[0], row)
     return rows
 

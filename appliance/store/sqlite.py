@@ -553,7 +553,8 @@ class SqliteStore:
         key = known.filters.get(subscription.filter)
         if key is None:
             key = known.filters[subscription.filter] = next(self._keys)
-        row = subscription_row(key, known.key, subscription)
+        replaying = subscription.qos > 0 and subscription.filter in session.replays
+        row = subscription_row(key, known.key, subscription, replaying=replaying)
         self._open.put(Table.SUBSCRIPTION, key, row)
         self._stage()
 

@@ -79,7 +79,7 @@ async def test_a_newer_database_is_left_alone(
     await house.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
     before = house.path.read_bytes()
-    with pytest.raises(StoreError, match=r"newer appliance \(version 2 .* knows 0\)"):
+    with pytest.raises(StoreError, match=r"newer appliance \(version 3 .* knows 0\)"):
         SqliteStore(house.path).open()
     assert house.path.read_bytes() == before
 
