@@ -155,7 +155,11 @@ class SqliteStore:
             database.make_directory(self.path)
             self._take_lock()
         except OSError as error:
-            if self.path.exists():
+            try:
+                found = self.path.exists()
+            except PermissionError:
+                raise StoreError(database.belongs_to_another(self.path)) from None
+            if found:
                 log.warning("%s: %s", error.filename, error.strerror)
             else:
                 raise StoreError(
