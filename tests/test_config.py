@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -158,6 +159,12 @@ log: {level: warn}
         assert problem.startswith(start)
 
 
+#: Ten lines that stand for ten thousand million values.
+_BOMB = "a0: &a0 x\n" + "".join(
+    f"a{n + 1}: &a{n + 1} [{','.join([f'*a{n}'] * 10)}]\n" for n in range(10)
+)
+
+
 @pytest.mark.parametrize(
     ("text", "place"),
     [
@@ -168,6 +175,7 @@ log: {level: warn}
         ("robot: 2024-13-45", "1: robot: month must be in 1..12"),
         ("? [a]\n: b", "1: a key must be text"),
         ("a: 1\n---\nb: 1", "2: "),
+        (_BOMB, "more than 100000 values"),
         ("robot: !!python/object:os.system x", "1: could not determine a constructor"),
     ],
 )
@@ -568,6 +576,18 @@ def test_what_is_said_beside_names() -> None:
     ]
     (found,) = problems("bridge: {services: [{ros: [/a, /b], to: mqtt, type: a/srv/B}]}")
     assert "to: must be ros when ros is a pattern or a list" in found
+
+
+def test_what_is_no_file_or_too_large_for_one(tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for name in ("folder.yaml", "pipe.yaml"):
+        with pytest.raises(ConfigError, match=rf"{name}: is not a file"):
+            config.load(tmp_path / name)
+    with (tmp_path / "huge.yaml").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(ConfigError, match=r"huge\.yaml: longer than 1 Mi characters"):
+        config.load(tmp_path / "huge.yaml")
 
 
 def test_a_file_that_may_not_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
