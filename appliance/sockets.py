@@ -29,6 +29,8 @@ def listen(host: str, port: int) -> socket.socket:
             (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
         )
     except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            error.strerror = "it is in use already; `appliance doctor` says who has it"
         raise _cannot_listen(f"{host or '*'}:{port}", error) from None
     sock.setblocking(False)
     return sock

@@ -578,6 +578,32 @@ def test_what_is_said_beside_names() -> None:
     assert "to: must be ros when ros is a pattern or a list" in found
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "collide"),
+    [
+        ("127.0.0.1:1883", "127.0.0.1:1883", True),
+        ("127.0.0.1:1883", "0.0.0.0:1883", True),
+        ("[::]:1883", "[::1]:1883", True),
+        (":1883", "127.0.0.1:1883", True),
+        (":1883", "[::1]:1883", True),
+        ("0.0.0.0:1883", "[::]:1883", False),
+        ("0.0.0.0:1883", "[::1]:1883", False),
+        ("127.0.0.1:1883", "127.0.0.2:1883", False),
+        ("0.0.0.0:1883", "127.0.0.1:8883", False),
+        (":0", "127.0.0.1:0", False),
+        ("unix:/a", ":1883", False),
+    ],
+)
+def test_listeners_that_keep_each_other_out(one: str, other: str, collide: bool) -> None:
+    for binds in ((one, other), (other, one)):
+        text = "".join(f"{{bind: '{bind}'}}, " for bind in binds)
+        text = f"broker: {{listeners: [{text}]}}"
+        if collide:
+            assert "listens there already" in problems(text)[0]
+        else:
+            loads(text)
+
+
 def test_what_is_no_file_or_too_large_for_one(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     os.mkfifo(tmp_path / "pipe.yaml")

@@ -19,7 +19,6 @@ from pydantic_core import ErrorDetails
 
 from appliance.config.printing import mask
 from appliance.config.quantities import (
-    Bind,
     either,
     format_duration,
     format_size,
@@ -130,10 +129,10 @@ def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | No
 
 
 def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
-    seen: dict[Bind, int] = {}
-    for number, listener in enumerate(settings.broker.listeners):
-        first = seen.setdefault(listener.bind, number)
-        if first != number and (listener.bind.port or listener.bind.path):
+    binds = [listener.bind for listener in settings.broker.listeners]
+    for number, bind in enumerate(binds):
+        first = next((n for n, other in enumerate(binds[:number]) if bind.collides(other)), None)
+        if first is not None:
             path = ("broker", "listeners", number, "bind")
             yield path, f"broker.listeners[{first}] listens there already"
     tls = settings.broker.tls
