@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import gc
 import logging
 import os
@@ -368,9 +369,12 @@ class App:
 
     async def _answer_reload(self) -> list[str]:
         try:
-            return await self.reload()
+            changed = await self.reload()
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
+        if not changed and self._reload.last_change:  # mostly by itself, before anybody could ask
+            return [f"nothing has changed since the last time: {self._reload.last_change}"]
+        return changed
 
     async def _answer_routes(self) -> list[dict[str, object]]:
         bridge = self._bridge_that_runs()
@@ -402,7 +406,13 @@ class App:
             "skipped": self._answer_skipped,
         }
         control = Control(settings.control, commands)
-        await control.start()
+        try:
+            await control.start()
+        except OSError as error:
+            # MQTT does without, and a robot's disk that has errors is mounted read-only.
+            if error.errno not in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
+                raise
+            log.error("`appliance status`, `reload` and `routes` are not answered: %s", error)
         self._stack.push_async_callback(control.stop)
         if settings.reload_on_change:
             self._beside(watch(self._reload.files, self._try_reload))

@@ -49,6 +49,7 @@ for name, group in GROUPS.items():
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Runs the command and exits with its code; what a user can mend is told in plain words."""
+    _open_standard_streams()
     given = sys.argv[1:] if arguments is None else arguments
     given, ros_arguments = _split_ros_arguments(given)
     try:
@@ -65,6 +66,14 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         what = f"{error.filename}: {what}" if error.filename else what
         typer.secho(f"appliance: {what}", fg="red", err=True)
     sys.exit(1)
+
+
+def _open_standard_streams() -> None:
+    """Nothing else gets their numbers, such as the database, which C libraries would write to."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
 
 
 def _split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:

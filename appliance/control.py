@@ -55,7 +55,7 @@ class Control:
             OSError: another appliance listens there, or the folder cannot be written to.
         """
         with _short(self._path) as path:
-            listening = listen_on_path(path, 0o600)
+            listening = listen_on_path(path, 0o600, "control")
         self._server = await asyncio.start_unix_server(
             self._serve, sock=listening, limit=LONGEST_REQUEST
         )

@@ -17,6 +17,9 @@ import yaml
 KeyPath = tuple["str | int", ...]
 """The keys and list positions that lead to a value, from the top of the file."""
 
+#: More values than a configuration has: a few lines of aliases of aliases can stand for billions.
+_MOST_VALUES = 100_000
+
 _VARIABLE = re.compile(r"\$?\$\{([A-Za-z_][A-Za-z0-9_]*)(?::-([^}]*))?\}")
 
 
@@ -50,6 +53,7 @@ class Document:
         self._environment = environment
         self._lines: dict[KeyPath, int] = {}
         self._written: dict[KeyPath, str] = {}
+        self._count = 0
         self.values = self._read(text)
 
     def line(self, path: KeyPath) -> int:
@@ -91,6 +95,9 @@ class Document:
     def _value(
         self, loader: yaml.SafeLoader, node: yaml.Node, path: KeyPath, around: tuple[yaml.Node, ...]
     ) -> Any:
+        self._count += 1
+        if self._count > _MOST_VALUES:
+            raise yaml.YAMLError(f"more than {_MOST_VALUES} values, those of aliases among them")
         self._lines.setdefault(path, node.start_mark.line + 1)
         if node in around:
             self._report(path, "is an alias of something that contains it")

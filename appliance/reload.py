@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Final, cast
 
@@ -90,6 +91,8 @@ class Reload:
         self._turn = asyncio.Lock()
         #: Of the last one; None when there was none.
         self.outcome: Outcome | None = None
+        #: What the last one that changed anything has changed, and when; empty when none did.
+        self.last_change = ""
 
     @property
     def settings(self) -> Settings:
@@ -124,6 +127,8 @@ class Reload:
                     self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
                 raise
             text = ", ".join(changed) or "nothing has changed"
+            if changed:
+                self.last_change = f"at {datetime.now():%H:%M:%S}, {text}"
             self._ended(True, text)
             log.info("reloaded: %s", text)
             return changed

@@ -15,6 +15,9 @@ log = logging.getLogger(__name__)
 #: Connections that wait to be accepted, as far as the system allows.
 BACKLOG = 4096
 
+#: Where the configuration says where to listen.
+_LISTENERS = "broker.listeners"
+
 
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; an empty host is every address, IPv6 ones too where there are any."""
@@ -26,13 +29,18 @@ def listen(host: str, port: int) -> socket.socket:
             (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
         )
     except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            error.strerror = "it is in use already; `appliance doctor` says who has it"
         raise _cannot_listen(f"{host or '*'}:{port}", error) from None
     sock.setblocking(False)
     return sock
 
 
-def listen_on_path(path: Path, mode: int) -> socket.socket:
-    """A listening Unix socket, in place of one that nobody listens on any more."""
+def listen_on_path(path: Path, mode: int, key: str = _LISTENERS) -> socket.socket:
+    """A listening Unix socket, in place of one that nobody listens on any more.
+
+    `key` of the configuration is what an error names.
+    """
     sock = socket.socket(socket.AF_UNIX)
     try:
         sock.setblocking(False)
@@ -43,7 +51,7 @@ def listen_on_path(path: Path, mode: int) -> socket.socket:
         sock.listen(BACKLOG)
     except OSError as error:
         sock.close()
-        raise _cannot_listen(f"unix:{path}", error) from None
+        raise _cannot_listen(f"unix:{path}", error, key) from None
     return sock
 
 
@@ -65,9 +73,9 @@ def _clear(path: Path) -> None:
     raise OSError(errno.EADDRINUSE, "another process listens there")
 
 
-def _cannot_listen(where: str, error: OSError) -> OSError:
+def _cannot_listen(where: str, error: OSError, key: str = _LISTENERS) -> OSError:
     reason = error.strerror or str(error)
-    return OSError(error.errno, f"cannot listen on {where} (broker.listeners): {reason}")
+    return OSError(error.errno, f"cannot listen on {where} ({key}): {reason}")
 
 
 def allow_files(needed: int) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
+from appliance_process import PATIENCE, eventually
 
 from appliance import cli
 from appliance.access import Passwords
@@ -67,6 +70,34 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("run", "--log-format", "xml") == 2
     assert run("pub", "a", "-m", "x", "-f", "y") == 2
     assert run("sub") == 2
+
+
+@pytest.mark.parametrize("content", [bytes(range(128, 256)), b"a" * 100_000])
+def test_a_password_file_that_is_something_else(
+    here: Path, output: pytest.CaptureFixture[str], content: bytes
+) -> None:
+    before = (here / "users.passwd").read_bytes()
+    (here / "other.file").write_bytes(content)
+    assert run("user", "add", "bob", "--password-file", "other.file") == 1
+    assert "other.file: " in output.readouterr().err
+    assert (here / "users.passwd").read_bytes() == before
+
+
+def test_nothing_gets_the_numbers_of_closed_standard_streams(here: Path) -> None:
+    """A C library's complaint on number 2 would be written into the database."""
+    settings = yaml.safe_load((here / "appliance.yaml").read_text())
+    settings |= {"broker": {"listeners": [{"bind": "127.0.0.1:0"}]}, "bridge": {"bus": "none"}}
+    (here / "appliance.yaml").write_text(yaml.safe_dump(settings))
+    command = [sys.executable, "-m", "appliance", "run"]
+    process = subprocess.Popen(command, preexec_fn=lambda: os.closerange(0, 3))
+    try:
+        eventually(lambda: (here / "state/control.sock").exists(), "it runs")
+        links = [str(Path(f"/proc/{process.pid}/fd/{number}").readlink()) for number in range(3)]
+    finally:
+        process.terminate()
+        process.wait(PATIENCE)
+    assert links == ["/dev/null"] * 3
+    assert process.returncode == 0
 
 
 def test_init_tells_the_password_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,6 +280,9 @@ def test_acl_explain(output: pytest.CaptureFixture[str]) -> None:
     assert run("acl", "explain", "", "r2/#") == 0
     assert "subscribe  refused" in output.readouterr().out
     assert run("acl", "explain", "alice", "r2/#/x") == 2
+    assert "no user" not in output.readouterr().err
+    assert run("acl", "explain", "alcie", "r2/odom") == 0
+    assert "note: there is no user 'alcie' in users.passwd" in output.readouterr().err
 
 
 def test_the_client_needs_a_password(

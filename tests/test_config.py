@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -158,6 +159,12 @@ log: {level: warn}
         assert problem.startswith(start)
 
 
+#: Ten lines that stand for ten thousand million values.
+_BOMB = "a0: &a0 x\n" + "".join(
+    f"a{n + 1}: &a{n + 1} [{','.join([f'*a{n}'] * 10)}]\n" for n in range(10)
+)
+
+
 @pytest.mark.parametrize(
     ("text", "place"),
     [
@@ -168,6 +175,7 @@ log: {level: warn}
         ("robot: 2024-13-45", "1: robot: month must be in 1..12"),
         ("? [a]\n: b", "1: a key must be text"),
         ("a: 1\n---\nb: 1", "2: "),
+        (_BOMB, "more than 100000 values"),
         ("robot: !!python/object:os.system x", "1: could not determine a constructor"),
     ],
 )
@@ -595,6 +603,44 @@ def test_what_is_said_beside_names() -> None:
     ]
     (found,) = problems("bridge: {services: [{ros: [/a, /b], to: mqtt, type: a/srv/B}]}")
     assert "to: must be ros when ros is a pattern or a list" in found
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "collide"),
+    [
+        ("127.0.0.1:1883", "127.0.0.1:1883", True),
+        ("127.0.0.1:1883", "0.0.0.0:1883", True),
+        ("[::]:1883", "[::1]:1883", True),
+        (":1883", "127.0.0.1:1883", True),
+        (":1883", "[::1]:1883", True),
+        ("0.0.0.0:1883", "[::]:1883", False),
+        ("0.0.0.0:1883", "[::1]:1883", False),
+        ("127.0.0.1:1883", "127.0.0.2:1883", False),
+        ("0.0.0.0:1883", "127.0.0.1:8883", False),
+        (":0", "127.0.0.1:0", False),
+        ("unix:/a", ":1883", False),
+    ],
+)
+def test_listeners_that_keep_each_other_out(one: str, other: str, collide: bool) -> None:
+    for binds in ((one, other), (other, one)):
+        text = "".join(f"{{bind: '{bind}'}}, " for bind in binds)
+        text = f"broker: {{listeners: [{text}]}}"
+        if collide:
+            assert "listens there already" in problems(text)[0]
+        else:
+            loads(text)
+
+
+def test_what_is_no_file_or_too_large_for_one(tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for name in ("folder.yaml", "pipe.yaml"):
+        with pytest.raises(ConfigError, match=rf"{name}: is not a file"):
+            config.load(tmp_path / name)
+    with (tmp_path / "huge.yaml").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(ConfigError, match=r"huge\.yaml: longer than 1 Mi characters"):
+        config.load(tmp_path / "huge.yaml")
 
 
 def test_a_file_that_may_not_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,8 @@ def read_text(path: Path, advice: str, limit: int = MAX_SIZE) -> str:
     AccessFileError when it is missing (then with `advice`), too large or not UTF-8.
     """
     try:
+        if path.is_fifo():  # somebody who writes to it would be waited for
+            raise AccessFileError([Problem(path, 0, 0, "is no file, but a pipe")])
         with path.open("rb") as file:
             data = file.read(limit + 1)
     except FileNotFoundError:

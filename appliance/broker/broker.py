@@ -571,6 +571,8 @@ class Broker:
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
         session.replay(subscription.filter, self._find_retained(session, subscription.filter))
+        if session.persistent and subscription.qos:
+            self.store.subscribed(session, subscription)
 
     def _find_retained(self, session: Session, topic_filter: str) -> Iterator[Delivery | None]:
         """What a subscription asks for, checked message by message as the client takes them.

@@ -74,6 +74,8 @@ class Client:
         self._store = broker.store
         #: PUBRELs that wait until the store can keep what they release.
         self._postponed: dict[int, None] = {}
+        #: QoS 2 messages that were refused, the last ones: some clients release them all the same.
+        self._refused: dict[int, None] = {}
         #: A packet that is worked on in several turns.
         self._work: Iterator[Packet | None] | None = None
         self._connect: Connect | None = None
@@ -230,9 +232,10 @@ class Client:
         self._counters.publish_refused += 1
         reason = "the payload is marked as UTF-8 text and is not"
         self.broker.complain(session, "may not publish to %s: %s", quote(message.topic), reason)
-        if message.qos:
-            first = 0x40 if message.qos == 1 else 0x50
-            self.output.acknowledge(first, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+        if message.qos == 1:
+            self.output.acknowledge(0x40, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+        elif message.qos:
+            self._refuse_qos2(packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
 
     def _on_publish_qos2(
         self, session: Session, packet_id: int, message: Message, route: Route
@@ -247,7 +250,7 @@ class Client:
         ):
             session.unhold(packet_id)
             self._counters.publish_dropped += 1
-            self.output.acknowledge(0x50, packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
+            self._refuse_qos2(packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
             return
         if held is not None and not held.message.is_like(message):
             # A client that has lost its memory begins anew with the same ids: what it does not
@@ -275,7 +278,16 @@ class Client:
                 code = ReasonCode.QUOTA_EXCEEDED
                 if self._version != 5:
                     raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
-        self.output.acknowledge(0x50, packet_id, code, _reason(code, route))
+        if code:
+            self._refuse_qos2(packet_id, code, _reason(code, route))
+        else:
+            self.output.acknowledge(0x50, packet_id, code)
+
+    def _refuse_qos2(self, packet_id: int, code: ReasonCode, reason: str) -> None:
+        self._refused[packet_id] = None
+        if len(self._refused) > self.broker.limits.inflight:
+            del self._refused[next(iter(self._refused))]
+        self.output.acknowledge(0x50, packet_id, code, reason)
 
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
         session = self.session
@@ -296,9 +308,14 @@ class Client:
             if self._ledger.failing and self._must_postpone(session, packet_id):
                 return
             held = session.unhold(packet_id)
+            answer = ReasonCode.SUCCESS
             if held is not None:
                 self.broker.release(held, session, self.wire.now() - held.since)
-            self.output.acknowledge(0x70, packet_id, ReasonCode.SUCCESS)
+            elif self._refused and packet_id in self._refused:
+                # paho-mqtt passes over the PUBREC that says so, and would tell of a success.
+                del self._refused[packet_id]
+                answer = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
+            self.output.acknowledge(0x70, packet_id, answer)
         elif not session.pubcomp(packet_id):
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
 

@@ -35,6 +35,8 @@ class Kept:
     will: PendingWill | None
     will_at: float | None
     subscriptions: list[Subscription] = field(default_factory=list)
+    #: Those of them whose retained messages were not all sent.
+    replaying: list[Subscription] = field(default_factory=list)
     #: By packet id, in the order sent; None where only PUBREL is left.
     inflight: dict[int, Owed | None] = field(default_factory=dict)
     queue: list[Owed] = field(default_factory=list)
@@ -70,6 +72,10 @@ def restore(broker: Broker, kept: list[Kept], retained: list[Message]) -> None:
     for entry in kept:  # what is owed names sessions and groups, all of which are there now
         _restore_owed(broker, entry)
     broker.retained.restore(retained)
+    for entry in kept:
+        assert entry.session is not None
+        for subscription in entry.replaying:  # from the beginning: what was sent is not known
+            broker.replay_retained(entry.session, subscription, is_new=True)
 
 
 def _restore_owed(broker: Broker, entry: Kept) -> None:

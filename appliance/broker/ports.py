@@ -201,7 +201,7 @@ class Store(Protocol):
         """The session and all that belongs to it ended."""
 
     def subscribed(self, session: Session, subscription: Subscription) -> None:
-        """The session subscribed, or subscribed anew with other options."""
+        """The session subscribed, or anew, or its `replays` of that filter begin or end."""
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         """The session unsubscribed."""

@@ -349,6 +349,8 @@ class Session:
                     delivery = next(deliveries)
                 except StopIteration:
                     del self.replays[topic_filter]
+                    if self.expiry and needs_window:
+                        self.ledger.store.subscribed(self, self.subscriptions[topic_filter])
                     break
                 if delivery is None:
                     continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -155,7 +155,7 @@ def acl_explain(
 ) -> None:
     """Say what a user may do with a topic, and which rule of which file decides it."""
     settings = load(config)
-    from appliance.access import AccessFileError, Acl
+    from appliance.access import AccessFileError, Acl, Passwords
     from appliance.broker.ports import Identity
 
     try:
@@ -166,3 +166,7 @@ def acl_explain(
     except ValueError as error:
         raise typer.BadParameter(f"{topic!r}: {error}") from None
     typer.echo(str(explanation))
+    with suppress(AccessFileError):
+        users = Passwords.load(settings.broker.users)
+        if user and user not in users.users():
+            typer.secho(f"note: {_no_user(user, users)}", fg="yellow", err=True)

@@ -27,7 +27,9 @@ class Connection:
     )
     port: Annotated[
         int | None,
-        typer.Option("--port", "-p", help="Else the TLS listener's of the configuration."),
+        typer.Option(
+            "--port", "-p", min=1, max=65535, help="Else the TLS listener's of the configuration."
+        ),
     ] = None
     ca: Annotated[
         Path | None,

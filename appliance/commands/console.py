@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,6 +28,10 @@ PasswordFileOption = Annotated[
 GenerateOption = Annotated[
     bool, typer.Option("--generate", help="Make a random password, and show it once.")
 ]
+
+
+#: Of the line that a password is read from: in MQTT it has at most 65,535 bytes.
+LONGEST_PASSWORD = 65_536
 
 
 class CommandError(Exception):
@@ -63,8 +68,14 @@ def new_password(whose: str, file: str | None, generate: bool) -> str:
 
 def read_password(file: str) -> str:
     """The first line of the file; - is standard input."""
-    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
-    return text.split("\n", 1)[0].rstrip("\r")
+    try:
+        with nullcontext(sys.stdin) if file == "-" else Path(file).open(encoding="utf-8") as opened:
+            line = opened.readline(LONGEST_PASSWORD + 1)
+    except UnicodeDecodeError:
+        raise CommandError(f"{file}: this is no password: it is not UTF-8 text") from None
+    if len(line) > LONGEST_PASSWORD:
+        raise CommandError(f"{file}: its first line is too long for a password: is it the file?")
+    return line.rstrip("\r\n")
 
 
 def shown(path: Path) -> str:

@@ -88,6 +88,21 @@ class Bind(NamedTuple):
         except ValueError:
             return self.host == "localhost"
 
+    def collides(self, other: Bind) -> bool:
+        """Whether no two sockets can listen on the two, one of which may be every address."""
+        if self.path is not None or other.path is not None:
+            return self.path == other.path
+        if self.port != other.port or not self.port:
+            return False
+        hosts = {self.host, other.host}
+        six = [":" in host for host in hosts]
+        return (
+            len(hosts) == 1
+            or "" in hosts
+            or ("0.0.0.0" in hosts and not any(six))
+            or ("::" in hosts and all(six))
+        )
+
 
 def parse_bind(value: object) -> Bind:
     """`host:port`, `[::1]:port`, `:port` or `unix:path`. Raises ValueError."""

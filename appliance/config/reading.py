@@ -19,7 +19,6 @@ from pydantic_core import ErrorDetails
 
 from appliance.config.printing import mask
 from appliance.config.quantities import (
-    Bind,
     either,
     format_duration,
     format_size,
@@ -43,6 +42,10 @@ SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Where the configuration is looked for when no file is named; the first that exists is used."""
 
 
+#: Characters of a file that can be meant.
+_MAX_SIZE = 1 << 20
+
+
 class ConfigError(Exception):
     """The configuration cannot be used; `problems` has everything that is wrong with it."""
 
@@ -57,6 +60,8 @@ def find(path: Path | None = None) -> Path:
         try:
             if candidate.is_file():
                 return candidate
+            if candidate.exists():
+                raise ConfigError([Problem(candidate, 0, "", "is not a file")])
         except PermissionError:
             text = "may not be looked at: run this as the appliance's user, or as root"
             raise ConfigError([Problem(candidate, 0, "", text)]) from None
@@ -72,10 +77,14 @@ def load(path: Path | None = None) -> Settings:
     """
     file = find(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        with file.open(encoding="utf-8") as opened:
+            text = opened.read(_MAX_SIZE + 1)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
         raise ConfigError([Problem(file, 0, "", f"cannot be read: {reason}")]) from None
+    if len(text) > _MAX_SIZE:
+        what = f"longer than {_MAX_SIZE >> 20} Mi characters: is it the right file?"
+        raise ConfigError([Problem(file, 0, "", what)])
     return loads(text, file, {**of_service(file), **os.environ})
 
 
@@ -120,10 +129,10 @@ def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | No
 
 
 def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
-    seen: dict[Bind, int] = {}
-    for number, listener in enumerate(settings.broker.listeners):
-        first = seen.setdefault(listener.bind, number)
-        if first != number and (listener.bind.port or listener.bind.path):
+    binds = [listener.bind for listener in settings.broker.listeners]
+    for number, bind in enumerate(binds):
+        first = next((n for n, other in enumerate(binds[:number]) if bind.collides(other)), None)
+        if first is not None:
             path = ("broker", "listeners", number, "bind")
             yield path, f"broker.listeners[{first}] listens there already"
     tls = settings.broker.tls

@@ -6,6 +6,8 @@ import contextlib
 import fcntl
 import logging
 import os
+import pwd
+import shlex
 import shutil
 import sqlite3
 import tempfile
@@ -87,7 +89,9 @@ def _read_all(connection: sqlite3.Connection) -> Rows:
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
         raise DamagedError(verdict.replace("\n", " "))
-    return [{row[0]: row for row in connection.execute(select(table))} for table in Table]
+    return [
+        {row[0]: row for row in connection.execute(select(table, connection))} for table in Table
+    ]
 
 
 def _read_copy(path: Path, error: Exception) -> Contents:
@@ -101,6 +105,8 @@ def _read_copy(path: Path, error: Exception) -> Contents:
             shutil.copyfile(path, copy)
             if _beside(path, _LOG).exists():
                 shutil.copyfile(_beside(path, _LOG), _beside(copy, _LOG))
+        except PermissionError:
+            raise StoreError(belongs_to_another(path)) from None
         except OSError as failed:
             raise StoreError(f"{path} cannot be read: {problem}; nor copied: {failed}") from None
         try:
@@ -110,6 +116,27 @@ def _read_copy(path: Path, error: Exception) -> Contents:
         assert contents.connection is not None
         contents.connection.close()
         return Contents(contents.rows, problem=problem)
+
+
+def belongs_to_another(path: Path) -> str:
+    """What to do when an appliance has run here as another user, such as once with sudo."""
+    try:
+        owner = path.stat().st_uid
+    except PermissionError:
+        owner = path.parent.stat().st_uid
+    user = os.geteuid()
+    return (
+        f"{path} belongs to {_user(owner)}, and this runs as {_user(user)}: run it as "
+        f"{_user(owner)}, or give it the folder and the files: sudo chown {_user(user)} "
+        f"{shlex.quote(str(path.parent))} {shlex.quote(str(path))}*"
+    )
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def _rescue(path: Path, damage: str) -> Contents:
@@ -168,7 +195,9 @@ def _salvage(path: Path) -> Rows:
             # From both ends, up to what cannot be read.
             for order in ("ASC", "DESC"):
                 with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError):
-                    for row in connection.execute(f"{select(table)} ORDER BY id {order}"):
+                    for row in connection.execute(
+                        f"{select(table, connection)} ORDER BY id {order}"
+                    ):
                         rows[table].setdefault(row[0], row)
     return rows
 

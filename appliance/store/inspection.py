@@ -71,7 +71,7 @@ def read(path: Path) -> Rows:
             connection.execute("BEGIN")
             rows: Rows = [{} for _ in Table]
             for table in tables:
-                rows[table] = {row[0]: row for row in connection.execute(select(table))}
+                rows[table] = {row[0]: row for row in connection.execute(select(table, connection))}
             return rows
     except (sqlite3.Error, DamagedError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from None

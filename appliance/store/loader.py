@@ -63,8 +63,8 @@ def session_row(key: int, session: Session, will: int | None, offset: float) -> 
     )
 
 
-def subscription_row(key: int, session: int, subscription: Subscription) -> Row:
-    """The row of a subscription."""
+def subscription_row(key: int, session: int, subscription: Subscription, *, replaying: bool) -> Row:
+    """The row of a subscription, `replaying` while its retained messages are being sent."""
     return (
         key,
         session,
@@ -74,6 +74,7 @@ def subscription_row(key: int, session: int, subscription: Subscription) -> Row:
         int(subscription.retain_as_published),
         int(subscription.retain_handling),
         subscription.identifier,
+        int(replaying),
     )
 
 
@@ -261,7 +262,7 @@ def _session(row: Row, offset: float, messages: dict[int, Message]) -> LoadedSes
 
 
 def _take_subscription(row: Row, loaded: Loaded) -> None:
-    key, owner, topic_filter, qos, no_local, as_published, handling, identifier = row
+    key, owner, topic_filter, qos, no_local, as_published, handling, identifier, *replaying = row
     session = loaded.sessions[_of(int, owner)]
     check_filter(_of(str, topic_filter))
     parse_shared(_of(str, topic_filter))
@@ -277,6 +278,8 @@ def _take_subscription(row: Row, loaded: Loaded) -> None:
         raise _WrongRowError("a second subscription with one filter")
     session.filters[subscription.filter] = _of(int, key)
     session.kept.subscriptions.append(subscription)
+    if replaying and _within(replaying[0], 0, 1):
+        session.kept.replaying.append(subscription)
 
 
 def _take_owed(row: Row, loaded: Loaded) -> None:

@@ -52,7 +52,7 @@ COLUMNS: dict[Table, tuple[str, ...]] = {
     ),
     Table.SUBSCRIPTION: (
         *("id", "session", "filter", "qos", "no_local", "retain_as_published"),
-        *("retain_handling", "identifier"),
+        *("retain_handling", "identifier", "replaying"),
     ),
     Table.OWED: (
         *("id", "session", "message", "qos", "retain", "subscription_ids", "share"),
@@ -130,6 +130,10 @@ MIGRATIONS: tuple[str, ...] = (
         counted REAL NOT NULL,
         boot TEXT NOT NULL
     );
+    """,
+    """
+    -- 1: the client has yet to be sent some of the retained messages that it subscribed to
+    ALTER TABLE subscription ADD COLUMN replaying INTEGER NOT NULL DEFAULT 0;
     """,
 )
 
@@ -240,6 +244,8 @@ def delete(table: Table, count: int) -> str:
     return f"DELETE FROM {table.name.lower()} WHERE id IN ({','.join('?' * count)})"
 
 
-def select(table: Table) -> str:
-    """The statement that reads a whole table."""
-    return f"SELECT {','.join(COLUMNS[table])} FROM {table.name.lower()}"
+def select(table: Table, connection: sqlite3.Connection) -> str:
+    """The statement that reads a whole table; what an older appliance made has fewer columns."""
+    name = table.name.lower()
+    there = {column for _, column, *_ in connection.execute(f"PRAGMA table_info({name})")}
+    return f"SELECT {','.join(filter(there.__contains__, COLUMNS[table]))} FROM {name}"

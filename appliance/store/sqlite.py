@@ -155,7 +155,11 @@ class SqliteStore:
             database.make_directory(self.path)
             self._take_lock()
         except OSError as error:
-            if self.path.exists():
+            try:
+                found = self.path.exists()
+            except PermissionError:
+                raise StoreError(database.belongs_to_another(self.path)) from None
+            if found:
                 log.warning("%s: %s", error.filename, error.strerror)
             else:
                 raise StoreError(
@@ -555,7 +559,8 @@ class SqliteStore:
         key = known.filters.get(subscription.filter)
         if key is None:
             key = known.filters[subscription.filter] = next(self._keys)
-        row = subscription_row(key, known.key, subscription)
+        replaying = subscription.qos > 0 and subscription.filter in session.replays
+        row = subscription_row(key, known.key, subscription, replaying=replaying)
         self._open.put(Table.SUBSCRIPTION, key, row)
         self._stage()
 

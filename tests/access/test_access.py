@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import os
 import random
 import shutil
 import socket
@@ -592,6 +593,14 @@ def test_what_is_wrong_in_a_group_is_told_once(tmp_path: Path) -> None:
         ("group.conf", 1, 7),
         ("group.conf", 2, 9),
     ]
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(AccessFileError, match=r"pipe: is no file, but a pipe"):
+        Acl.load(tmp_path / "pipe", "r2d2")
+    with pytest.raises(AccessFileError, match=r"pipe: is no file, but a pipe"):
+        Passwords.load(tmp_path / "pipe")
 
 
 def test_files_that_are_too_large_too_many_and_too_deep(

@@ -10,7 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
+from appliance_process import ACL, ApplianceProcess
+from raw_client import RawClient
 
+from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription
 from durability.harm import HARMS
 from durability.ordeal import Ordeal
 
@@ -51,6 +55,34 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, killed: bool) -> None:
     assert "CANNOT BE WRITTEN" in log
     if not killed:
         assert report.starts == 1 and "can be written again" in log
+
+
+def test_it_starts_on_a_disk_that_was_mounted_read_only(tmp_path: Path) -> None:
+    """As the system does with one that has errors: what was kept is there, and is delivered."""
+    with small_disk(tmp_path / "disk") as disk:
+        process = ApplianceProcess(
+            tmp_path / "home", acl=ACL, broker={"store": {"path": str(disk / "state/store.db")}}
+        )
+        settings = yaml.safe_load(process.config.read_text())
+        settings["control"] = str(disk / "state/control.sock")
+        process.config.write_text(yaml.safe_dump(settings))
+        process.start()
+        try:
+            with RawClient(process, 5, tls=True) as client:
+                client.connect("first")
+                client.send(Publish("r2d2/a", b"kept", 1, retain=True, packet_id=1))
+                assert isinstance(client.decode(client.receive()), Puback)
+            process.stop()
+            subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+            process.start()
+            with RawClient(process, 5, tls=True) as client:
+                client.connect("second")
+                client.send(Subscribe(1, [Subscription("r2d2/#", 1)]))
+                received = [p for p in client.drain() if isinstance(p, Publish)]
+            process.wait_for_log("status`, `reload` and `routes` are not answered: .*control.sock")
+        finally:
+            process.stop()
+    assert ("r2d2/a", b"kept") in [(p.topic, p.payload) for p in received]
 
 
 class FullDisk(Ordeal):

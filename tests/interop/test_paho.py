@@ -381,6 +381,16 @@ def test_take_over(broker: BrokerProcess, version: MQTTProtocolVersion, topic: s
             assert second.payloads(1) == ["for the second"]
 
 
+@pytest.mark.parametrize("qos", [1, 2])
+def test_a_publish_that_is_refused_is_told(
+    appliance: ApplianceProcess, qos: int, topic: str
+) -> None:
+    """paho releases a QoS 2 message that was refused, and tells what PUBCOMP says."""
+    with Peer(appliance, V5, user="bob") as sender:
+        assert sender.publish("elsewhere", "1", qos).is_failure
+        assert not sender.publish(topic, "2", qos).is_failure
+
+
 @both_versions
 def test_a_client_without_an_id_gets_one(
     broker: BrokerProcess, version: MQTTProtocolVersion

@@ -100,6 +100,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         "will": (_message(will.message), will.delay) if will is not None else None,
         "will_at": session.will_at,
         "subscriptions": session.subscriptions,
+        "replays": {name for name in session.replays if session.subscriptions[name].qos},
         "inflight": [(number, delivery(each)) for number, each in session.inflight.items()],
         "queue": [delivery(each) for each in session.queue],
         "received": {

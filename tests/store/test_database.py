@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import pwd
 import random
 import sqlite3
 import stat
-from collections.abc import AsyncIterator
+import tempfile
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +20,8 @@ from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock
 from store.house import House, difference, state
+
+NOBODY = pwd.getpwnam("nobody").pw_uid
 
 
 @pytest_asyncio.fixture
@@ -54,6 +59,33 @@ async def test_one_appliance_has_it(house: House) -> None:
         SqliteStore(house.path).open()
 
 
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """Pytest's own are for their user alone."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name)
+        path.chmod(0o755)
+        yield path
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may be somebody else")
+@pytest.mark.parametrize("mode", [0o700, 0o755])
+async def test_one_of_another_user_is_told(mode: int, open_folder: Path) -> None:
+    """As after `sudo appliance run`, once."""
+    house = House(open_folder).start()
+    await house.stop()
+    house.path.parent.chmod(mode)
+    os.seteuid(NOBODY)
+    try:
+        with pytest.raises(StoreError) as caught:
+            SqliteStore(house.path).open()
+    finally:
+        os.seteuid(0)
+    text = str(caught.value)
+    assert f"{house.path} belongs to root, and this runs as nobody" in text
+    assert f"sudo chown nobody {house.path.parent} {house.path}*" in text
+
+
 async def test_the_lock_is_let_go(house: House) -> None:
     await house.stop()
     second = House(house.path.parent.parent).start()
@@ -79,7 +111,7 @@ async def test_a_newer_database_is_left_alone(
     await house.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
     before = house.path.read_bytes()
-    with pytest.raises(StoreError, match=r"newer appliance \(version 2 .* knows 0\)"):
+    with pytest.raises(StoreError, match=r"newer appliance \(version 3 .* knows 0\)"):
         SqliteStore(house.path).open()
     assert house.path.read_bytes() == before
 

@@ -95,6 +95,57 @@ async def test_every_field_comes_back(house: House, tmp_path: Path) -> None:
     await twin.stop()
 
 
+async def test_retained_messages_that_were_not_sent_yet_are_sent_behind_the_restart(
+    house: House, tmp_path: Path
+) -> None:
+    """The client has its SUBACK and will find its session: it does not subscribe again."""
+    topics = [f"a/{number}" for number in range(10)]
+    publisher = await house.join("publisher")
+    for number, topic in enumerate(topics, 1):
+        publisher.send(Publish(topic, b"x", 1, retain=True, packet_id=number))
+    client = await house.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a/#", 1)]))
+    await house.written()
+    sent = [packet for packet in client.received() if isinstance(packet, Publish)]
+    assert len(sent) == house.limits.inflight
+    client.send(Puback(sent[0].packet_id))
+    twin = await restarted(house, tmp_path / "twin")
+    again = await twin.join("client", **lasting(5))
+    assert await _acknowledge_all(twin, again) == {*topics}
+    # That was all of them: behind another restart there is nothing left to be sent.
+    third = await restarted(twin, tmp_path / "third")
+    again = await third.join("client", **lasting(5))
+    assert not await _acknowledge_all(third, again)
+    await third.stop()
+    await twin.stop()
+
+
+async def _acknowledge_all(house: House, client: Peer) -> set[str]:
+    """Topics of all that the client is sent."""
+    topics: set[str] = set()
+    while messages := [p for p in client.received() if isinstance(p, Publish)]:
+        topics |= {message.topic for message in messages}
+        client.send(*(Puback(message.packet_id) for message in messages if message.packet_id))
+        await house.written()
+    return topics
+
+
+async def test_a_store_of_before_replays_were_in_it(tmp_path: Path) -> None:
+    house = House(tmp_path / "first").start()
+    client = await house.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a", 1)]))
+    await house.stop()
+    with contextlib.closing(sqlite3.connect(house.path)) as connection:
+        connection.execute("ALTER TABLE subscription DROP COLUMN replaying")
+        connection.execute("UPDATE about SET version = 2")
+        connection.execute("PRAGMA user_version = 2")
+        connection.commit()
+    assert [session.subscriptions for session in summarise(house.path).sessions] == [1]
+    twin = house.twin(tmp_path / "twin")
+    assert [*twin.broker.sessions["client"].subscriptions] == ["a"]
+    await twin.stop()
+
+
 @pytest.mark.parametrize("version", [4, 5])
 async def test_what_was_in_flight_comes_again_with_its_id(
     house: House, tmp_path: Path, version: int
