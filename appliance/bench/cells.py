@@ -224,8 +224,8 @@ class BridgeCell(RosCell):
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
         # As the tutorial node does it: the text as it is, QoS 0, and as much may wait.
-        route = {"type": "std_msgs/msg/String", "encoding": "text", "qos": 0, "keep": self.queue}
-        routes = [{"ros": "/chatter", "to": "mqtt"}, {"ros": "/command", "to": "ros"}]
+        route = {"type": "std_msgs/msg/String", "encoding": "text", "keep": self.queue}
+        routes = [{"ros": "/chatter", "to": "mqtt", "qos": 0}, {"ros": "/command", "to": "ros"}]
         environment = ros_environment(0)
         with peers.appliance(site, [each | route for each in routes], environment) as server:
             yield BridgeSide(server, self.send, self.receive, environment, self.maximum)
