@@ -227,7 +227,7 @@ class BridgeCell(RosCell):
         route = {"type": "std_msgs/msg/String", "encoding": "text", "keep": self.queue}
         routes = [{"ros": "/chatter", "to": "mqtt", "qos": 0}, {"ros": "/command", "to": "ros"}]
         environment = ros_environment(0)
-        with peers.appliance(site, [each | route for each in routes], environment) as server:
+        with peers.appliance(site, [{**each, **route} for each in routes], environment) as server:
             yield BridgeSide(server, self.send, self.receive, environment, self.maximum)
 
     @contextlib.contextmanager
