@@ -225,9 +225,10 @@ class BridgeCell(RosCell):
     def ours(self, site: Site) -> Iterator[Side]:
         # As the tutorial node does it: the text as it is, QoS 0, and as much may wait.
         route = {"type": "std_msgs/msg/String", "encoding": "text", "keep": self.queue}
-        routes = [{"ros": "/chatter", "to": "mqtt", "qos": 0}, {"ros": "/command", "to": "ros"}]
+        to_mqtt = {"ros": "/chatter", "to": "mqtt", "qos": 0, **route}
+        to_ros = {"ros": "/command", "to": "ros", **route}
         environment = ros_environment(0)
-        with peers.appliance(site, [{**each, **route} for each in routes], environment) as server:
+        with peers.appliance(site, [to_mqtt, to_ros], environment) as server:
             yield BridgeSide(server, self.send, self.receive, environment, self.maximum)
 
     @contextlib.contextmanager
