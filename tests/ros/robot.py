@@ -145,6 +145,14 @@ class Turtle:
         """Change a parameter of its own, as a node does; null takes its value away."""
         self.node.set_parameters([Parameter(name, value=value)])
 
+    def followed(self):
+        """Wait until somebody subscribes to the feedback of goals."""
+        deadline = time.monotonic() + 10
+        while not self.node.count_subscribers("/turtle/walk/_action/feedback"):
+            if time.monotonic() > deadline:
+                raise TimeoutError("nobody subscribes to the feedback")
+            time.sleep(0.01)
+
     def declare(self, name, value):
         self.node.declare_parameter(name, value, ParameterDescriptor(dynamic_typing=True))
 
