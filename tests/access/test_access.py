@@ -1058,10 +1058,11 @@ async def test_closing_refuses_those_who_wait(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     access = FileAccess(*files, "r2d2")
-    slow = threading.Event()
+    begun, never = threading.Event(), threading.Event()
 
     def check(stored: str, password: bytes) -> bool:
-        slow.wait(0.05)
+        begun.set()
+        never.wait(0.05)
         return check_password(stored, password)
 
     monkeypatch.setattr(passwords_module, "check_password", check)
@@ -1069,8 +1070,7 @@ async def test_closing_refuses_those_who_wait(
         asyncio.ensure_future(access.authenticate("alice", b"%d" % i, "c", "::1"))
         for i in range(10)
     ]
-    for _ in range(5):  # for the first to be with its thread
-        await asyncio.sleep(0)
+    assert await asyncio.to_thread(begun.wait, 5)  # the first is with its thread
     access.close()
     access.close()
     codes = {answer.code for answer in await asyncio.gather(*logins)}  # type: ignore[union-attr]

@@ -33,7 +33,8 @@ from test_ros2 import Peer, domain, string, until
 
 __all__ = ["domain"]  # a fixture for all tests here
 
-pytestmark = pytest.mark.timeout(600)  # it may have to be built
+# It may have to be built, and that once: one test compares times, and building takes the longest.
+pytestmark = [pytest.mark.timeout(600), pytest.mark.timed]
 
 PROJECT = Path(__file__).parent.parent.parent
 MIB = 1 << 20
