@@ -128,18 +128,18 @@ class Listeners:
         Raises:
             OSError: an address cannot be listened on; nothing has changed then.
         """
-        known = list(self._doors)
+        leaving = list(self._doors)
+        kept: list[_Door | None] = []
+        for listener in settings:
+            # The first of several: those whose ports the system chose are told apart by order.
+            same = (door for door in leaving if door.settings.place == listener.place)
+            kept.append(next(same, None))
+            if kept[-1] is not None:
+                leaving.remove(kept[-1])
         doors: list[_Door] = []
         try:
-            for listener in settings:
-                # The first of several: those whose ports the system chose are told apart by order.
-                same = (door for door in known if door.settings.place == listener.place)
-                door = next(same, None)
-                if door is None:
-                    door = _Door(self, listener)
-                else:
-                    known.remove(door)
-                doors.append(door)
+            for listener, door in zip(settings, kept, strict=True):
+                doors.append(door or _Door(self, listener, leaving))
         except BaseException:
             self.drop(doors)
             raise
@@ -273,9 +273,11 @@ class Listeners:
 
 
 class _Door:
-    """One listening socket."""
+    """One listening socket; it may take over the port of one that is `leaving`."""
 
-    def __init__(self, listeners: Listeners, settings: ListenerSettings) -> None:
+    def __init__(
+        self, listeners: Listeners, settings: ListenerSettings, leaving: list[_Door]
+    ) -> None:
         self._listeners = listeners
         self.settings = settings
         self._loop = asyncio.get_running_loop()
@@ -285,7 +287,8 @@ class _Door:
             self._inode = settings.path.stat().st_ino
             self.address = (f"unix:{settings.path}", 0)
         else:
-            self._socket = listen(settings.host, settings.port)
+            same = [door._socket for door in leaving if door.address[1] == settings.port > 0]
+            self._socket = listen(settings.host, settings.port, same)
             self.address = (settings.host, self._socket.getsockname()[1])
 
     def __str__(self) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
 import resource
 import socket
 import stat
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -19,21 +21,42 @@ BACKLOG = 4096
 _LISTENERS = "broker.listeners"
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; an empty host is every address, IPv6 ones too where there are any."""
+def listen(host: str, port: int, leaving: Sequence[socket.socket] = ()) -> socket.socket:
+    """A listening socket; an empty host is every address, IPv6 ones too where there are any.
+
+    Of the sockets that are `leaving` it takes over the port: `0.0.0.0` that of `127.0.0.1`, say.
+    """
     everywhere = not host
     dualstack = everywhere and socket.has_dualstack_ipv6()
     family = socket.AF_INET6 if ":" in host or dualstack else socket.AF_INET
     try:
-        sock = socket.create_server(
-            (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=dualstack
-        )
+        with _shared_ports(leaving):
+            sock = socket.create_server(
+                (host, port),
+                family=family,
+                backlog=BACKLOG,
+                reuse_port=bool(leaving),
+                dualstack_ipv6=dualstack,
+            )
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             error.strerror = "it is in use already; `appliance doctor` says who has it"
         raise _cannot_listen(f"{host or '*'}:{port}", error) from None
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
     sock.setblocking(False)
     return sock
+
+
+@contextlib.contextmanager
+def _shared_ports(sockets: Sequence[socket.socket]) -> Iterator[None]:
+    """Meanwhile who asks for it (SO_REUSEPORT, socket(7)) may listen on their ports as well."""
+    for sock in sockets:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    try:
+        yield
+    finally:
+        for sock in sockets:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
 
 
 def listen_on_path(path: Path, mode: int, key: str = _LISTENERS) -> socket.socket:

@@ -423,6 +423,30 @@ async def test_an_address_in_use(house: House):
     assert not house.listeners._doors
 
 
+async def test_a_port_moves_to_all_addresses_and_back(house: House):
+    """What listens on the port until then does not keep its successor from it, others do."""
+
+    def use(*wanted: ListenerSettings):
+        listeners.take(listeners.prepare([*wanted]), [*wanted], listeners.admission)
+
+    listeners = house.listeners
+    ((_, port),) = await listeners.start([ListenerSettings("127.0.0.1", 0, None)])
+    house.ports = [("127.0.0.1", port)]
+    early = await house.join("early")
+    for host in ("", "0.0.0.0", "127.0.0.1"):
+        use(ListenerSettings(host, port, None))
+        assert listeners.addresses == [(host, port)]
+        await house.join(f"by {host or 'any'}")
+        with pytest.raises(OSError, match="in use already"):
+            sockets.listen(host, port)
+    with socket.create_server(("127.0.0.2", port)), pytest.raises(OSError, match="in use already"):
+        use(ListenerSettings("", port, None))
+    assert listeners.addresses == [("127.0.0.1", port)]
+    await house.join("late")
+    await early.say(Pingreq())
+    assert isinstance(await early.hear(), Pingresp)
+
+
 async def test_every_address(house: House):
     """An empty host listens on IPv4, and on IPv6 where there is any."""
     ((host, port),) = await house.listeners.start([ListenerSettings("", 0, None)])
