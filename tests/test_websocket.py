@@ -518,7 +518,7 @@ async def test_a_flood_of_empty_frames_leaves_others_their_turn(house: House):
         assert isinstance(await other.hear(), Pingresp)
         answers += 1
     assert (await end)[0] == BINARY
-    assert answers > 20
+    assert answers > 5
 
 
 async def test_packets_behind_connect_wait_for_the_login(house: House):
