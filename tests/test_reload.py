@@ -268,6 +268,7 @@ class Bystander:
         assert not self._thread.is_alive()
 
 
+@pytest.mark.timed
 def test_changed_files_take_effect_by_themselves(tmp_path: Path) -> None:
     """Each within two seconds, and a client that it does not concern notices nothing."""
     took: dict[str, float] = {}

@@ -96,6 +96,7 @@ def reload(robot: ApplianceProcess, *, says: str = "reload: reloaded: ") -> None
     robot.wait_for_log(says, count + 1)
 
 
+@pytest.mark.timed
 def test_a_narrowed_acl_takes_just_what_it_says(robot: ApplianceProcess, tmp_path: Path) -> None:
     alice, bob, carol = log_in(robot, "alice"), log_in(robot, "bob"), log_in(robot, "carol")
     for client in (bob, carol):
@@ -153,6 +154,7 @@ def test_a_narrowed_acl_takes_just_what_it_says(robot: ApplianceProcess, tmp_pat
         client.kill()
 
 
+@pytest.mark.timed
 def test_a_user_removed_is_gone_and_its_password_with_it(
     robot: ApplianceProcess, tmp_path: Path
 ) -> None:

@@ -254,6 +254,7 @@ def test_our_own_client(unchanged: ApplianceProcess, capfdbinary) -> None:
 # What takes effect while it runs
 
 
+@pytest.mark.timed
 def test_revoked_while_connected(process: ApplianceProcess) -> None:
     with Peer(process, "tablet") as peer, Peer(process, "stranger") as other, Peer(process) as user:
         assert peer.log_in("a") == other.log_in("b") == 0
@@ -280,6 +281,7 @@ def test_revoked_while_connected(process: ApplianceProcess) -> None:
         process.wait_for_log("no TLS connection: its certificate .* was revoked", 2)
 
 
+@pytest.mark.timed
 def test_revoked_while_it_does_not_read(process: ApplianceProcess) -> None:
     """It may have what was sent before, but not for long."""
     with Peer(process, "tablet") as peer, Peer(process, "stranger") as other:

@@ -342,6 +342,7 @@ async def test_what_ros_says_on_a_topic_of_both_ways_needs_no_lease(house):
 # Silence
 
 
+@pytest.mark.timed
 async def test_the_stop_message_follows_silence_in_time(house, caplog):
     house.start(CommandRules(on_silence=OnSilence(AFTER)))
     driver = Driver(house.broker, "a")

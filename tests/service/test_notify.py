@@ -138,7 +138,7 @@ async def test_systemd_does_not_read(tmp_path: Path) -> None:
     notifier.start(asyncio.get_running_loop(), lambda: "fine")
     began = time.monotonic()
     await asyncio.sleep(0.3)
-    assert time.monotonic() - began < 0.8
+    assert time.monotonic() - began < 5
     notifier.close()
     listening.close()
 
