@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import ssl
 import time
@@ -143,21 +144,23 @@ class Connection:
             trusted = f"by {target.ca}" if target.ca else "by this computer's own list of CAs"
             raise ClientError(
                 f"the certificate of {target.address} is not trusted {trusted}: "
-                f"{error.verify_message}. Name the ca.crt that this appliance's `init` made with "
-                "--ca, and connect by a name that the certificate has."
+                f"{error.verify_message.rstrip('.')}. Name the ca.crt that this appliance's "
+                "`init` made with --ca, and connect by a name that the certificate has."
             ) from None
         except socket.gaierror:
             raise ClientError(f"there is no computer called {target.host!r}") from None
         except ssl.SSLError as error:
-            reason = (error.reason or str(error)).lower().replace("_", " ")
-            raise ClientError(f"no TLS with {target.address}: {reason}") from None
+            raise ClientError(
+                f"no TLS with {target.address}: {_reason(error)}; is this the port of a listener "
+                "with tls: true?"
+            ) from None
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise ClientError(f"{target.address} cannot be reached: {reason}") from None
         self._wait(lambda: self._answer is not None, "the login")
         if self._answer is not None and self._answer.is_failure:
             who = f"user {target.username!r}" if target.username else "a client without user name"
-            raise ClientError(f"{target.address} refused {who}: {self._answer}")
+            raise ClientError(f"{target.address} refused {who}: {self._answer} (its log says why)")
 
     def publish(
         self,
@@ -231,6 +234,12 @@ class Connection:
         self._client.disconnect()
 
 
+def _reason(error: ssl.SSLError) -> str:
+    """What OpenSSL says, without the line of Python's source that it came by."""
+    said = error.reason or re.sub(r"^\[SSL\] | \(_ssl\.c:\d+\)$", "", str(error.args[-1]))
+    return said.lower().replace("_", " ")
+
+
 def _tls(target: Target) -> ssl.SSLContext:
     if target.insecure:
         context = ssl.create_default_context()
@@ -253,9 +262,8 @@ def _show_certificate(context: ssl.SSLContext, certificate: Path, key: Path | No
     try:
         context.load_cert_chain(certificate, key, no_password)
     except ssl.SSLError as error:
-        reason = (error.reason or str(error)).lower().replace("_", " ")
         files = f"{certificate} and {key}" if key else f"{certificate} (without --key)"
-        raise ClientError(f"{files}: no certificate with its key: {reason}") from None
+        raise ClientError(f"{files}: no certificate with its key: {_reason(error)}") from None
     except OSError as error:
         files = f"{certificate} or {key}" if key else str(certificate)
         raise ClientError(f"{files} cannot be read: {error.strerror}") from None

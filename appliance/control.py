@@ -110,7 +110,10 @@ def ask(path: Path, command: str, timeout: float = 30.0) -> Any:
             connection.sendall(json.dumps({"command": command}).encode() + b"\n")
             answer = json.loads(b"".join(iter(lambda: connection.recv(65536), b"")))
     except (FileNotFoundError, ConnectionRefusedError):
-        raise NotRunningError(f"no appliance is running (nobody listens on {path})") from None
+        raise NotRunningError(
+            f"no appliance is running (nobody listens on {path}); one with another configuration "
+            "is found with --config FILE"
+        ) from None
     except PermissionError:
         raise ControlError(
             f"{path} may not be opened: run this as the appliance's user, or as root"

@@ -122,7 +122,8 @@ class Reload:
                 changed = await self._run()
             except ReloadError as error:
                 self._ended(False, str(error))
-                log.error("not reloaded, what was in force stays so: %s", error)
+                told = str(error).replace("\n", "; ")
+                log.error("not reloaded, what was in force stays so: %s", told)
                 if self._parts.audit is not None:
                     self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
                 raise

@@ -17,6 +17,13 @@ log = logging.getLogger(__name__)
 #: Connections that wait to be accepted, as far as the system allows.
 BACKLOG = 4096
 
+#: Why a port cannot be had, and what to do.
+_REASONS = {
+    errno.EADDRINUSE: "it is in use already; `appliance doctor` says who has it",
+    errno.EADDRNOTAVAIL: "this computer does not have this address; 0.0.0.0 is for all that it has",
+    errno.EACCES: "ports as low as this one are for root; `appliance doctor` says what else to do",
+}
+
 #: Where the configuration says where to listen.
 _LISTENERS = "broker.listeners"
 
@@ -39,8 +46,9 @@ def listen(host: str, port: int, leaving: Sequence[socket.socket] = ()) -> socke
                 dualstack_ipv6=dualstack,
             )
     except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            error.strerror = "it is in use already; `appliance doctor` says who has it"
+        error.strerror = _REASONS.get(error.errno or 0, error.strerror)
+        if error.errno is not None and error.errno < 0:  # of getaddrinfo(3)
+            error.strerror = f"there is no address for {host!r}; name one, or 0.0.0.0 for all"
         raise _cannot_listen(f"{host or '*'}:{port}", error) from None
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
     sock.setblocking(False)

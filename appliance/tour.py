@@ -19,6 +19,7 @@ import uvloop
 from appliance.access import Passwords
 from appliance.app import App
 from appliance.config import Bind, Settings
+from appliance.control import ControlError, ask
 from appliance.init import PASSWORD_FILE
 from appliance.ros.installation import is_frozen
 
@@ -35,6 +36,9 @@ def run(settings: Settings) -> int:
     """Runs broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
     if not any(listener.is_mqtts for listener in settings.broker.listeners):
         raise TourError("the demo needs a listener with tls: true")
+    with contextlib.suppress(ControlError):
+        pid = ask(settings.control, "status")["pid"]
+        raise TourError(f"this demo runs already, as process {pid}; Ctrl-C in its terminal ends it")
     for listener in settings.broker.listeners:
         if listener.bind.path is None:
             _check_free(listener.bind)

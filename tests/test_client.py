@@ -126,7 +126,21 @@ def test_no_user(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
 
 def test_a_publish_that_the_acl_refuses(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
     assert run(peer.arguments("pub", "other", "-m", "x")) == 1
-    assert "'other' was refused: Not authorized" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert "'other' was refused: Not authorized" in error
+    assert "appliance acl explain USER TOPIC" in error
+
+
+def test_a_port_alone_leaves_the_rest_to_the_configuration(
+    peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("appliance.yaml").write_text(f"broker: {{tls: {{ca: {peer.directory / 'ca.crt'}}}}}\n")
+    login = ["-u", "alice", "--password-file", str(peer.directory / "alice.password")]
+    command = ["pub", "robot/a", "-m", "x", "-p", str(peer.port), *login]
+    assert run(command) == 0
+    assert run([*command, "-H", "127.0.0.1"]) == 1
+    assert "is not trusted by this computer's own list of CAs" in capfd.readouterr().err
 
 
 def test_a_certificate_of_another_authority(
@@ -140,7 +154,8 @@ def test_a_certificate_of_another_authority(
     assert "--ca" in error
     assert run(peer.arguments("pub", "robot/a", "-m", "x", *other, "--insecure")) == 0
     assert run(peer.arguments("pub", "robot/a", "-m", "x", "-H", "127.0.0.1")) == 1
-    assert "IP address mismatch" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert "IP address mismatch" in error and ".." not in error
 
 
 def test_a_ca_that_is_none(peer: Peer, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -174,7 +189,18 @@ def test_a_server_that_speaks_no_tls(peer: Peer, capfd: pytest.CaptureFixture[st
         thread.start()
         assert run(peer.arguments("pub", "a", "-m", "x", "-p", str(port))) == 1
         thread.join(PATIENCE)
-    assert f"localhost:{port}" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert f"no TLS with localhost:{port}" in error
+    assert "is this the port of a listener with tls: true?" in error
+
+
+def test_a_certificate_without_its_key(
+    peer: Peer, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    certificate = ["--cert", str(peer.directory / "ca.crt")]
+    assert run(peer.arguments("pub", "a", "-m", "x", *certificate)) == 1
+    error = capfd.readouterr().err
+    assert "(without --key): no certificate with its key: " in error and "ssl.c" not in error
 
 
 @pytest.mark.parametrize("command", [["pub", "a/#", "-m", "x"], ["sub", "a/#/b"]])

@@ -447,6 +447,21 @@ async def test_a_port_moves_to_all_addresses_and_back(house: House):
     assert isinstance(await early.hear(), Pingresp)
 
 
+@pytest.mark.parametrize(
+    ("host", "told"),
+    [
+        ("192.0.2.1", "this computer does not have this address; 0.0.0.0 is for all that it has"),
+        ("none.invalid", "there is no address for 'none.invalid'; name one, or 0.0.0.0 for all"),
+    ],
+)
+def test_where_nobody_can_listen(host: str, told: str):
+    with pytest.raises(OSError) as refused:
+        sockets.listen(host, 8883)
+    assert str(refused.value.strerror) == (
+        f"cannot listen on {host}:8883 (broker.listeners): {told}"
+    )
+
+
 async def test_every_address(house: House):
     """An empty host listens on IPv4, and on IPv6 where there is any."""
     ((host, port),) = await house.listeners.start([ListenerSettings("", 0, None)])

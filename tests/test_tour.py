@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shlex
 import shutil
 import socket
@@ -83,6 +84,17 @@ def test_a_port_that_is_taken(demo: Path, monkeypatch: pytest.MonkeyPatch) -> No
         settings = config.load(demo / "run/appliance.yaml")
         with pytest.raises(tour.TourError, match="make run PORT="):
             tour.run(settings)
+
+
+async def test_a_demo_that_runs_already(demo: Path) -> None:
+    settings = config.load(demo / "run/appliance.yaml")
+    first = tour.Tour(settings)
+    await first.start()
+    try:
+        with pytest.raises(tour.TourError, match=f"runs already, as process {os.getpid()}"):
+            await asyncio.to_thread(tour.run, settings)
+    finally:
+        await first.stop()
 
 
 def test_the_demo_needs_tls(demo: Path) -> None:

@@ -232,7 +232,8 @@ class _Reader:
             return self._lines[file]
         lines = self._lines[file] = []
         try:
-            text = read_text(path, "make it, or name another in appliance.yaml", _MAX_SIZE)
+            advice = "make it, as `appliance init` does, or name another in appliance.yaml"
+            text = read_text(path, advice, _MAX_SIZE)
         except AccessFileError as error:
             lines += error.problems
             return lines

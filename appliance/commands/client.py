@@ -12,6 +12,8 @@ import typer
 from appliance.commands.connection import Connection, connecting
 from appliance.commands.console import CommandError
 
+_EXPLAINED = "On the robot, `appliance acl explain USER TOPIC` says which rule decides it."
+
 
 @connecting
 def pub(
@@ -45,6 +47,8 @@ def pub(
 
     try:
         client.publish(connection.target(), topic, payloads, qos, retain)
+    except client.RefusedError as error:
+        raise CommandError(f"{error}. {_EXPLAINED}") from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
 
@@ -78,6 +82,8 @@ def sub(
             count=count,
             timeout=timeout,
         )
+    except client.RefusedError as error:
+        raise CommandError(f"{error}. {_EXPLAINED}") from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
     if count is not None and received < count:

@@ -17,14 +17,14 @@ from appliance.commands.console import CommandError, ConfigOption, load, read_pa
 if TYPE_CHECKING:
     from appliance.client import Target
 
+_HERE = "localhost"
+
 
 @dataclass(frozen=True)
 class Connection:
     """The options of a command that connects; what none says is the configuration's, if any."""
 
-    host: Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")] = (
-        "localhost"
-    )
+    host: Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")] = _HERE
     port: Annotated[
         int | None,
         typer.Option(
@@ -77,8 +77,10 @@ class Connection:
         from appliance.client import Target
 
         port, ca = self.port, self.ca
-        # Without a configuration it is a client on some other computer: the options say everything.
-        if self.config or (port is None and ca is None and _is_configured()):
+        # Of an appliance on this computer the configuration says the rest. Without one it is a
+        # client on some other computer: the options say everything.
+        is_own = ca is None and (port is None or self.host == _HERE) and _is_configured()
+        if self.config or is_own:
             broker = load(self.config).broker
             ports = [listener.bind.port for listener in broker.listeners if listener.is_mqtts]
             port = port or (ports[0] if ports else None)

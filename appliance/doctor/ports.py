@@ -77,8 +77,10 @@ def _port(
         return Finding(
             "warning",
             subject,
-            "free, though an appliance is running: it has read another configuration",
-            "appliance reload",
+            "free, though an appliance is running: it has read another configuration, or this one "
+            "with other environment variables",
+            "appliance reload, or give this command the same variables; `appliance status` says "
+            "where it listens",
         )
     return Finding("ok", subject, "free")
 

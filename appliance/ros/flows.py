@@ -235,7 +235,9 @@ class Flow(ABC):
         endpoints = [endpoint for endpoint in endpoints if endpoint.type == type_name]
         if not endpoints and self._wanted is not None and self._wanted[0] == type_name:
             return False  # they have left; all stays as it is for their return
-        hashes = [endpoint.type_hash for endpoint in endpoints if endpoint.type_hash]
+        # Towards ROS nobody is told the hash, and another publisher would first have to be found.
+        ends = endpoints if self.direction == "to_mqtt" else []
+        hashes = [end.type_hash for end in ends if end.type_hash]
         wanted = (type_name, self._choose_qos(endpoints, type_name), min(hashes, default=None))
         before = self.bridged
         if wanted == self._wanted and (before is not None or self._problem is None):

@@ -406,10 +406,16 @@ class FakeNode:
         return peer
 
     def add_subscriber(
-        self, topic: str, type_name: str, qos: QosProfile | None = None, *, node: str = "/other"
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile | None = None,
+        *,
+        node: str = "/other",
+        type_hash: str | None = None,
     ) -> FakePeer:
         """Another node subscribes."""
-        peer = FakePeer(self, topic, Endpoint(node, type_name, qos or QosProfile()))
+        peer = FakePeer(self, topic, Endpoint(node, type_name, qos or QosProfile(), type_hash))
         self.remote_subscribers.append(peer)
         self.spin()
         return peer

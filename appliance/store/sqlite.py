@@ -288,7 +288,7 @@ class SqliteStore:
             await self._loop.run_in_executor(None, self._writer.stop)
             if self._failed is not None:
                 log.error("%d changes could not be stored, and are lost", len(self._failed))
-            elif self.commits:
+            elif self.messages_written:
                 log.info(
                     "store: %d commits of %.1f messages on average, the largest of %d",
                     self.commits,

@@ -259,6 +259,17 @@ async def test_subscription_is_made_anew_when_publishers_change(house, caplog):
     assert "ROS reliable, volatile, depth 1000; MQTT QoS 1" in lines[1]
 
 
+async def test_a_publisher_stays_when_a_subscriber_tells_the_hash_of_its_type(house, caplog):
+    caplog.set_level(logging.INFO, "appliance.ros")
+    house.start(to_ros("/a", type=STRING))
+    [publisher] = house.node.own_publishers
+    qos = publisher.endpoint.qos
+    house.node.add_subscriber("/a", STRING, qos, type_hash="RIHS01_abc")
+    await house.settle()
+    assert house.node.own_publishers == [publisher]
+    assert len([r for r in caplog.records if "→ /a: std_msgs" in r.getMessage()]) == 1
+
+
 async def test_a_publisher_replaced_between_two_looks_is_found(house):
     house.start(to_mqtt("/a"))
     old = house.node.add_publisher("/a", STRING)

@@ -1,6 +1,6 @@
 """The soak from the command line, in the environment that `make test` sets up::
 
-    cd tests && ../.venv/bin/python -m soak --minutes 10 --clients 200
+    .venv/bin/python tests/soak --minutes 10 --clients 200
 
 It ends with a table, and with the exit code 1 when the broker did anything wrong; then each wrong
 delivery is told with all that is known about the message and the session. The clients' choices
@@ -15,6 +15,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 from soak.run import Report, Soak
 
 #: Violations that are told in full.
@@ -26,7 +28,8 @@ _LONG = 240
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m soak", description="Random clients against the broker, checked by a model."
+        prog="python tests/soak",
+        description="Random clients against the broker, checked by a model.",
     )
     parser.add_argument("--minutes", type=float, default=10.0, help="how long (default: 10)")
     parser.add_argument("--clients", type=int, default=200, help="how many (default: 200)")
