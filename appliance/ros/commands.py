@@ -12,8 +12,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import orjson
-
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Decision
@@ -51,12 +49,12 @@ class _Stop:
     def __init__(self, converter: Converter, payload: str) -> None:
         """Raises ConversionError when the type has no such message."""
         self._converter = converter
-        self._value = orjson.loads(payload)
+        self._payload = payload.encode()
         self.example = self.cdr()
 
     def cdr(self) -> bytes:
         """The message, made anew: it may say "now"."""
-        return self._converter.from_dict(self._value)
+        return self._converter.from_json(self._payload)
 
     def is_like(self, cdr: bytes) -> bool:
         """Whether a message says the same, at another time or in another frame."""
