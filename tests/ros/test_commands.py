@@ -376,6 +376,26 @@ async def test_who_drives_and_falls_silent_is_disconnected(house):
     assert house.robot.received[-1] == twist(0.5)
 
 
+@pytest.mark.parametrize("other_drives_on", [True, False])
+async def test_of_two_who_drive_each_that_falls_silent_is_disconnected(house, other_drives_on):
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    a.drive()
+    b.drive()
+
+    def is_over():
+        if other_drives_on:
+            b.drive()
+        return a.wire.closed
+
+    await until(is_over)
+    if not other_drives_on:
+        await until(lambda: b.wire.closed)
+    before = len(house.robot.received)
+    Driver(house.broker, "a").drive()  # what it had queued, perhaps
+    assert len(house.robot.received) == before
+
+
 @pytest.mark.parametrize("stops_itself", [True, False])
 async def test_who_has_stopped_or_may_be_silent_stays(house, stops_itself):
     house.start(CommandRules(on_silence=OnSilence(AFTER, disconnect=stops_itself)))
