@@ -44,9 +44,10 @@ class ParameterSettings:
         """Those that are wanted of a node; None for none at all."""
         mine: list[str] = []
         for text in self.names:
+            is_excluded = text.startswith("!")
             pattern, _, name = text.removeprefix("!").rpartition("/")
-            if compile_pattern(pattern).fullmatch(node):
-                mine.append(f"!{name}" if text.startswith("!") else name)
+            if compile_pattern(pattern, hidden=is_excluded).fullmatch(node):
+                mine.append(f"!{name}" if is_excluded else name)
         return Names(mine) if any(not name.startswith("!") for name in mine) else None
 
 
