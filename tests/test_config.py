@@ -224,6 +224,8 @@ bridge:
         ("to: ros, allow: {x: [{}]}", ".allow: x can have only text"),
         ("to: ros, on_silence: {publish: {}}", ".on_silence.after: is needed"),
         ("to: ros, on_silence: {after: 1 s, publish: {x: 2024-01-01}}", "JSON does not know"),
+        ("to: ros, on_silence: {after: 1 s, publish: {x: .nan}}", "NaN is written null"),
+        ("to: ros, on_silence: {after: 1 s, publish: {x: -.inf}}", "JSON does not know"),
     ],
 )
 def test_rules_of_commands_that_cannot_be(route: str, problem: str) -> None:

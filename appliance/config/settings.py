@@ -53,7 +53,6 @@ from appliance.config.values import (
     check_node,
     check_node_topic,
     check_plugins,
-    check_response,
     check_response_information,
     check_robot,
     check_ros_arguments,
@@ -330,7 +329,7 @@ class ServiceRoute(_CalledRoute):
     to: Literal["ros", "mqtt"] = "ros"
     type: Annotated[str, AfterValidator(check_service_type)] | None = None
     encoding: CallEncoding = "json"
-    on_error: Annotated[dict[str, Any], BeforeValidator(check_response)] | None = None
+    on_error: Annotated[dict[str, Any], BeforeValidator(check_message)] | None = None
 
 
 class ActionRoute(_CalledRoute):

@@ -176,14 +176,6 @@ def check_action_type(value: str) -> str:
     return _check_called_type(value, "action", "nav2_msgs/action/NavigateToPose")
 
 
-def check_response(value: object) -> object:
-    try:
-        json.dumps(value)
-    except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
-        raise ValueError("has a value that JSON does not know; put text in quotes") from None
-    return value
-
-
 def from_names(value: object) -> object:
     """A route of which only the names are said."""
     return {"ros": value} if isinstance(value, (str, list, tuple)) else value
@@ -238,9 +230,11 @@ def check_allow(value: object) -> object:
 
 def check_message(value: object) -> object:
     try:
-        json.dumps(value)
+        json.dumps(value, allow_nan=False)
     except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
         raise ValueError("has a value that JSON does not know; put text in quotes") from None
+    except ValueError:
+        raise ValueError("has a number that JSON does not know; NaN is written null") from None
     return value
 
 

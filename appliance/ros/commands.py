@@ -12,8 +12,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import orjson
-
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Decision
@@ -51,12 +49,12 @@ class _Stop:
     def __init__(self, converter: Converter, payload: str) -> None:
         """Raises ConversionError when the type has no such message."""
         self._converter = converter
-        self._value = orjson.loads(payload)
+        self._payload = payload.encode()
         self.example = self.cdr()
 
     def cdr(self) -> bytes:
         """The message, made anew: it may say "now"."""
-        return self._converter.from_dict(self._value)
+        return self._converter.from_json(self._payload)
 
     def is_like(self, cdr: bytes) -> bool:
         """Whether a message says the same, at another time or in another frame."""
@@ -91,7 +89,9 @@ class Commands(ToRos):
         self._heard_at = -math.inf
         #: Whether something else than the stop message was published last.
         self._is_driven = False
-        self._last = b""
+        #: What those who are connected commanded last, and when, where it was something else; at
+        #: infinity when they have fallen silent since.
+        self._drivers: dict[Session, tuple[bytes, float]] = {}
         self._has_stopped = False
         self._backlog = Backlog()
         #: Whether a stop message is overdue, which ROS would not take.
@@ -161,6 +161,7 @@ class Commands(ToRos):
             del broker.guards[self.mqtt]
         broker.guards_changed()
         self._holder = self._source = None
+        self._drivers.clear()
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         if self._is_left or not self._is_in_time(message, retain, origin):
@@ -220,8 +221,12 @@ class Commands(ToRos):
         now = self._around.loop.time()
         self._heard_at = now
         self._source = origin
-        self._last = cdr
         self._is_driven = self._stop is not None and cdr != self._stop.example
+        if origin is not None and origin.link is not None:
+            if self._is_driven:
+                self._drivers[origin] = cdr, now
+            else:
+                self._drivers.pop(origin, None)
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
         self._is_awaited = False
@@ -267,19 +272,27 @@ class Commands(ToRos):
             self._source = None
             if self._is_driven:
                 self._publish_stop(f"{session} has left")
-            if self._stop is not None and not self._stop.is_like(self._last):
-                # Its library may have queued what it commanded since, and marks none of it as old.
-                self._backlog.expect(session.client_id)
+        driven = self._drivers.pop(session, None)
+        if driven is not None and not self._is_stop(driven[0]):
+            # Its library may have queued what it commanded since, and marks none of it as old.
+            self._backlog.expect(session.client_id)
+
+    def _is_stop(self, cdr: bytes) -> bool:
+        return self._stop is None or self._stop.is_like(cdr)
 
     def _arm(self) -> None:
+        rules = self.rules
         due = math.inf
-        if self._is_driven and self.rules.on_silence is not None:
-            due = self.rules.on_silence.after
+        if self._is_driven and rules.on_silence is not None:
+            due = self._heard_at + rules.on_silence.after
         if self._holder is not None:
-            due = min(due, self.rules.lease)
+            due = min(due, self._heard_at + rules.lease)
+        if rules.on_silence is not None and rules.on_silence.disconnect:
+            heard_at = min((at for _, at in self._drivers.values()), default=math.inf)
+            due = min(due, heard_at + rules.on_silence.after)
         if due < math.inf:
             loop = self._around.loop
-            self._timer = loop.call_at(max(self._heard_at + due, loop.time()), self._check)
+            self._timer = loop.call_at(max(due, loop.time()), self._check)
 
     def _check(self) -> None:
         self._timer = None
@@ -292,24 +305,30 @@ class Commands(ToRos):
             if self._must_stop:
                 self._publish_stop("at last")
             elif is_over or silence >= on_silence.after:
-                self._fell_silent(min(silence, on_silence.after), on_silence.disconnect)
+                who = self._source or "a retained command"
+                after = min(silence, on_silence.after)
+                self._publish_stop(f"{who} fell silent for {after:g} s")
+        if on_silence is not None and on_silence.disconnect:
+            self._disconnect_silent(min(silence, on_silence.after) if is_over else on_silence.after)
         if self._timer is None:
             self._arm()
 
-    def _fell_silent(self, after: float, disconnects: bool) -> None:
-        source = self._source
-        why = f"{source or 'a retained command'} fell silent for {after:g} s"
-        has_stopped_itself = self._stop is not None and self._stop.is_like(self._last)
-        self._publish_stop(why)
-        if source is None or has_stopped_itself or not disconnects:
-            return
-        # The network may have it, and a heap of its commands on their way: they are old when they
-        # come, and nothing in them says so. On a new connection there are none of them.
-        source.close_link(
-            ReasonCode.ADMINISTRATIVE_ACTION,
-            f"it drove {self.ros} and fell silent (on_silence.disconnect)",
-        )
-        self._around.broker.flush()
+    def _disconnect_silent(self, after: float) -> None:
+        """Disconnect who drove and has said nothing for so long, also when others drive on."""
+        latest = self._around.loop.time() - after
+        silent = [(who, cdr) for who, (cdr, at) in self._drivers.items() if at <= latest]
+        for session, cdr in silent:
+            self._drivers[session] = cdr, math.inf
+            if self._is_stop(cdr):
+                continue
+            # The network may have it, and a heap of its commands on their way: they are old when
+            # they come, and nothing in them says so. On a new connection there are none of them.
+            session.close_link(
+                ReasonCode.ADMINISTRATIVE_ACTION,
+                f"it drove {self.ros} and fell silent (on_silence.disconnect)",
+            )
+        if silent:
+            self._around.broker.flush()
 
     def _begin(self) -> None:
         """There is somebody on ROS to have a message."""

@@ -16,6 +16,7 @@ import pybase64
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
+from appliance.mqtt.topics import check_topic
 from appliance.ros.calls import Answer, Call, CallCounters, CallError, Offer, Switchboard
 from appliance.ros.convert import ConversionError
 from appliance.ros.patterns import Names, compile_pattern
@@ -43,9 +44,10 @@ class ParameterSettings:
         """Those that are wanted of a node; None for none at all."""
         mine: list[str] = []
         for text in self.names:
+            is_excluded = text.startswith("!")
             pattern, _, name = text.removeprefix("!").rpartition("/")
-            if compile_pattern(pattern).fullmatch(node):
-                mine.append(f"!{name}" if text.startswith("!") else name)
+            if compile_pattern(pattern, hidden=is_excluded).fullmatch(node):
+                mine.append(f"!{name}" if is_excluded else name)
         return Names(mine) if any(not name.startswith("!") for name in mine) else None
 
 
@@ -151,15 +153,15 @@ class ParameterTopics(ABC, Generic[HolderT]):
 
     def _publish(self, holder: HolderT, name: str, payload: bytes) -> None:
         """Show a parameter as it is now; without a payload it is no more."""
-        is_topic = not set("+#\0") & set(name) and len(name) <= LONGEST_NAME
-        if payload == holder.shown.get(name, b"") or not is_topic:
+        topic = f"{holder.base}/{name}"
+        if payload == holder.shown.get(name, b"") or not _is_topic(name, topic):
             return
         if payload:
             holder.shown[name] = payload
         else:
             del holder.shown[name]
         properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[holder.route.encoding]}
-        self._board.publish(Message(f"{holder.base}/{name}", payload, 1, True, properties))
+        self._board.publish(Message(topic, payload, 1, True, properties))
 
     async def _check_and_set(
         self, holder: HolderT, values: dict[str, Any], call: Call, *, at_once: bool
@@ -191,6 +193,15 @@ class ParameterTopics(ABC, Generic[HolderT]):
             }
             for holder in self._holders.values()
         ]
+
+
+def _is_topic(name: str, topic: str) -> bool:
+    """Whether a parameter's name makes a topic: a node may give it any."""
+    try:
+        check_topic(topic)
+    except ValueError:
+        return False
+    return len(name) <= LONGEST_NAME
 
 
 def value_of(call: Call) -> Any:

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
-from collections.abc import Callable, Coroutine, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,6 +106,8 @@ class ParameterRoutes(ParameterTopics[_Node]):
         # The ROS thread's.
         self._subscription: RosSubscription | None = None
         self._is_refused = False
+        #: How many nodes there are of each name.
+        self._nodes: Counter[str] = Counter()
 
     def _look_again(self) -> None:
         self.follow()
@@ -125,6 +127,12 @@ class ParameterRoutes(ParameterTopics[_Node]):
             if found is not None:
                 self._join(found)
                 self._load(found)
+
+    def _came_anew(self, names: Iterable[str]) -> None:
+        for name in names:
+            node = self._holders.get(name)
+            if node is not None:
+                self._load(node)
 
     def _leave(self, node: _Node) -> None:
         node.is_gone = True
@@ -291,6 +299,16 @@ class ParameterRoutes(ParameterTopics[_Node]):
         elif not self._routes and self._subscription is not None:
             self._subscription.destroy()
             self._subscription = None
+        if self._routes:
+            self._look_for_restarts()
+
+    def _look_for_restarts(self) -> None:
+        """A node that was killed stays on the graph for a while, next to the one that takes its
+        place and has values of its own."""
+        before, self._nodes = self._nodes, Counter(self._node.nodes())
+        anew = [name for name, count in self._nodes.items() if count > before.get(name, count)]
+        if anew:
+            self._post(self._came_anew, anew)
 
     def _on_event(self, cdr: bytes) -> None:
         if len(self._events) < WAITING_EVENTS:
@@ -303,6 +321,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
         """The bus is gone, and with it the subscription."""
         self._subscription = None
         self._is_refused = False
+        self._nodes.clear()
 
 
 def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:

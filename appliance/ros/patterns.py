@@ -34,7 +34,9 @@ class Names:
         wanted = [text for text in every if not text.startswith("!")]
         self._wanted = [compile_pattern(text) for text in wanted]
         self._spoken_of = [compile_pattern(text, hidden=True) for text in wanted]
-        self._excluded = [(text, compile_pattern(text[1:])) for text in every if text[0] == "!"]
+        self._excluded = [
+            (text, compile_pattern(text[1:], hidden=True)) for text in every if text[0] == "!"
+        ]
 
     def __contains__(self, name: str) -> bool:
         return any(pattern.fullmatch(name) for pattern in self._wanted) and not any(

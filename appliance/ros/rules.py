@@ -197,9 +197,13 @@ def _allow(values: tuple[Any, ...]) -> Callable[[Primitive | String | WideString
             if not isinstance(value, wanted) or (isinstance(value, bool) and bool not in wanted):
                 raise ValueError(f"{value!r} is not {name}")
         allowed = values
-        if isinstance(type_, Primitive) and type_.code == "f":
-            allowed = struct.unpack(f"<{len(values)}f", struct.pack(f"<{len(values)}f", *values))
         listed = ", ".join(map(str, values))
+        if isinstance(type_, Primitive) and type_.code == "f":
+            code = f"<{len(values)}f"
+            try:
+                allowed = struct.unpack(code, struct.pack(code, *values))
+            except (OverflowError, struct.error):
+                raise ValueError(f"a float32 cannot be {listed}") from None
 
         def limit(value: Any, path: str) -> Any:
             if value not in allowed:

@@ -20,6 +20,7 @@ from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge, Bridged, RouteSettings
 from appliance.ros.flows import Echo, Route
+from appliance.ros.graph import ParameterSettings
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
 from appliance.store import MemoryStore
@@ -446,6 +447,15 @@ def test_what_patterns_match():
     some = to_mqtt(("/camera/**", "/odom", "!/camera/*/raw", "!/camera/raw"))
     names = "/camera/raw", "/camera/left/raw", "/camera/left/image", "/odom", "/odometry"
     assert matches(some, *names) == ["/camera/left/image", "/odom"]
+
+
+def test_what_is_left_out_is_so_in_hidden_names_too():
+    route = Route(to_mqtt(("/**", "/_debug/**", "!/**/raw")), "to_mqtt")
+    assert route.matches("/_debug/state", [STRING])
+    assert not route.matches("/_debug/raw", [STRING])
+    shown = ParameterSettings(("/_debug/*", "!/**/secret"), "r2d2{node}").of("/_debug")
+    assert shown is not None
+    assert [name in shown for name in ("speed", "secret")] == [True, False]
 
 
 def test_patterns_of_types():

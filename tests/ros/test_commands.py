@@ -30,6 +30,7 @@ from test_bridge import INT, STRING, TWIST, Client, House
 
 from appliance.ros.definitions import import_message, load_description
 
+FLOAT = "std_msgs/msg/Float32"
 TOPIC = "r2d2/cmd_vel"
 GO = b'{"linear":{"x":0.5}}'
 AFTER = 0.1
@@ -376,6 +377,26 @@ async def test_who_drives_and_falls_silent_is_disconnected(house):
     assert house.robot.received[-1] == twist(0.5)
 
 
+@pytest.mark.parametrize("other_drives_on", [True, False])
+async def test_of_two_who_drive_each_that_falls_silent_is_disconnected(house, other_drives_on):
+    house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    a.drive()
+    b.drive()
+
+    def is_over():
+        if other_drives_on:
+            b.drive()
+        return a.wire.closed
+
+    await until(is_over)
+    if not other_drives_on:
+        await until(lambda: b.wire.closed)
+    before = len(house.robot.received)
+    Driver(house.broker, "a").drive()  # what it had queued, perhaps
+    assert len(house.robot.received) == before
+
+
 @pytest.mark.parametrize("stops_itself", [True, False])
 async def test_who_has_stopped_or_may_be_silent_stays(house, stops_itself):
     house.start(CommandRules(on_silence=OnSilence(AFTER, disconnect=stops_itself)))
@@ -514,10 +535,17 @@ async def test_when_ros_is_lost_there_is_nobody_to_be_stopped(house):
     assert house.robot.received == [twist(0.5)]
 
 
-async def test_a_stop_message_that_the_type_has_not_is_told(house, caplog):
-    house.start(CommandRules(on_silence=OnSilence(1, '{"linear":{"q":1}}')))
+@pytest.mark.parametrize(
+    ("stop", "problem"),
+    [
+        ('{"linear":{"q":1}}', "linear.q: unknown field"),
+        (f'{{"linear":{{"x":{10**400}}}}}', "not JSON: number is infinity"),
+    ],
+)
+async def test_a_stop_message_that_the_type_has_not_is_told(house, caplog, stop, problem):
+    house.start(CommandRules(on_silence=OnSilence(1, stop)))
     await house.settle()
-    assert "on_silence.publish: linear.q: unknown field" in caplog.text
+    assert f"on_silence.publish: {problem}" in caplog.text
     Driver(house.broker, "a").drive()
     assert house.robot.received == []
 
@@ -605,6 +633,8 @@ def test_limits_reach_into_arrays_of_messages():
         (INT, {"allow": (("data", (1.5,)),)}, "1.5 is not an integer"),
         (INT, {"allow": (("data", (True,)),)}, "True is not an integer"),
         (STRING, {"allow": (("data", (1,)),)}, "1 is not a string"),
+        (FLOAT, {"allow": (("data", (1, 1e39)),)}, r"a float32 cannot be 1, 1e\+39"),
+        (FLOAT, {"allow": (("data", (10**400,)),)}, "a float32 cannot be 10000"),
         ("std_msgs/msg/UInt8MultiArray", {"clamp": (("data", 0, 1),)}, "is bytes"),
     ],
 )

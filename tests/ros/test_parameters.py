@@ -98,6 +98,19 @@ async def test_a_change_while_the_values_are_read_is_not_lost(house):
     assert house.retained("r2d2/arm/_param/speed") == 2
 
 
+async def test_a_node_that_takes_the_place_of_one_that_was_killed(house):
+    house.start(parameters("/arm/*"))
+    arm = Declaring(house, speed=1, old=1)
+    house.node.nodes = lambda: ["/bridge", "/arm"]
+    house.node.spin()
+    await shown(house, "old", 1)
+    arm.values = {"speed": 2}
+    house.node.nodes = lambda: ["/bridge", "/arm", "/arm"]  # the killed one is not forgotten yet
+    house.node.spin()
+    await shown(house, "speed", 2)
+    await shown(house, "old", None)
+
+
 async def test_a_flood_of_changes_has_the_node_read_anew(house, monkeypatch):
     monkeypatch.setattr(module, "WAITING_EVENTS", 20)
     house.start(parameters("/arm/*"))
@@ -213,10 +226,10 @@ def test_what_may_have_any_type_takes_it_from_the_value():
 
 async def test_names_that_make_no_topic_hide_no_others(house):
     house.start(parameters("/arm/*"))
-    arm = Declaring(house, **{"speed": 1, "a+b": 1, "x" * 70_000: 1})
+    arm = Declaring(house, **{"a+b": 1, "a\nb": 1, "\ufffe": 1, "x" * 70_000: 1, "speed": 1})
     house.node.spin()
     await shown(house, "speed", 1)
-    arm.change("y" * 70_000, 2)
-    arm.change("speed", 2)
+    for name in ("y" * 70_000, "tab\tbed", "speed"):
+        arm.change(name, 2)
     await shown(house, "speed", 2)
     assert not house.bridge.calls._parameters._events
