@@ -21,6 +21,7 @@ from contextlib import suppress
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -47,6 +48,7 @@ from appliance.ros.ros1_actions import (
 )
 from appliance.ros.ros1_ends import Client, Publisher, Service, Subscription
 from appliance.ros.ros1_peers import (
+    LARGEST_HEADER,
     Answers,
     Master,
     MasterParameters,
@@ -54,6 +56,7 @@ from appliance.ros.ros1_peers import (
     ask_service,
 )
 from appliance.ros.ros1_types import (
+    LARGEST_MESSAGE,
     Definition,
     describe,
     full_name,
@@ -65,6 +68,10 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the graph, of which the Master does not tell changes.
 POLL_INTERVAL = 0.2
+
+#: Seconds until the types of topics are asked for again though the same nodes have them: one of
+#: them may have made a topic anew.
+TYPES_INTERVAL = 1.0
 
 #: Seconds between two attempts to find a Master at the start.
 KNOCK_INTERVAL = 0.5
@@ -142,7 +149,11 @@ class Ros1Node:
         """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
         self._arguments = list(remappings(arguments))
         said = dict(argument.split(":=", 1) for argument in self._arguments)
-        self.name = f"{said.get('__ns', namespace).rstrip('/')}/{said.get('__name', name)}"
+        space = os.environ.get("ROS_NAMESPACE", "") if namespace == "/" else namespace
+        space = said.get("__ns", space).strip("/")
+        self.name = (
+            f"/{space}/{said.get('__name', name)}" if space else f"/{said.get('__name', name)}"
+        )
         self._master = Master(said.get("__master", master_uri()), self.name)
         self.parameter_server: ParameterServer | None = MasterParameters(self._master)
         self._base_name = name
@@ -166,6 +177,7 @@ class Ros1Node:
         self._subscribers: _Graph = {}
         self._servers: _Graph = {}
         self._types: dict[str, str] = {}
+        self._types_asked = 0.0
         #: The types of the actions that have a server.
         self._actions: dict[str, str] = {}
         self._action_clients = Actions(self)
@@ -248,6 +260,7 @@ class Ros1Node:
             disable_signals=True,
         )
         _Servers(rospy)
+        _bound_receiving(rospy)
         self.name = rospy.get_name()
         self._uri = rospy.core.get_node_uri()
         self._master.caller = self.name
@@ -324,7 +337,9 @@ class Ros1Node:
             state = [dict(found) for found in self._master.call("getSystemState")]
             self._register_missing(*state)
             connected = self._add_connected(*state[:2])
-            if state != [self._publishers, self._subscribers, self._servers]:
+            is_other = state != [self._publishers, self._subscribers, self._servers]
+            if is_other or monotonic() >= self._types_asked + TYPES_INTERVAL:
+                self._types_asked = monotonic()
                 types = dict(self._master.call("getTopicTypes"))
                 before = {topic: self._types[topic] for topic in connected if topic in self._types}
                 self._types = before | {
@@ -647,6 +662,61 @@ class _Servers:
         for caller in list(self._callers):
             with suppress(OSError):
                 caller.shutdown(socket.SHUT_RDWR)
+
+
+class _HeaderBuffer(BytesIO):
+    """What has come of a TCPROS header, and then of what is behind it."""
+
+    _is_bounded = False
+
+    def write(self, data: Any) -> int:
+        from rosgraph.network import ROSHandshakeException
+
+        size = super().write(data)
+        if not self._is_bounded and self.tell() >= 4:
+            self._is_bounded = True
+            if _announced(self) > LARGEST_HEADER:
+                raise ROSHandshakeException(f"a header of {_announced(self)} bytes")
+        return size
+
+
+def _announced(buffer: BytesIO) -> int:
+    """The length that is before what is in a buffer."""
+    with buffer.getbuffer() as data:
+        return int.from_bytes(data[:4], "little")
+
+
+def _bound_receiving(rospy: Any) -> None:
+    """Pass over what is announced to be larger than anything is: rospy keeps what has come of a
+    message until it is complete, and a wrong length may say 4 GB."""
+    base = rospy.impl.tcpros_base
+    receive, read_header = base.recv_buff, base.read_ros_handshake_header
+
+    def receive_bounded(peer: socket.socket, buffer: BytesIO, size: int) -> int:
+        count = int(receive(peer, buffer, size))
+        announced = _announced(buffer)
+        if announced <= LARGEST_MESSAGE:
+            return count
+        log.warning(
+            "a message of %d bytes, the most are %d, is left out", announced, LARGEST_MESSAGE
+        )
+        left = 4 + announced - buffer.tell()
+        while left:
+            buffer.seek(0)
+            buffer.truncate()
+            left -= int(receive(peer, buffer, min(size, left)))
+        buffer.seek(0)
+        buffer.truncate()
+        return count
+
+    def read_header_bounded(peer: socket.socket, buffer: BytesIO, size: int) -> Any:
+        own = _HeaderBuffer()
+        header = read_header(peer, own, size)
+        buffer.write(own.getvalue())  # what came behind it
+        return header
+
+    base.recv_buff = receive_bounded
+    base.read_ros_handshake_header = read_header_bounded
 
 
 @cache

@@ -9,12 +9,13 @@ four bytes.
 
 from __future__ import annotations
 
+import queue
 import socket
 import struct
 import threading
 import xmlrpc.client
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
@@ -120,18 +121,43 @@ def _plain(value: Any) -> Any:
 
 
 class Answers(Generic[_Answer]):
-    """Answers to questions, which are asked on threads of their own; for one thread."""
+    """Answers to questions, which are asked on threads of their own; for one thread.
+
+    An executor's threads would be waited for at the end of the process, and who is asked may take
+    its time.
+    """
 
     def __init__(self) -> None:
-        self._askers = ThreadPoolExecutor(ASKERS, thread_name_prefix="ros-ask")
+        self._askers: list[threading.Thread] = []
+        self._questions: queue.SimpleQueue[tuple[Future[_Answer], Callable[[], _Answer]] | None]
+        self._questions = queue.SimpleQueue()
         self._asked: dict[Any, tuple[Future[_Answer], float]] = {}
 
     def get(self, key: Any, ask: Callable[[], _Answer]) -> _Answer | None:
         """The answer of `ask`; None when it is not there yet. Raises BusError as `ask` did."""
         asked = self._asked.get(key)
         if asked is None or (asked[1] < monotonic() and asked[0].done() and asked[0].exception()):
-            asked = self._asked[key] = (self._askers.submit(ask), monotonic() + RETRY)
+            asked = self._asked[key] = (self._ask(ask), monotonic() + RETRY)
         return asked[0].result() if asked[0].done() else None
+
+    def _ask(self, ask: Callable[[], _Answer]) -> Future[_Answer]:
+        answer: Future[_Answer] = Future()
+        self._questions.put((answer, ask))
+        if len(self._askers) < ASKERS:
+            asker = threading.Thread(target=self._run, name="ros-ask", daemon=True)
+            self._askers.append(asker)
+            asker.start()
+        return answer
+
+    def _run(self) -> None:
+        while (question := self._questions.get()) is not None:
+            answer, ask = question
+            if not answer.set_running_or_notify_cancel():
+                continue
+            try:
+                answer.set_result(ask())
+            except Exception as error:  # as an executor does: it is raised where it is asked for
+                answer.set_exception(error)
 
     def forget(self, key: Any) -> None:
         """Ask anew."""
@@ -140,11 +166,13 @@ class Answers(Generic[_Answer]):
     def keep(self, keys: set[Any]) -> None:
         """Forget all others."""
         for key in self._asked.keys() - keys:
-            del self._asked[key]
+            self._asked.pop(key)[0].cancel()
 
     def close(self) -> None:
         """Ask nothing more."""
-        self._askers.shutdown(wait=False, cancel_futures=True)
+        self.keep(set())
+        for _ in self._askers:
+            self._questions.put(None)
 
 
 def ask_publisher(master_uri: str, caller: str, node: str, topic: str) -> Definition:
@@ -270,14 +298,17 @@ def _connect(address: tuple[str, Any], who: str) -> socket.socket:
 
 
 def _shake_hands(peer: socket.socket, fields: Mapping[str, str], who: str) -> dict[str, str]:
-    """Send a header, and read the other's. Raises BusError, also for an error in it."""
+    """Send a header, and read the other's. Raises BusError, also for an error in it, and when the
+    other takes longer than PATIENCE for all of it."""
+    until = monotonic() + PATIENCE
     lines = [f"{key}={value}".encode() for key, value in fields.items()]
     header = b"".join(struct.pack("<I", len(line)) + line for line in lines)
     try:
         peer.sendall(struct.pack("<I", len(header)) + header)
     except OSError as error:
         raise BusError(f"{who}: {error}") from error
-    found = parse_header(_read_sized(peer, LARGEST_HEADER, who))
+    found = parse_header(_read_sized(peer, LARGEST_HEADER, who, until))
+    peer.settimeout(PATIENCE)
     if "error" in found:
         raise BusError(f"{who} says: {found['error'][:500]}")
     return found
@@ -300,17 +331,20 @@ def parse_header(data: bytes) -> dict[str, str]:
     return fields
 
 
-def _read_sized(peer: socket.socket, largest: int, who: str) -> bytes:
-    size = int.from_bytes(_read(peer, 4, who), "little")
+def _read_sized(peer: socket.socket, largest: int, who: str, until: float | None = None) -> bytes:
+    size = int.from_bytes(_read(peer, 4, who, until), "little")
     if size > largest:
         raise BusError(f"{who} sends {size} bytes, more than the {largest} that are taken")
-    return _read(peer, size, who)
+    return _read(peer, size, who, until)
 
 
-def _read(peer: socket.socket, size: int, who: str) -> bytes:
+def _read(peer: socket.socket, size: int, who: str, until: float | None = None) -> bytes:
+    """So many bytes; with `until` before that time."""
     data = bytearray()
     while len(data) < size:
         try:
+            if until is not None:
+                peer.settimeout(max(0.001, until - monotonic()))
             chunk = peer.recv(min(size - len(data), 1 << 20))
         except OSError as error:
             raise BusError(f"{who}: {error}") from error
