@@ -113,12 +113,13 @@ class Subscription:
         self._lock = threading.Lock()
         self._is_over = False
         self._held: deque[bytes] = deque(maxlen=HELD)
+        self._raw = rospy.AnyMsg
         kind = message_class(rospy, definition)
         self._own = rospy.Subscriber(topic, kind, self._on_message, tcp_nodelay=True)
         found = self._own.impl.data_class
-        # rospy itself receives /clock when the time is simulated.
-        self._is_raw = issubclass(found, rospy.AnyMsg)
-        if found is not kind and (self._is_raw or found._md5sum != kind._md5sum):
+        # rospy itself receives /clock when the time is simulated, as a message of its own class.
+        is_own = not issubclass(found, rospy.AnyMsg) and found._md5sum == kind._md5sum
+        if found is not kind and not is_own:
             other = self._own.impl.type
             self.destroy()
             raise BusError(f"another route receives {topic} as {other}")
@@ -126,7 +127,7 @@ class Subscription:
     def _on_message(self, message: Any) -> None:
         header: Mapping[str, str] = message._connection_header
         is_latched = header.get("latching") == "1"
-        data = message._buff if self._is_raw else _serialized(message)
+        data = message._buff if isinstance(message, self._raw) else _serialized(message)
         with self._lock:
             if self._is_over:
                 return

@@ -14,13 +14,14 @@ import socket
 import struct
 import threading
 import xmlrpc.client
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
 from typing import Any, Generic, TypeVar
 from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
 
 from appliance.ros.node import BusError
 from appliance.ros.ros1_types import Definition, ServiceDefinition
@@ -37,6 +38,17 @@ ASKERS = 4
 #: Bytes of a header, which has a type's definition in it, and of a response.
 LARGEST_HEADER = 4 << 20
 LARGEST_RESPONSE = 64 << 20
+
+#: What comes of an answer that is none: a port may be another program's by now.
+_WRONG = (
+    OSError,
+    HTTPException,
+    xmlrpc.client.Error,
+    ExpatError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
 
 _Answer = TypeVar("_Answer")
 
@@ -65,10 +77,10 @@ class Master:
         """The value of an answer. Raises BusError, also when it says that it failed."""
         try:
             return _value(getattr(self._connection(), method)(self.caller, *arguments))
-        except (OSError, HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
+        except _WRONG as error:
             raise BusError(f"{self.uri}: {error}") from error
 
-    def call_each(self, method: str, calls: Iterable[tuple[Any, ...]]) -> list[Any]:
+    def call_each(self, method: str, calls: Sequence[tuple[Any, ...]]) -> list[Any]:
         """The values of many answers at once, None for what failed. Raises BusError."""
         many = [{"methodName": method, "params": (self.caller, *arguments)} for arguments in calls]
         try:
@@ -77,7 +89,12 @@ class Master:
                 answer[0][2] if isinstance(answer, list) and answer[0][0] == 1 else None
                 for answer in answers
             ]
-        except (OSError, HTTPException, xmlrpc.client.Error, LookupError, TypeError) as error:
+        except xmlrpc.client.Fault:
+            if len(calls) == 1:  # there is no telling it, such as a number of 64 bits
+                return [None]
+            half = len(calls) // 2
+            return self.call_each(method, calls[:half]) + self.call_each(method, calls[half:])
+        except _WRONG as error:
             raise BusError(f"{self.uri}: {error}") from error
 
 
