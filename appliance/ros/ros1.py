@@ -578,7 +578,7 @@ class Ros1Node:
 
     def doubt(self, service: str) -> None:
         """Ask a service anew for its type: a call of it has failed."""
-        self._service_types.forget((service, *self._servers.get(service, ())))
+        self._service_types.doubt((service, *self._servers.get(service, ())))
 
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]

@@ -149,13 +149,18 @@ class Answers(Generic[_Answer]):
         self._questions: queue.SimpleQueue[tuple[Future[_Answer], Callable[[], _Answer]] | None]
         self._questions = queue.SimpleQueue()
         self._asked: dict[Any, tuple[Future[_Answer], float]] = {}
+        #: What was answered before, until it is answered anew.
+        self._before: dict[Any, _Answer] = {}
 
     def get(self, key: Any, ask: Callable[[], _Answer]) -> _Answer | None:
         """The answer of `ask`; None when it is not there yet. Raises BusError as `ask` did."""
         asked = self._asked.get(key)
         if asked is None or (asked[1] < monotonic() and asked[0].done() and asked[0].exception()):
             asked = self._asked[key] = (self._ask(ask), monotonic() + RETRY)
-        return asked[0].result() if asked[0].done() else None
+        if not asked[0].done():
+            return self._before.get(key)
+        self._before.pop(key, None)
+        return asked[0].result()
 
     def _ask(self, ask: Callable[[], _Answer]) -> Future[_Answer]:
         answer: Future[_Answer] = Future()
@@ -176,14 +181,19 @@ class Answers(Generic[_Answer]):
             except Exception as error:  # as an executor does: it is raised where it is asked for
                 answer.set_exception(error)
 
-    def forget(self, key: Any) -> None:
-        """Ask anew."""
-        self._asked.pop(key, None)
+    def doubt(self, key: Any) -> None:
+        """Ask anew; what was answered holds until then."""
+        asked = self._asked.get(key)
+        if asked is not None and asked[0].done() and asked[0].exception() is None:
+            self._before[key] = asked[0].result()
+            del self._asked[key]
 
     def keep(self, keys: set[Any]) -> None:
         """Forget all others."""
         for key in self._asked.keys() - keys:
             self._asked.pop(key)[0].cancel()
+        for key in self._before.keys() - keys:
+            del self._before[key]
 
     def close(self) -> None:
         """Ask nothing more."""

@@ -6,6 +6,7 @@
 | `/robot/sleep` | std_srvs/Trigger | never answers |
 | `/robot/greet` | std_srvs/Trigger | |
 | `/robot/rest` | std_srvs/Empty | |
+| `/robot/fail` | std_srvs/SetBool | fails |
 | `/robot/map` | std_msgs/String | latched |
 | `/robot/own` | own_msgs/Own | a type that is installed nowhere |
 | `/robot/work` | actionlib/TestAction | so many steps; -1 fails |
@@ -47,6 +48,7 @@ class Robot:
         rospy.Service("/robot/switch", SetBool, lambda asked: SetBoolResponse(not asked.data, "so"))
         rospy.Service("/robot/greet", Trigger, lambda asked: (True, "hello"))
         rospy.Service("/robot/rest", Empty, lambda asked: ())
+        rospy.Service("/robot/fail", SetBool, lambda asked: None)
         rospy.Service("/robot/sleep", Trigger, lambda asked: threading.Event().wait())
         self.map = rospy.Publisher("/robot/map", String, latch=True, queue_size=1)
         self.map.publish("a map")

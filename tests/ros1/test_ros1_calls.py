@@ -49,6 +49,15 @@ def test_a_service_in_cbor_and_in_ros_bytes(robot: Node, appliance: Ros1Applianc
         assert code == "bad_request" and "truncated" in text
 
 
+def test_a_service_that_fails_stays(robot: Node, appliance: Ros1Appliance) -> None:
+    appliance.wait_for_log("/robot/fail can be called")
+    with Mqtt(appliance) as client:
+        for _ in range(20):
+            code, text = error(client.ask("r2d2/robot/fail/_call", b"{}"))
+            assert code == "ros_error" and text.startswith("/robot/fail says: ")
+    assert len(appliance.wait_for_log("/robot/fail can be called")) == 1
+
+
 def test_what_is_too_large_goes_nowhere(robot: Node, appliance: Ros1Appliance) -> None:
     large = b'{"data": "' + bytes(70_000).replace(b"\0", b"x") + b'"}'
     with Mqtt(appliance) as client:
