@@ -281,7 +281,9 @@ class SqliteStore:
                     timer.cancel()
             while self._writing:
                 await self._next_outcome()
-            if self._failed is not None or self._open:
+            # Before the first write nothing is changed that the next start would not change, too.
+            is_changed = self.commits > 0 or self._depended
+            if self._failed is not None or (self._open and is_changed):
                 self._put_stamp()
                 self._hand_over()
                 await self._next_outcome()
