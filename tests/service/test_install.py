@@ -289,6 +289,28 @@ def test_interrupted_it_is_as_before(
     assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
 
 
+def test_interrupted_at_the_restart_the_version_before_is_started(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd goes on with what it was told, and would run a version that is not there any more."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    restarted: list[str] = []
+
+    def systemctl(self: Installation, *arguments: str) -> None:
+        if arguments[0] == "restart":
+            restarted.append((image / COMMAND).read_text())
+            if len(restarted) == 1:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(Installation, "_starts", True)
+    monkeypatch.setattr(Installation, "_systemctl", systemctl)
+    with pytest.raises(KeyboardInterrupt):
+        install(image, single_file(tmp_path, 2))
+    assert restarted == [single_file(tmp_path, 2).read_text(), single_file(tmp_path).read_text()]
+
+
 def test_a_full_disk(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told of the file that could not be written, not of the one that was read."""
     if os.geteuid():
