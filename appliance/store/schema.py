@@ -153,7 +153,7 @@ _SYNCHRONOUS = {"power": "FULL", "process": "NORMAL"}
 def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
     """Open the database, making it when there is none; only its user may read it.
 
-    One of an older appliance is in a transaction then, see `_migrate`.
+    That of an older appliance is in a transaction then, see `_migrate`.
 
     Raises:
         sqlite3.Error, OSError: it cannot be opened.
@@ -192,7 +192,8 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
 def _migrate(connection: sqlite3.Connection, path: Path) -> None:
     """Bring the tables up to date, in a transaction that the first write goes on with and commits.
 
-    So a start that fails leaves the database to the older appliance that takes over again.
+    So a start that fails leaves the database to the older appliance that takes over again. A new
+    one has its tables at once: it may be looked at before anything is written.
     """
     found = version(connection)
     if found > len(MIGRATIONS):
@@ -209,6 +210,8 @@ def _migrate(connection: sqlite3.Connection, path: Path) -> None:
     connection.execute("UPDATE about SET version = ?", (len(MIGRATIONS),))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+    if not found:
+        connection.execute("COMMIT")
 
 
 def version(connection: sqlite3.Connection) -> int:

@@ -19,6 +19,7 @@ from durability.harm import HARMS
 from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock
+from appliance.store.inspection import summarise
 from store.house import House, difference, state
 
 NOBODY = pwd.getpwnam("nobody").pw_uid
@@ -122,6 +123,14 @@ async def test_a_newer_version_that_does_not_start_leaves_it_to_the_older(
     assert not difference(before, state(older.broker))
     await older.stop()
     await newer.stop()
+
+
+async def test_a_new_one_can_be_looked_at_before_anything_is_written(tmp_path: Path) -> None:
+    """By `appliance check` after a start that failed, say."""
+    store = SqliteStore(tmp_path / "store.db")
+    store.open()
+    await store.close()
+    assert summarise(store.path).sessions == []
 
 
 async def test_what_nobody_waits_for_is_written_at_the_stop(house: House, tmp_path: Path) -> None:
