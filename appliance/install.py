@@ -485,12 +485,15 @@ class Installation:
         try:
             self._systemctl("daemon-reload")
             self._systemctl("restart", NAME)
-        except InstallError as error:
+        except (InstallError, KeyboardInterrupt) as error:
             if not self._undo:
                 raise
+            # systemd may be about to start the newer one, which Ctrl-C does not end.
             self._put_back()
             self._systemctl("daemon-reload")
             self._systemctl("restart", NAME)
+            if isinstance(error, KeyboardInterrupt):
+                raise
             raise InstallError(f"{error}\nThe version that was there before runs again.") from None
 
     def _disable(self) -> None:

@@ -6,10 +6,12 @@ those that are started from within `sys.executable` is the one file.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import runpy
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from appliance.environment import LIBRARIES, ORIGINAL_LIBRARIES
@@ -22,6 +24,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 def main() -> None:
     use_ros()
+    keep_what_is_unpacked()
     end_with_the_boot_loader()
     if sys.argv[1:2] == ["-m"] and sys.argv[2:]:
         module = sys.argv[2]
@@ -46,6 +49,12 @@ def end_with_the_boot_loader() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:
             sys.exit(1)
+
+
+def keep_what_is_unpacked() -> None:
+    """systemd-tmpfiles deletes what is old in /tmp, but not in a folder that is locked."""
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(os.open(INSIDE, os.O_RDONLY | os.O_DIRECTORY), fcntl.LOCK_SH)
 
 
 def use_ros() -> None:

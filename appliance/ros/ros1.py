@@ -9,6 +9,7 @@ are made again. And it starts only once: to join anew, it is imported anew.
 from __future__ import annotations
 
 import asyncio
+import atexit
 import logging
 import os
 import queue
@@ -46,7 +47,7 @@ from appliance.ros.ros1_actions import (
     find_actions,
     services_of,
 )
-from appliance.ros.ros1_ends import Client, Publisher, Service, Subscription
+from appliance.ros.ros1_ends import Client, Publisher, Service, Subscription, forget_classes
 from appliance.ros.ros1_peers import (
     LARGEST_HEADER,
     Answers,
@@ -588,7 +589,15 @@ class Ros1Node:
 
 
 def _fresh_rospy() -> Any:
-    """rospy as it is before it was started."""
+    """rospy as it is before it was started; of the one before nothing stays in memory."""
+    core = sys.modules.get("rospy.core")
+    if core is not None:
+        forget_classes()
+        atexit.unregister(core._ros_atexit)
+        logger = logging.getLogger("rospy")
+        for handler in list(logger.handlers):
+            if isinstance(handler, core.NullHandler):
+                logger.removeHandler(handler)
     for name in [name for name in sys.modules if name.partition(".")[0] == "rospy"]:
         del sys.modules[name]
     return import_module("rospy")

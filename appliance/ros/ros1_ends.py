@@ -77,6 +77,12 @@ def _service_class(rospy: Any, definition: ServiceDefinition) -> Any:
     return type("RawService", (), attributes)
 
 
+def forget_classes() -> None:
+    """Let go of what was made with a rospy that has ended, and with it of that, which is 1 MB."""
+    message_class.cache_clear()
+    _service_class.cache_clear()
+
+
 def _of(kind: Any, data: bytes) -> Any:
     message = kind()
     message._buff = data

@@ -153,6 +153,8 @@ _SYNCHRONOUS = {"power": "FULL", "process": "NORMAL"}
 def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
     """Open the database, making it when there is none; only its user may read it.
 
+    That of an older appliance is in a transaction then, see `_migrate`.
+
     Raises:
         sqlite3.Error, OSError: it cannot be opened.
         DamagedError: it is a database, but not ours.
@@ -188,24 +190,28 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
 
 
 def _migrate(connection: sqlite3.Connection, path: Path) -> None:
+    """Bring the tables up to date, in a transaction that the first write goes on with and commits.
+
+    So a start that fails leaves the database to the older appliance that takes over again. A new
+    one has its tables at once: it may be looked at before anything is written.
+    """
     found = version(connection)
     if found > len(MIGRATIONS):
         raise StoreError(
             f"{path} was written by a newer appliance (version {found} of its tables, this one "
             f"knows {len(MIGRATIONS)}): install that one again, or move the file away"
         )
-    for number, script in enumerate(MIGRATIONS[found:], found + 1):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            for statement in script.split(";\n"):
-                connection.execute(statement)
-            connection.execute("UPDATE about SET version = ?", (number,))
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {number}")
-            connection.execute("COMMIT")
-        except BaseException:
-            roll_back(connection)
-            raise
+    if found == len(MIGRATIONS):
+        return
+    connection.execute("BEGIN IMMEDIATE")
+    for script in MIGRATIONS[found:]:
+        for statement in script.split(";\n"):
+            connection.execute(statement)
+    connection.execute("UPDATE about SET version = ?", (len(MIGRATIONS),))
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+    if not found:
+        connection.execute("COMMIT")
 
 
 def version(connection: sqlite3.Connection) -> int:

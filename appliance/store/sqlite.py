@@ -127,6 +127,8 @@ class SqliteStore:
         self._open = Batch(self.batch, 1)
         #: Whether something may depend on what is in the open batch.
         self._depended = False
+        #: Whether anything has changed since it was opened.
+        self._is_changed = False
         self._failed: Batch | None = None
         self._failing = False
         self._writing = False
@@ -281,7 +283,8 @@ class SqliteStore:
                     timer.cancel()
             while self._writing:
                 await self._next_outcome()
-            if self._failed is not None or self._open:
+            # What `restore` alone has changed, the next start would change as well.
+            if self._failed is not None or (self._open and self._is_changed):
                 self._put_stamp()
                 self._hand_over()
                 await self._next_outcome()
@@ -324,6 +327,7 @@ class SqliteStore:
 
     def _stage_lazily(self) -> None:
         """Nothing depends on it: it is written when something else is, or in a while."""
+        self._is_changed = True
         if self._timer is None and self._running and not self._writing:
             delay = RETRY if self._failing else LINGER
             self._timer = self._loop.call_later(delay, self._write_in_time)

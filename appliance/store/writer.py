@@ -127,7 +127,8 @@ class Writer:
 
 def write(connection: sqlite3.Connection, batch: Batch) -> None:
     """Write a batch in one transaction. Raises sqlite3.Error, with the transaction not ended."""
-    connection.execute("BEGIN IMMEDIATE")
+    if not connection.in_transaction:  # as it is when the tables are an older appliance's
+        connection.execute("BEGIN IMMEDIATE")
     for table in Table:
         for keys in _chunks(list(batch.deleted[table])):
             connection.execute(delete(table, len(keys)), keys)

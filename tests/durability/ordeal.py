@@ -199,7 +199,7 @@ class Ordeal:
             client.send(Subscribe(1, [Subscription("r2d2/kept/#", 0)]))
             for packet in client.drain():
                 if isinstance(packet, Publish):
-                    found[packet.topic] = int(packet.payload.split(b" ", 1)[0])
+                    found[packet.topic] = self.world.number(packet.payload)
         for publisher in self.publishers:
             if not publisher.retain or self.world.forgetful:
                 continue

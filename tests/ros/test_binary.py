@@ -207,6 +207,35 @@ def _answers(house, context, port):
         return secured.recv(1) == b"\x20"  # CONNACK, be it that nobody may come in like that
 
 
+def test_what_is_unpacked_stays_while_it_runs(binary, tmp_path):
+    """A computer that runs for weeks has what is old in its /tmp deleted, libraries not yet
+    loaded among it."""
+    unpacked = tmp_path / "unpacked"
+    unpacked.mkdir()
+    (unpacked / "old").touch()
+    house = tmp_path / "house"
+    environment = {"TMPDIR": str(unpacked)}
+    subprocess.run([binary, "init", "--dir", house], env=environment, check=True)
+    ports = "broker: {listeners: [{bind: '127.0.0.1:0'}]}\nbridge: {bus: none}\n"
+    (house / "appliance.yaml").write_text(ports)
+    command = [binary, "run", "-c", house / "appliance.yaml"]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        assert any("listening on" in line for line in process.stderr)
+        (inside,) = unpacked.glob("_MEI*")
+        before = sorted(inside.rglob("*"))
+        assert len(before) > 100
+        rule = tmp_path / "tmp.conf"
+        rule.write_text(f"d {unpacked} - - - 0\n")  # whatever is there is old
+        subprocess.run(["systemd-tmpfiles", "--clean", rule], check=True)
+        assert sorted(inside.rglob("*")) == before
+        assert not (unpacked / "old").exists()
+    finally:
+        process.terminate()
+        process.communicate(timeout=60)
+    assert not inside.exists()
+
+
 def test_the_commands(box):
     house = box({})
     config = ("-c", house.config)

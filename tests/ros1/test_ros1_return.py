@@ -3,7 +3,9 @@ know the robot."""
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
 import threading
 import time
 from contextlib import ExitStack
@@ -14,7 +16,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 import psutil
 import pytest
 from appliance_process import eventually
-from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, end, is_installed, output
+from ros1_world import Mqtt, Node, Python, Ros1Appliance, Run, World, end, is_installed, output
 
 from appliance.ros.node import BusError
 from appliance.ros.ros1 import POLL_INTERVAL
@@ -122,6 +124,25 @@ def test_it_joins_again_and_leaves_another_its_name(
         eventually(lambda port=port: not is_used(port, process), f"port {port} is free")  # type: ignore[misc]
     for caller in silent:
         caller.close()
+
+
+JOIN_AGAIN = """\
+import gc, types
+from appliance.ros.ros1 import _fresh_rospy
+from appliance.ros.ros1_ends import message_class
+from appliance.ros.ros1_types import installed
+for _ in range(3):
+    message_class(_fresh_rospy(), installed("std_msgs/msg/String"))
+gc.collect()
+modules = [each for each in gc.get_objects() if isinstance(each, types.ModuleType)]
+print([each.__name__ for each in modules].count("rospy.core"))
+"""
+
+
+def test_nothing_is_kept_of_the_rospy_before(world: World, python: Python) -> None:
+    environment = {**world.environment, "PYTHONPATH": python.path, "LD_LIBRARY_PATH": ""}
+    command = [python.executable, "-c", JOIN_AGAIN]
+    assert int(subprocess.check_output(command, env={**os.environ, **environment})) == 1
 
 
 def test_a_master_that_is_killed_and_comes_back(

@@ -289,6 +289,28 @@ def test_interrupted_it_is_as_before(
     assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
 
 
+def test_interrupted_at_the_restart_the_version_before_is_started(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd goes on with what it was told, and would run a version that is not there any more."""
+    if os.geteuid():
+        pytest.skip("gives files to another user, as root only may")
+    install(image, single_file(tmp_path))
+    restarted: list[str] = []
+
+    def systemctl(self: Installation, *arguments: str) -> None:
+        if arguments[0] == "restart":
+            restarted.append((image / COMMAND).read_text())
+            if len(restarted) == 1:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(Installation, "_starts", True)
+    monkeypatch.setattr(Installation, "_systemctl", systemctl)
+    with pytest.raises(KeyboardInterrupt):
+        install(image, single_file(tmp_path, 2))
+    assert restarted == [single_file(tmp_path, 2).read_text(), single_file(tmp_path).read_text()]
+
+
 def test_a_full_disk(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told of the file that could not be written, not of the one that was read."""
     if os.geteuid():
@@ -375,8 +397,11 @@ def test_the_command_keeps_the_user_of_before(
     assert "\nUser=robot\nGroup=drivers\n" in capsys.readouterr().out
 
 
-def run_script(image: Path, name: str, *arguments: str) -> list[str]:
-    """A script of the package with `image` in place of /; returns the commands that it called."""
+def run_script(image: Path, name: str, *arguments: str, fails: str = "") -> list[str]:
+    """A script of the package with `image` in place of /; returns the commands that it called.
+
+    `fails` is a program that does. Raises CalledProcessError when the script does.
+    """
     called = image / "called"
     called.unlink(missing_ok=True)
     programs = image / "programs"
@@ -387,7 +412,8 @@ def run_script(image: Path, name: str, *arguments: str) -> list[str]:
     for program in ("appliance", "deb-systemd-helper", "deb-systemd-invoke", "systemctl"):
         for place in (programs / program, image / "usr/bin" / program):
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text(f'#!/bin/sh\necho "$0 $@" >> {called}\n')
+            code = int(program == fails)
+            place.write_text(f'#!/bin/sh\necho "$0 $@" >> {called}\nexit {code}\n')
             place.chmod(0o755)
     environment = {"PATH": f"{programs}:/usr/bin:/bin"}
     subprocess.run(["sh", "-c", text, name, *arguments], env=environment, check=True)
@@ -429,6 +455,17 @@ def test_the_package_runs_its_own_command(image: Path) -> None:
     assert run_script(image, "postinst", "configure")[0] == "usr/bin/appliance install --packaged"
     called = run_script(image, "postinst", "abort-upgrade")
     assert called and not [line for line in called if "install --packaged" in line]
+
+
+def test_an_upgrade_with_a_mistake_in_the_configuration_leaves_dpkg_whole(image: Path) -> None:
+    (image / "run/systemd/system").mkdir(parents=True)
+    restart = "programs/deb-systemd-invoke restart appliance.service"
+    assert restart in run_script(image, "postinst", "configure", "0.1.0")
+    called = run_script(image, "postinst", "configure", "0.1.0", fails="appliance")
+    assert "programs/systemctl --system daemon-reload" in called
+    assert restart not in called, "what runs is the version before, with what it has read"
+    with pytest.raises(subprocess.CalledProcessError):
+        run_script(image, "postinst", "configure", "", fails="appliance")
 
 
 def test_to_purge_the_package_leaves_what_was_installed_by_hand_since(image: Path) -> None:

@@ -19,6 +19,7 @@ from durability.harm import HARMS
 from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock
+from appliance.store.inspection import summarise
 from store.house import House, difference, state
 
 NOBODY = pwd.getpwnam("nobody").pw_uid
@@ -101,8 +102,52 @@ async def test_an_older_database_is_migrated(
     monkeypatch.setattr(schema, "MIGRATIONS", (*schema.MIGRATIONS, more))
     twin = house.twin(tmp_path / "twin")
     assert not difference(before, state(twin.broker))
+    await twin.join("new", **lasting(5))
     assert schema.version(sqlite3.connect(twin.path)) == len(schema.MIGRATIONS)
     await twin.stop()
+
+
+@pytest.mark.parametrize("is_stopped", [True, False])
+async def test_a_newer_version_that_does_not_start_leaves_it_to_the_older(
+    house: House, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_stopped: bool
+) -> None:
+    """After a failed upgrade `appliance install` puts the version back that was there before."""
+    await house.written()
+    before = state(house.broker)
+    with monkeypatch.context() as patch:
+        patch.setattr(schema, "MIGRATIONS", (*schema.MIGRATIONS, "CREATE TABLE more (id INTEGER)"))
+        newer = house.twin(tmp_path / "newer")
+        if is_stopped:  # a port is taken, for example; else it is killed
+            await newer.stop()
+    older = newer.twin(tmp_path / "older")
+    assert not difference(before, state(older.broker))
+    await older.stop()
+    await newer.stop()
+
+
+async def test_a_new_one_can_be_looked_at_before_anything_is_written(tmp_path: Path) -> None:
+    """By `appliance check` after a start that failed, say."""
+    store = SqliteStore(tmp_path / "store.db")
+    store.open()
+    await store.close()
+    assert summarise(store.path).sessions == []
+
+
+async def test_what_nobody_waits_for_is_written_at_the_stop(house: House, tmp_path: Path) -> None:
+    """A retained message with QoS 0, for example, which comes just before it."""
+    await house.written()
+    twin = house.twin(tmp_path / "twin")
+    peer = twin.peer()
+    peer.say_connect("sensor")
+    peer.client.accept(peer.user)
+    peer.send(Publish("late", b"kept", 0, True))
+    before = state(twin.broker)
+    assert "late" in before["retained"]
+    assert not twin.store.commits and not twin.store._writing
+    await twin.stop()
+    again = twin.twin(tmp_path / "again")
+    assert not difference(before, state(again.broker))
+    await again.stop()
 
 
 async def test_a_newer_database_is_left_alone(
