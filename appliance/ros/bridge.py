@@ -269,6 +269,7 @@ class Bridge:
         )
         self._subscribe()
         self.calls.start()
+        self._forget_schemas(self._session)
         self._announce()
         self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
@@ -417,6 +418,12 @@ class Bridge:
                 Message(topic, payload, 0, True, SCHEMA_PROPERTIES if payload else None), session
             )
         self._told = types
+
+    def _forget_schemas(self, session: Session) -> None:
+        """Take back what a run has told that was killed: the types may be others now."""
+        for topic, _ in list(self._broker.retained.find(f"{self._schemas}#")):
+            self._broker.publish(Message(topic, b"", 0, True), session)
+        self._broker.flush()
 
     def _joined(self) -> None:
         log.info("on ROS as %s", self._node.name)

@@ -76,7 +76,7 @@ class ToMqtt(Flow):
         return qos
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        self.close()
+        self._unsubscribe()
         settings = self.settings
         converter = None
         if settings.encoding not in RAW:
@@ -99,7 +99,11 @@ class ToMqtt(Flow):
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
     def close(self) -> None:
-        self.bridged = self._held = None
+        self._unsubscribe()
+        self._send_held()
+
+    def _unsubscribe(self) -> None:
+        self.bridged = None
         if self._subscription is not None:
             self._subscription.destroy()
             self._subscription = None
@@ -112,7 +116,8 @@ class ToMqtt(Flow):
 
     def lost(self) -> None:
         super().lost()
-        self._subscription = self._transforms = self._held = None
+        self._send_held()
+        self._subscription = self._transforms = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
         """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
@@ -167,12 +172,22 @@ class ToMqtt(Flow):
             held = self._held
             if held is None or now < held[1] + (self._interval or QUIET):
                 return
-            if self._admit(now):
-                self._held = None
-                message = self._message(held[0], 0)
-                if message is not None:
-                    self._mailbox.put(self._lane, message)
             self.counters.throttled -= 1  # once was enough
+            if self._admit(now):
+                self._release(held[0])
+
+    def _send_held(self) -> None:
+        """Send what is held back although it is early: there will be no later."""
+        with self._admission:
+            if self._held is not None:
+                self.counters.throttled -= 1
+                self._release(self._held[0])
+
+    def _release(self, cdr: bytes) -> None:
+        self._held = None
+        message = self._message(cdr, 0)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
 
     def _message(self, cdr: bytes, published_at: int) -> Message | None:
         try:

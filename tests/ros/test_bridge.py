@@ -388,6 +388,33 @@ async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, m
     assert house.client.payloads("r2d2/a")[2:] == [b"next"]
 
 
+async def test_what_is_held_back_is_not_lost_with_its_publisher_or_route(house, monkeypatch):
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 100.0)
+    names = ("/gone/**", "/there", "/taken")
+    routes = [to_mqtt(name, encoding="text", rate=1, keep=2) for name in names]
+    bridge = house.start(*routes)
+    gone, there, taken = (
+        house.node.add_publisher(name, STRING) for name in ("/gone/a", "/there", "/taken")
+    )
+    house.node.spin()
+    for publisher in (gone, there, taken):
+        publisher.publish(string("first"))
+        publisher.publish(string("last"))
+    house.node.add_publisher("/there", STRING, BEST_EFFORT)  # subscribed to anew: no reason to send
+    gone.remove()
+    bridge.replace(routes[:2])
+    house.node.spin()
+    await house.settle()
+    assert house.client.payloads("r2d2/gone/a") == [b"first", b"last"]
+    assert house.client.payloads("r2d2/taken") == [b"first", b"last"]
+    assert house.client.payloads("r2d2/there") == [b"first"]
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 102.0)
+    house.node.spin()
+    await house.settle()
+    assert house.client.payloads("r2d2/there") == [b"first", b"last"]
+    assert [status.throttled for status in bridge.status()] == [0, 0]
+
+
 async def test_keep_latest_and_keep_n(house):
     house.start(to_mqtt("/a"), to_mqtt("/b", keep=3))
     a, b = house.node.add_publisher("/a", STRING), house.node.add_publisher("/b", STRING)

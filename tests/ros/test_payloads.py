@@ -319,6 +319,15 @@ async def test_schemas_of_what_is_bridged_are_retained(house):
     assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
 
 
+async def test_schemas_from_before_a_crash_are_taken_back(house):
+    topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
+    house.client.send(topic, b"{}", retain=True)
+    house.start(to_ros("/chatter", type=STRING))
+    await house.settle()
+    assert house.broker.retained.get(topic) is None
+    assert house.broker.retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
+
+
 # the budget
 
 
