@@ -542,6 +542,17 @@ def test_without_rclpy_one_line_says_so(monkeypatch):
     assert failures == [reason]
 
 
+@pytest.mark.parametrize("domain", ["500", "233", "-1", "one"])
+def test_a_domain_that_there_is_not_is_told(monkeypatch, domain):
+    """Fast DDS would end the process, and the broker with it."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    failures = []
+    node = ros2.Ros2Node()
+    node.start(lambda: None, failures.append)
+    node.stop()
+    assert failures == [f"ROS_DOMAIN_ID is {domain}: a domain is a number from 0 to 232"]
+
+
 def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_nowhere_cpp")
     is_available, reason = ros2.available()
