@@ -294,7 +294,7 @@ class Ros2Node:
 
     def now(self) -> int:
         clock = self._clock
-        return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
+        return int(clock.now().nanoseconds) if clock is not None else time.time_ns()
 
     def nodes(self) -> list[str]:
         found = self._node.get_node_names_and_namespaces()

@@ -281,6 +281,8 @@ def test_the_schema_of_every_field():
     ("type_name", "value"),
     [
         (ODOMETRY, {"header": {"stamp": "now"}}),
+        ("builtin_interfaces/msg/Time", "now"),
+        ("builtin_interfaces/msg/Duration", "now"),
         (ODOMETRY, {"header": {"stamp": {"sec": 2**31}}}),
         (ODOMETRY, {"pose": {"covariance": [None] * 36}}),
         (ODOMETRY, {"pose": {"covariance": [0] * 35}}),
