@@ -19,6 +19,10 @@ from appliance.ros.transforms import TYPES, StaticTransforms
 #: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
 QUIET = 1.0
 
+#: Seconds of which the messages may come at once and are not above the rate: those of a fast topic
+#: come in lots when the computer is busy.
+HELD_UP = 0.05
+
 
 class ToMqtt(Flow):
     """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
@@ -43,6 +47,7 @@ class ToMqtt(Flow):
         self._publish = publish
         self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
+        self._saved_up = max(0.0, HELD_UP - self._interval)
         self._due = 0.0
         #: Bytes that may be sent now; fewer than none when a message was larger than that.
         self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
@@ -226,5 +231,7 @@ class ToMqtt(Flow):
             return False
         if self._interval:
             late = now - self._due
-            self._due = (self._due if late < self._interval else now) + self._interval
+            if late >= self._interval:
+                late = min(late, self._saved_up)
+            self._due = now - late + self._interval
         return True

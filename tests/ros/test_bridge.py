@@ -367,6 +367,23 @@ async def test_rate_is_kept_before_conversion(house, monkeypatch):
     assert status.throttled == 200 - status.messages
 
 
+@pytest.mark.parametrize(("source", "least"), [(500, 500), (4000, 950)])
+async def test_a_high_rate_is_kept_when_messages_come_in_lots(house, monkeypatch, source, least):
+    now = 100.0
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
+    house.start(to_mqtt("/a", rate=1000, keep=10_000))
+    peer = house.node.add_publisher("/a", STRING)
+    for lot in range(20):  # in a second
+        now = 100 + lot / 20
+        for _ in range(source // 20):
+            peer.publish(string("x"))
+    for _ in range(100):
+        await house.settle()
+    status = house.status()
+    assert least <= status.messages <= 1050
+    assert status.throttled == source - status.messages
+
+
 async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, monkeypatch):
     now = 100.0
     monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
