@@ -61,6 +61,8 @@ class ToMqtt(Flow):
         self._is_large = False
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._transforms: StaticTransforms | None = None
+        #: What makes of a message one with all that belongs to it, before any is left out.
+        self._gather: Callable[[bytes], bytes] | None = None
         self._topic_wire = encode_string(self.mqtt)
         #: The properties of the last message, most often those of the next, and their bytes.
         self._properties: Properties = {}
@@ -90,14 +92,14 @@ class ToMqtt(Flow):
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        self._pack = pack = packer(converter, settings.encoding, settings.compression, about)
+        self._pack = packer(converter, settings.encoding, settings.compression, about)
         wanted_qos, wanted_retain = settings.qos, settings.retain
         self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
         self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        self._gather = None
         if type_name in TYPES and self._retain and mqtt_retain(qos):
             known = self._transforms or StaticTransforms(self._converters.get(type_name))
-            self._transforms = known
-            self._pack = lambda cdr: pack(known.add(cdr))
+            self._transforms, self._gather = known, known.add
         self._subscription = node.subscribe_raw(
             self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
         )
@@ -162,6 +164,12 @@ class ToMqtt(Flow):
             self._is_large = True  # the next thorough look subscribes for fewer of them
         if self.echo is not None and self.echo.is_own(cdr):
             return None
+        if self._gather is not None:
+            try:
+                cdr = self._gather(cdr)
+            except ConversionError as error:
+                self.fail(f"cannot be converted: {error}")
+                return None
         if self._interval or self._bytes_per_second:
             now = monotonic()
             with self._admission:
