@@ -321,6 +321,14 @@ async def test_schemas_of_what_is_bridged_are_retained(house):
     assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
 
 
+@pytest.mark.parametrize("name", ["routes", "skipped"])
+async def test_what_is_told_as_json_says_so(house, name):
+    house.start(to_ros("/chatter", type=STRING))
+    await house.settle()
+    message = house.broker.retained.get(f"r2d2/_appliance/{name}")
+    assert message.properties == {Property.CONTENT_TYPE: "application/json"}
+
+
 async def test_schemas_from_before_a_crash_are_taken_back(house):
     topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
     house.client.send(topic, b"{}", retain=True)
