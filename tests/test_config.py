@@ -215,6 +215,9 @@ bridge:
         ("to: ros, qos: 0", ".qos: is for routes to MQTT only"),
         ("to: ros, retain: false", ".retain: is for routes to MQTT only"),
         ("to: ros, fields: [x]", ".fields: is for routes to MQTT only"),
+        ("to: mqtt, fields: [x], encoding: cdr", ".fields: is for json and cbor only"),
+        ("to: both, fields: [data], encoding: text", ".fields: is for json and cbor only"),
+        ("to: mqtt, keep: 1000000000000", ".keep: must be at most 2147483647"),
         ("to: ros, lease: 1 s", ".lease: needs exclusive: true"),
         ("to: ros, clamp: {x: 3}", ".clamp: x must have its least and its most"),
         ("to: ros, clamp: {x: [.nan, 1]}", ".clamp: x must have its least before its most"),
@@ -228,7 +231,7 @@ bridge:
         ("to: ros, on_silence: {after: 1 s, publish: {x: -.inf}}", "JSON does not know"),
     ],
 )
-def test_rules_of_commands_that_cannot_be(route: str, problem: str) -> None:
+def test_routes_that_cannot_be(route: str, problem: str) -> None:
     (found,) = problems(f"bridge: {{topics: [{{ros: /a, {route}}}]}}")
     assert problem in found
 

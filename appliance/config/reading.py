@@ -156,6 +156,9 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if route.to == "ros":
             for key in route.mqtt_keys:
                 yield ("bridge", "topics", number, key), "is for routes to MQTT only"
+        elif route.fields and route.encoding not in ("json", "cbor"):
+            problem = f"is for json and cbor only, and the encoding is {route.encoding}"
+            yield ("bridge", "topics", number, "fields"), problem
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)

@@ -35,10 +35,16 @@ def _parse_retain(value: object) -> bool | None:
     raise ValueError("must be true, false or auto")
 
 
+#: The depth of a history in ROS is an int of C.
+MOST_KEPT = 2**31 - 1
+
+
 def _parse_keep(value: object) -> int | Literal["latest"]:
     if value == "latest":
         return "latest"
     if isinstance(value, int) and not isinstance(value, bool) and value > 0:
+        if value > MOST_KEPT:
+            raise ValueError(f"must be at most {MOST_KEPT}, as far as ROS counts")
         return value
     raise ValueError("must be latest, or how many messages to keep (1 or more)")
 

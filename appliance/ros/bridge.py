@@ -34,7 +34,7 @@ from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSett
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
-from appliance.ros.payloads import ZSTD_MAGIC
+from appliance.ros.payloads import CONTENT_TYPE, ZSTD_MAGIC
 from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
@@ -72,6 +72,7 @@ METERS_TO_ANNOUNCE = 10
 
 BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
+JSON_PROPERTIES: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE["json"]}
 SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
 
@@ -269,6 +270,7 @@ class Bridge:
         )
         self._subscribe()
         self.calls.start()
+        self._forget_schemas(self._session)
         self._announce()
         self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
@@ -385,14 +387,17 @@ class Bridge:
         payload = orjson.dumps([*topics, *self.calls.bridged()])
         if self._session is not None and payload != self._announced:
             self._announced = payload
-            self._broker.publish(Message(self._topic, payload, 0, True), self._session)
+            self._tell_all(self._topic, payload, self._session)
             self._tell_schemas({topic.type for topic in topics}, self._session)
             self._broker.flush()
         payload = orjson.dumps(summary(self.skips()))
         if self._session is not None and payload != self._announced_skips:
             self._announced_skips = payload
-            self._broker.publish(Message(self._skipped_topic, payload, 0, True), self._session)
+            self._tell_all(self._skipped_topic, payload, self._session)
             self._broker.flush()
+
+    def _tell_all(self, topic: str, payload: bytes, session: Session) -> None:
+        self._broker.publish(Message(topic, payload, 0, True, JSON_PROPERTIES), session)
 
     def _meter(self) -> None:
         now = self._loop.time()
@@ -417,6 +422,12 @@ class Bridge:
                 Message(topic, payload, 0, True, SCHEMA_PROPERTIES if payload else None), session
             )
         self._told = types
+
+    def _forget_schemas(self, session: Session) -> None:
+        """Take back what a run has told that was killed: the types may be others now."""
+        for topic, _ in list(self._broker.retained.find(f"{self._schemas}#")):
+            self._broker.publish(Message(topic, b"", 0, True), session)
+        self._broker.flush()
 
     def _joined(self) -> None:
         log.info("on ROS as %s", self._node.name)

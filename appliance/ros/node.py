@@ -176,7 +176,7 @@ class RosNode(Protocol):
 
     def now(self) -> int:
         """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
-        the node is told so, and the computer's before there is any."""
+        the node is told so: 0 until /clock says something, as in every node."""
 
     def nodes(self) -> list[str]:
         """The full names of all nodes on the bus, as far as they are known, this one included."""

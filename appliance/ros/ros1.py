@@ -418,7 +418,7 @@ class Ros1Node:
         rospy = self._rospy
         if rospy is None or rospy.rostime.is_wallclock():
             return time.time_ns()
-        return int(rospy.rostime.get_rostime().to_nsec()) or time.time_ns()
+        return int(rospy.rostime.get_rostime().to_nsec())
 
     def topics(self) -> dict[str, list[str]]:
         return {

@@ -59,6 +59,9 @@ NETWORK_INTERVAL = 2.0
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 _LONGEST_NAME = 247
 
+#: Those above have no ports of their own on DDS.
+HIGHEST_DOMAIN = 232
+
 _PROFILE = Path(__file__).parent.parent / "fastdds.xml"
 _UDP_PROFILE = _PROFILE.with_name("fastdds_udp.xml")
 _PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -82,6 +85,14 @@ def available() -> tuple[bool, str]:
             f"{', '.join(installed)}. Install it, or unset RMW_IMPLEMENTATION"
         )
     return True, ""
+
+
+def _wrong_domain() -> str:
+    """What is wrong with ROS_DOMAIN_ID, over which Fast DDS would end the whole process."""
+    said = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if not said or (said.isdecimal() and int(said) <= HIGHEST_DOMAIN):
+        return ""
+    return f"ROS_DOMAIN_ID is {said}: a domain is a number from 0 to {HIGHEST_DOMAIN}"
 
 
 def _resources(kind: str) -> Iterator[str]:
@@ -168,8 +179,10 @@ class Ros2Node:
         loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         self._loop = loop
-        is_available, reason = available()
-        if not is_available:
+        _, reason = available()
+        if self._domain_id is None:
+            reason = reason or _wrong_domain()
+        if reason:
             failed(reason)
             return
         use_fastdds_profile(os.environ)
@@ -281,7 +294,7 @@ class Ros2Node:
 
     def now(self) -> int:
         clock = self._clock
-        return (clock.now().nanoseconds if clock is not None else 0) or time.time_ns()
+        return int(clock.now().nanoseconds) if clock is not None else time.time_ns()
 
     def nodes(self) -> list[str]:
         found = self._node.get_node_names_and_namespaces()

@@ -30,6 +30,8 @@ def json_schema(description: TypeDescription) -> dict[str, Any]:
     """
     types: dict[str, Any] = {}
     schema = _structure(description, types)
+    if description.name == TIME:
+        schema = {"anyOf": [schema, {"const": "now"}]}
     return {
         "$schema": DIALECT,
         "title": description.name,

@@ -19,6 +19,10 @@ from appliance.ros.transforms import TYPES, StaticTransforms
 #: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
 QUIET = 1.0
 
+#: Seconds of which the messages may come at once and are not above the rate: those of a fast topic
+#: come in lots when the computer is busy.
+HELD_UP = 0.05
+
 
 class ToMqtt(Flow):
     """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
@@ -43,6 +47,7 @@ class ToMqtt(Flow):
         self._publish = publish
         self._lane = Lane(settings.samples, self.counters)
         self._interval = 1 / settings.rate if settings.rate else 0.0
+        self._saved_up = max(0.0, HELD_UP - self._interval)
         self._due = 0.0
         #: Bytes that may be sent now; fewer than none when a message was larger than that.
         self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
@@ -56,6 +61,8 @@ class ToMqtt(Flow):
         self._is_large = False
         self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._transforms: StaticTransforms | None = None
+        #: What makes of a message one with all that belongs to it, before any is left out.
+        self._gather: Callable[[bytes], bytes] | None = None
         self._topic_wire = encode_string(self.mqtt)
         #: The properties of the last message, most often those of the next, and their bytes.
         self._properties: Properties = {}
@@ -76,7 +83,7 @@ class ToMqtt(Flow):
         return qos
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        self.close()
+        self._unsubscribe()
         settings = self.settings
         converter = None
         if settings.encoding not in RAW:
@@ -85,21 +92,25 @@ class ToMqtt(Flow):
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        self._pack = pack = packer(converter, settings.encoding, settings.compression, about)
+        self._pack = packer(converter, settings.encoding, settings.compression, about)
         wanted_qos, wanted_retain = settings.qos, settings.retain
         self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
         self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        self._gather = None
         if type_name in TYPES and self._retain and mqtt_retain(qos):
             known = self._transforms or StaticTransforms(self._converters.get(type_name))
-            self._transforms = known
-            self._pack = lambda cdr: pack(known.add(cdr))
+            self._transforms, self._gather = known, known.add
         self._subscription = node.subscribe_raw(
             self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
         )
         return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
 
     def close(self) -> None:
-        self.bridged = self._held = None
+        self._unsubscribe()
+        self._send_held()
+
+    def _unsubscribe(self) -> None:
+        self.bridged = None
         if self._subscription is not None:
             self._subscription.destroy()
             self._subscription = None
@@ -112,7 +123,8 @@ class ToMqtt(Flow):
 
     def lost(self) -> None:
         super().lost()
-        self._subscription = self._transforms = self._held = None
+        self._send_held()
+        self._subscription = self._transforms = None
 
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
         """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
@@ -152,6 +164,12 @@ class ToMqtt(Flow):
             self._is_large = True  # the next thorough look subscribes for fewer of them
         if self.echo is not None and self.echo.is_own(cdr):
             return None
+        if self._gather is not None:
+            try:
+                cdr = self._gather(cdr)
+            except ConversionError as error:
+                self.fail(f"cannot be converted: {error}")
+                return None
         if self._interval or self._bytes_per_second:
             now = monotonic()
             with self._admission:
@@ -167,12 +185,22 @@ class ToMqtt(Flow):
             held = self._held
             if held is None or now < held[1] + (self._interval or QUIET):
                 return
-            if self._admit(now):
-                self._held = None
-                message = self._message(held[0], 0)
-                if message is not None:
-                    self._mailbox.put(self._lane, message)
             self.counters.throttled -= 1  # once was enough
+            if self._admit(now):
+                self._release(held[0])
+
+    def _send_held(self) -> None:
+        """Send what is held back although it is early: there will be no later."""
+        with self._admission:
+            if self._held is not None:
+                self.counters.throttled -= 1
+                self._release(self._held[0])
+
+    def _release(self, cdr: bytes) -> None:
+        self._held = None
+        message = self._message(cdr, 0)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
 
     def _message(self, cdr: bytes, published_at: int) -> Message | None:
         try:
@@ -211,5 +239,7 @@ class ToMqtt(Flow):
             return False
         if self._interval:
             late = now - self._due
-            self._due = (self._due if late < self._interval else now) + self._interval
+            if late >= self._interval:
+                late = min(late, self._saved_up)
+            self._due = now - late + self._interval
         return True

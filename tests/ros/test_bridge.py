@@ -367,6 +367,23 @@ async def test_rate_is_kept_before_conversion(house, monkeypatch):
     assert status.throttled == 200 - status.messages
 
 
+@pytest.mark.parametrize(("source", "least"), [(500, 500), (4000, 950)])
+async def test_a_high_rate_is_kept_when_messages_come_in_lots(house, monkeypatch, source, least):
+    now = 100.0
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
+    house.start(to_mqtt("/a", rate=1000, keep=10_000))
+    peer = house.node.add_publisher("/a", STRING)
+    for lot in range(20):  # in a second
+        now = 100 + lot / 20
+        for _ in range(source // 20):
+            peer.publish(string("x"))
+    for _ in range(100):
+        await house.settle()
+    status = house.status()
+    assert least <= status.messages <= 1050
+    assert status.throttled == source - status.messages
+
+
 async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, monkeypatch):
     now = 100.0
     monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
@@ -386,6 +403,33 @@ async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, m
     peer.publish(string("next"))  # nothing is saved up
     await house.settle()
     assert house.client.payloads("r2d2/a")[2:] == [b"next"]
+
+
+async def test_what_is_held_back_is_not_lost_with_its_publisher_or_route(house, monkeypatch):
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 100.0)
+    names = ("/gone/**", "/there", "/taken")
+    routes = [to_mqtt(name, encoding="text", rate=1, keep=2) for name in names]
+    bridge = house.start(*routes)
+    gone, there, taken = (
+        house.node.add_publisher(name, STRING) for name in ("/gone/a", "/there", "/taken")
+    )
+    house.node.spin()
+    for publisher in (gone, there, taken):
+        publisher.publish(string("first"))
+        publisher.publish(string("last"))
+    house.node.add_publisher("/there", STRING, BEST_EFFORT)  # subscribed to anew: no reason to send
+    gone.remove()
+    bridge.replace(routes[:2])
+    house.node.spin()
+    await house.settle()
+    assert house.client.payloads("r2d2/gone/a") == [b"first", b"last"]
+    assert house.client.payloads("r2d2/taken") == [b"first", b"last"]
+    assert house.client.payloads("r2d2/there") == [b"first"]
+    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 102.0)
+    house.node.spin()
+    await house.settle()
+    assert house.client.payloads("r2d2/there") == [b"first", b"last"]
+    assert [status.throttled for status in bridge.status()] == [0, 0]
 
 
 async def test_keep_latest_and_keep_n(house):

@@ -281,6 +281,8 @@ def test_the_schema_of_every_field():
     ("type_name", "value"),
     [
         (ODOMETRY, {"header": {"stamp": "now"}}),
+        ("builtin_interfaces/msg/Time", "now"),
+        ("builtin_interfaces/msg/Duration", "now"),
         (ODOMETRY, {"header": {"stamp": {"sec": 2**31}}}),
         (ODOMETRY, {"pose": {"covariance": [None] * 36}}),
         (ODOMETRY, {"pose": {"covariance": [0] * 35}}),
@@ -317,6 +319,23 @@ async def test_schemas_of_what_is_bridged_are_retained(house):
     await house.settle()
     assert retained.get("r2d2/_appliance/schema/std_msgs/String") is None
     assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
+
+
+@pytest.mark.parametrize("name", ["routes", "skipped"])
+async def test_what_is_told_as_json_says_so(house, name):
+    house.start(to_ros("/chatter", type=STRING))
+    await house.settle()
+    message = house.broker.retained.get(f"r2d2/_appliance/{name}")
+    assert message.properties == {Property.CONTENT_TYPE: "application/json"}
+
+
+async def test_schemas_from_before_a_crash_are_taken_back(house):
+    topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
+    house.client.send(topic, b"{}", retain=True)
+    house.start(to_ros("/chatter", type=STRING))
+    await house.settle()
+    assert house.broker.retained.get(topic) is None
+    assert house.broker.retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
 
 
 # the budget

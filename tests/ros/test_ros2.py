@@ -367,7 +367,8 @@ async def test_latched_samples_are_retained(house, peer):
     assert house.received[-1][1] == 1
 
 
-async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, tmp_path):
+@pytest.mark.parametrize("rate", [None, 1])
+async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, tmp_path, rate):
     folder = tmp_path / "share/tf2_msgs/msg"
     folder.mkdir(parents=True)
     (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\n")
@@ -388,15 +389,16 @@ async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, t
             for each in json.loads(message.payload)["transforms"]
         }
 
-    peers = [await Peer().start(name) for name in ("base", "lidar")]
+    peers = [await Peer().start(name) for name in ("base", "arm", "lidar")]
     try:
         for peer in peers:
             await peer.do("advertise", "/tf_static", TF, "reliable", "transient_local")
         await publish(peers[0], transform("base", 1.0), transform("wheel", 2.0))
-        await publish(peers[1], transform("lidar", 3.0))
-        house.start(route("/tf_static", "mqtt"))
-        everything = {"base": 1.0, "wheel": 2.0, "lidar": 3.0}
-        await until(lambda: retained() == everything, "the transforms of both")
+        await publish(peers[1], transform("hand", 5.0))
+        await publish(peers[2], transform("lidar", 3.0))
+        house.start(route("/tf_static", "mqtt", rate=rate))
+        everything = {"base": 1.0, "wheel": 2.0, "hand": 5.0, "lidar": 3.0}
+        await until(lambda: retained() == everything, "the transforms of all")
         await publish(peers[0], transform("wheel", 4.0))
         await until(lambda: retained() == everything | {"wheel": 4.0}, "the one that has changed")
     finally:
@@ -540,6 +542,17 @@ def test_without_rclpy_one_line_says_so(monkeypatch):
     node.start(lambda: None, failures.append)
     node.stop()
     assert failures == [reason]
+
+
+@pytest.mark.parametrize("domain", ["500", "233", "-1", "one"])
+def test_a_domain_that_there_is_not_is_told(monkeypatch, domain):
+    """Fast DDS would end the process, and the broker with it."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    failures = []
+    node = ros2.Ros2Node()
+    node.start(lambda: None, failures.append)
+    node.stop()
+    assert failures == [f"ROS_DOMAIN_ID is {domain}: a domain is a number from 0 to 232"]
 
 
 def test_a_middleware_that_is_not_installed_is_told(monkeypatch):

@@ -259,6 +259,7 @@ async def test_time_is_the_simulations(start, peer, node):
     await peer.do("subscribe", "/t", STAMP)
     await until(house.bridged, "/t")
     await peer.do("matched", "/clock")
+    assert house.node.now() == 0
     clock = b"\0\1\0\0" + (1234).to_bytes(4, "little") + (500).to_bytes(4, "little")
 
     async def has_arrived():
