@@ -128,11 +128,13 @@ def test_it_joins_again_and_leaves_another_its_name(
 
 JOIN_AGAIN = """\
 import gc, types
-from appliance.ros.ros1 import _fresh_rospy
+from importlib import import_module
 from appliance.ros.ros1_ends import message_class
+from appliance.ros.ros1_rospy import unload
 from appliance.ros.ros1_types import installed
 for _ in range(3):
-    message_class(_fresh_rospy(), installed("std_msgs/msg/String"))
+    unload()
+    message_class(import_module("rospy"), installed("std_msgs/msg/String"))
 gc.collect()
 modules = [each for each in gc.get_objects() if isinstance(each, types.ModuleType)]
 print([each.__name__ for each in modules].count("rospy.core"))
