@@ -197,8 +197,9 @@ class Bridge:
                     self._leaving.append(flow)
                     flow.route.past.add(flow.counters)
         for key, flow in flows.items():
-            if before.get(key) is not flow:
-                flow.enter()
+            known = before.get(key)
+            if known is not flow:
+                flow.enter(known)
         receivers: dict[str, list[ToRos]] = {}
         for flow in flows.values():
             receivers.setdefault(flow.mqtt, []).append(flow)

@@ -58,7 +58,10 @@ class _Stop:
 
     def is_like(self, cdr: bytes) -> bool:
         """Whether a message says the same, at another time or in another frame."""
-        one, other = (self._converter.to_dict(message) for message in (cdr, self.example))
+        try:
+            one, other = (self._converter.to_dict(message) for message in (cdr, self.example))
+        except ConversionError:  # of another type, from before a reload
+            return False
         return all(one[name] == other[name] for name in one if name != "header")
 
 
@@ -130,13 +133,17 @@ class Commands(ToRos):
 
     # The loop's thread
 
-    def enter(self) -> None:
+    def enter(self, before: ToRos | None) -> None:
         broker = self._around.broker
         self._is_left = False
         broker.departures.append(self._departed)
         # Also when anybody may command: the topic is then known as one that no answer goes to.
         broker.guards.setdefault(self.mqtt, []).append(self)
         broker.guards_changed()
+        if isinstance(before, Commands):
+            # What the network has of their commands, or a client that is away, is as old here.
+            self._drivers, self._backlog = before._drivers, before._backlog
+            self._arm()
         if self.rules.on_silence is not None:
             # Of the time before, of another run even, nothing is known. Who drove then and is away
             # may come back with what it had queued.
@@ -161,7 +168,6 @@ class Commands(ToRos):
             del broker.guards[self.mqtt]
         broker.guards_changed()
         self._holder = self._source = None
-        self._drivers.clear()
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         if self._is_left or not self._is_in_time(message, retain, origin):
@@ -278,7 +284,9 @@ class Commands(ToRos):
             self._backlog.expect(session.client_id)
 
     def _is_stop(self, cdr: bytes) -> bool:
-        return self._stop is None or self._stop.is_like(cdr)
+        if self.rules.on_silence is None:
+            return True
+        return self._stop is not None and self._stop.is_like(cdr)
 
     def _arm(self) -> None:
         rules = self.rules

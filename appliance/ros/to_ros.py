@@ -73,8 +73,8 @@ class ToRos(Flow):
         rules = self.settings.rules
         return rules is not None and rules.take_retained
 
-    def enter(self) -> None:
-        """Messages are going to be received from now on."""
+    def enter(self, before: ToRos | None) -> None:
+        """Messages are going to be received from now on; until now `before` has had them."""
 
     def leave(self) -> None:
         """None will be received any more."""

@@ -480,9 +480,24 @@ async def test_the_end_of_the_route_or_the_bridge_stops_who_is_driven(house):
     house.node.spin()
     bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
     house.node.spin()
-    Driver(house.broker, "a").drive()
+    Driver(house.broker, "b").drive()
     await bridge.stop()
     assert house.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
+
+
+async def test_who_fell_silent_is_disconnected_though_its_route_has_changed(house):
+    bridge = house.start(CommandRules(on_silence=OnSilence(AFTER)))
+    stalled, gone = Driver(house.broker, "a"), Driver(house.broker, "b")
+    gone.drive()
+    gone.cut()
+    stalled.drive()
+    rules = CommandRules(on_silence=OnSilence(2 * AFTER))
+    bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
+    await until(lambda: stalled.wire.closed)
+    before = len(house.robot.received)
+    for name in ("a", "b"):
+        Driver(house.broker, name).drive()  # what they had queued, perhaps
+    assert len(house.robot.received) == before
 
 
 async def test_a_lease_and_a_driver_survive_a_reload(house):
