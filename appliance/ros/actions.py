@@ -639,7 +639,6 @@ class Action:
         for offer in self._offers:
             self._board.withdraw(offer)
         self.forget()
-        self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
         try:
             self._routes._node.call_soon(self._close)
         except BusError:
@@ -683,6 +682,12 @@ class Action:
     def _close(self) -> None:
         self._is_over = True
         self._close_subscriptions()
+        self._take_back_status()
+
+    def _take_back_status(self) -> None:
+        """Behind what waits in the mailbox, which would be retained for good."""
+        nothing = Message(f"{self.base}/_status", b"", 0, True)
+        self._routes._mailbox.put(self._status_lane, nothing)
 
     def _close_subscriptions(self) -> None:
         for own in self._subscriptions:
@@ -694,7 +699,7 @@ class Action:
         self._subscriptions.clear()
         self._subscribed = None
         self._servers = 0
-        self._routes._post(self.forget)
+        self._take_back_status()
 
     def _on_status(self, cdr: bytes) -> None:
         try:

@@ -208,6 +208,7 @@ async def test_each_address_has_its_turn_and_its_place(
     access.close()
 
 
+@pytest.mark.timed
 async def test_a_stranger_cannot_tell_by_the_time_who_is_a_user(access: FileAccess) -> None:
     """A wrong password takes as long for a user as for nobody, also when it comes again."""
 

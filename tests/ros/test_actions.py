@@ -178,6 +178,22 @@ async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_agai
     assert house.node.subscriptions == subscriptions
 
 
+@pytest.mark.parametrize("is_lost", [True, False], ids=["the bus ends", "the route is removed"])
+async def test_a_status_that_still_waits_is_not_left_behind(house, is_lost):
+    await begin(house)
+    said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
+    latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
+    status = house.node.add_publisher("/walk/_action/status", STATUS, latched)
+    status.publish(CONVERTERS.get(STATUS).from_dict(said))
+    assert house.broker.retained.get("r2d2/walk/_status") is None, "it waits for its turn"
+    if is_lost:
+        house.node.fail("the node ended")
+    else:
+        house.bridge.calls.replace(call_routes())
+    await asyncio.sleep(0.1)
+    assert house.broker.retained.get("r2d2/walk/_status") is None
+
+
 async def test_an_action_is_of_one_type(house):
     """Others may offer services by the same names, of which ROS takes those of one type for one."""
     walks, client = await begin(house)
