@@ -158,8 +158,9 @@ async def test_http(backend: Backend) -> None:
         assert not await decided(rig, who, Action.PUBLISH, "a")
 
 
+@pytest.mark.timed
 async def test_a_server_that_hangs_holds_up_nobody_else(backend: Backend, tmp_path: Path) -> None:
-    async with running(backend.plugins(), plugin_timeout=1) as rig:
+    async with running(backend.plugins(), plugin_timeout=0.5) as rig:
         slow = [
             asyncio.ensure_future(
                 rig.frame.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
@@ -169,10 +170,10 @@ async def test_a_server_that_hangs_holds_up_nobody_else(backend: Backend, tmp_pa
         await until(lambda: backend.logins.count("slow") == 20)
         began = time.monotonic()
         assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
-        assert time.monotonic() - began < 0.9
+        assert time.monotonic() - began < 0.4
         answers = await asyncio.gather(*slow)
         assert {code_of(answer) for answer in answers} == {ReasonCode.SERVER_UNAVAILABLE}
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < 2
         # That is not remembered, and no guess.
         backend.hangs.set()
         answer = await rig.frame.authenticate(connect_of("slow", b"1"), "10.0.0.1:1")

@@ -92,10 +92,11 @@ def code_of(answer: Identity | Refusal) -> ReasonCode:
     return answer.code if isinstance(answer, Refusal) else ReasonCode.SUCCESS
 
 
+@pytest.mark.timed
 async def test_guesses_do_not_keep_out_who_was_here_before_nor_another_address(
     access: FileAccess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.5)
+    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.1)
     guessing(access, "10.0.0.1:1")
     checks = count_checks(monkeypatch)
     # Nothing is hashed for who guesses on, and it learns nothing about users.
@@ -106,11 +107,11 @@ async def test_guesses_do_not_keep_out_who_was_here_before_nor_another_address(
     # alice was never here, and comes in from elsewhere, after the time that she can be held up.
     began = time.monotonic()
     assert await access.authenticate("alice", b"geheim", "c", "10.0.0.2:1") == ALICE_C
-    assert 0.5 <= time.monotonic() - began < 5
+    assert 0.1 <= time.monotonic() - began < 1
     # And now even from where it is guessed, at once.
     began = time.monotonic()
     assert await access.authenticate("alice", b"geheim", "c", "10.0.0.1:3") == ALICE_C
-    assert time.monotonic() - began < 0.5
+    assert time.monotonic() - began < 0.1
     assert len(checks) == 1
 
 

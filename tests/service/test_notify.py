@@ -130,6 +130,7 @@ async def test_no_status_spoils_what_systemd_is_told(tmp_path: Path) -> None:
     assert names == [b"READY", b"STATUS"]
 
 
+@pytest.mark.timed
 async def test_systemd_does_not_read(tmp_path: Path) -> None:
     """A sign of life that does not fit into the socket's queue holds up nothing."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -138,7 +139,7 @@ async def test_systemd_does_not_read(tmp_path: Path) -> None:
     notifier.start(asyncio.get_running_loop(), lambda: "fine")
     began = time.monotonic()
     await asyncio.sleep(0.3)
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 0.8
     notifier.close()
     listening.close()
 
