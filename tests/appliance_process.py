@@ -15,12 +15,12 @@ import ssl
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
+from waiting import PATIENCE
 
 from appliance import certs
 from appliance.access import Passwords
@@ -28,9 +28,6 @@ from appliance.init import Credentials, initialise
 
 ROBOT = "r2d2"
 HOST = "localhost"
-
-#: Seconds for what takes milliseconds, on a computer that is busy with something else.
-PATIENCE = 30.0
 
 #: For interop tests: what alice publishes under r2d2/ she and bob can read.
 ACL = """\
@@ -253,11 +250,3 @@ def _free_ports(count: int) -> list[int]:
     for sock in sockets:
         sock.close()
     return ports
-
-
-def eventually(condition: Callable[[], object], what: str, timeout: float = PATIENCE) -> None:
-    """Returns when the condition holds; AssertionError says what did not come true."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {timeout:g} s: {what}"
-        time.sleep(0.01)

@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import socket
 import ssl
-from collections.abc import Callable
 from pathlib import Path
+
+from waiting import PATIENCE
 
 from appliance import certs
 from appliance.broker.broker import Broker
@@ -19,8 +20,6 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.network import Network
 from appliance.store import MemoryStore
 from appliance.wire import ClientProtocol
-
-PATIENCE = 10.0  # seconds for what takes milliseconds
 
 
 def make_contexts(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
@@ -161,13 +160,3 @@ class Caller:
 
     def hang_up(self) -> None:
         self.writer.transport.abort()
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Wait for what is about to happen."""
-
-    async def wait() -> None:
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.002)
-
-    await asyncio.wait_for(wait(), PATIENCE)

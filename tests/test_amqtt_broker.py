@@ -26,6 +26,7 @@ from amqtt.session import ApplicationMessage
 from amqtt.session import Session as AmqttSession
 from argon2 import PasswordHasher
 from transitions import MachineError
+from waiting import PATIENCE, until
 
 from appliance import certs
 from appliance.access import AccessFileError, FileAccess, Passwords
@@ -57,7 +58,6 @@ EVENT_LOGGER = "amqtt.plugins.logging_amqtt.EventLoggerPlugin"
 PACKET_LOGGER = "amqtt.plugins.logging_amqtt.PacketLoggerPlugin"
 
 #: Seconds that anything here may take; far more than it does.
-PATIENCE = 10.0
 #: Seconds that plugins get where a test waits for them in vain.
 SHORT = 0.1
 
@@ -306,13 +306,6 @@ async def nothing_more(client: MQTTClient, other: MQTTClient) -> None:
     """What `other` publishes now is the next that the client receives."""
     await other.publish("test/end", b"end", qos=1)
     assert (await receive(client)).topic == "test/end"
-
-
-async def until(done: Callable[[], bool]) -> None:
-    deadline = asyncio.get_running_loop().time() + PATIENCE
-    while not done():
-        assert asyncio.get_running_loop().time() < deadline, "it did not happen"
-        await asyncio.sleep(0.005)
 
 
 async def refused(connecting: Awaitable[object]) -> int | None:

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from appliance_process import ApplianceProcess, eventually
+from appliance_process import ApplianceProcess
 from raw_client import RawClient
+from waiting import eventually
 
 from appliance import audit as audit_module
 from appliance import cli

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from appliance_process import PATIENCE, eventually
+from waiting import PATIENCE, eventually
 
 from appliance import cli
 from appliance.access import Passwords

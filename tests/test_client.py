@@ -12,12 +12,12 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from waiting import PATIENCE
 
 from appliance import certs, cli
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
-PATIENCE = 10.0  # seconds for what takes milliseconds
 
 
 @dataclass(frozen=True)

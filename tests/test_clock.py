@@ -7,8 +7,9 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from appliance_process import PATIENCE, ROBOT, ApplianceProcess, eventually
+from appliance_process import ROBOT, ApplianceProcess
 from raw_client import RawClient
+from waiting import PATIENCE, eventually
 from wall_clock import HOUR, YEAR, WallClock
 
 from appliance.clock import RELEASED, StepWatch, is_unset

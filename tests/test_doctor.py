@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 import yaml
-from appliance_process import ApplianceProcess, eventually
+from appliance_process import ApplianceProcess
+from waiting import eventually
 
 from appliance import certs, cli, config
 from appliance.config import Settings

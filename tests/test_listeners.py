@@ -18,7 +18,8 @@ from unittest.mock import Mock
 import pytest
 import uvloop
 import yaml
-from house import PATIENCE, Caller, House, make_contexts, until
+from house import Caller, House, make_contexts
+from waiting import PATIENCE, until
 
 from appliance import config, farewell, listeners, network, sockets, wire, wiring
 from appliance.broker.ports import Limits

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 from aiohttp import web
-from test_amqtt_broker import Login, connect_of, own, running, until
+from test_amqtt_broker import Login, connect_of, own, running
+from waiting import until
 
 from appliance.amqtt_broker import Answers, PluginSettingsError
 from appliance.amqtt_broker import logins as logins_module

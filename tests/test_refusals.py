@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from appliance_process import HOST, PATIENCE, ApplianceProcess
+from appliance_process import HOST, ApplianceProcess
 from raw_client import RawClient
+from waiting import PATIENCE
 
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (

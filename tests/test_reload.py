@@ -17,9 +17,10 @@ from typing import Any
 
 import pytest
 import yaml
-from appliance_process import HOST, PATIENCE, ApplianceProcess, eventually
+from appliance_process import HOST, ApplianceProcess
 from cryptography import x509
 from raw_client import RawClient
+from waiting import PATIENCE, eventually
 
 from appliance import certs
 from appliance.access import Passwords

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 import yaml
-from appliance_process import ApplianceProcess, eventually
+from appliance_process import ApplianceProcess
 from raw_client import RawClient
+from waiting import eventually
 
 from appliance import cli
 from appliance.access import Passwords

@@ -20,6 +20,7 @@ import pytest
 import uvloop
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from waiting import PATIENCE, until
 
 from appliance import certs, tls
 from appliance.tls import RECORD_SIZE, TlsTransport
@@ -27,7 +28,6 @@ from appliance.tls import RECORD_SIZE, TlsTransport
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
-PATIENCE = 10.0  # seconds for what takes milliseconds
 MIB = 1 << 20
 ALERT = 0x15  # the record's type (RFC 8446, section 5.1)
 OWN = tls.accept
@@ -267,16 +267,6 @@ async def house(server: ssl.SSLContext, client: ssl.SSLContext) -> AsyncIterator
     house = House(server, client)
     yield house
     await house.close()
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Wait for what is about to happen."""
-
-    async def wait() -> None:
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.002)
-
-    await asyncio.wait_for(wait(), PATIENCE)
 
 
 async def turns(count: int = 5) -> None:

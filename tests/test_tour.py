@@ -12,10 +12,9 @@ from asyncio.subprocess import PIPE, Process
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE
 
 from appliance import cli, config, tour
-
-PATIENCE = 20.0  # seconds for what takes one
 
 
 @pytest.fixture

@@ -14,8 +14,9 @@ from typing import Any
 import paho.mqtt.client as paho
 import pytest
 import uvloop
-from house import PATIENCE, Caller, House, make_contexts, until
+from house import Caller, House, make_contexts
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from waiting import PATIENCE, until
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode

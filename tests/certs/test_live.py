@@ -18,10 +18,11 @@ from typing import Any
 
 import psutil
 import pytest
-from appliance_process import HOST, PATIENCE, ApplianceProcess, eventually
+from appliance_process import HOST, ApplianceProcess
 from authorities import NOW, Company
 from cryptography import x509
 from raw_client import RawClient
+from waiting import PATIENCE, eventually
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as websocket

@@ -9,13 +9,13 @@ import hashlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
+from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity
 from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.packets import Connect, Pingreq, Publish, Subscribe, Subscription
 
-PATIENCE = 10.0
 KEY = base64.b64encode(bytes(range(16))).decode()
 ACCEPT = base64.b64encode(
     hashlib.sha1(f"{KEY}258EAFA5-E914-47DA-95CA-C5AB0DC85B11".encode()).digest()

@@ -8,9 +8,10 @@ import uuid
 from collections.abc import Callable, Iterator
 
 import pytest
-from appliance_process import PATIENCE, ApplianceProcess
+from appliance_process import ApplianceProcess
 from client_v311 import CLEAN_SESSION, PASSWORD, USER_NAME, connect, field, packet, wire
 from raw_client import RawClient
+from waiting import PATIENCE
 
 from appliance.mqtt.packets import Publish, Subscribe, Subscription, Will
 

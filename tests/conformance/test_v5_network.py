@@ -8,9 +8,10 @@ import uuid
 from collections.abc import Callable, Iterator
 
 import pytest
-from appliance_process import PATIENCE, ApplianceProcess
+from appliance_process import ApplianceProcess
 from client_v5 import connack, connect, disconnect, properties, publish, wire
 from raw_client import RawClient
+from waiting import PATIENCE
 
 from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription, Will
 

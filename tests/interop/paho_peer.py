@@ -7,13 +7,14 @@ import socket
 import threading
 from typing import Any
 
-from appliance_process import HOST, PATIENCE, BrokerProcess
+from appliance_process import HOST, BrokerProcess
 from paho.mqtt.client import Client, DisconnectFlags, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
+from waiting import PATIENCE
 
 V311 = MQTTProtocolVersion.MQTTv311
 V5 = MQTTProtocolVersion.MQTTv5

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from amqtt.client import MQTTClient
 from amqtt.errors import ConnectError
-from appliance_process import HOST, PATIENCE, ApplianceProcess
+from appliance_process import HOST, ApplianceProcess
+from waiting import PATIENCE
 
 QOS = [0, 1, 2]
 

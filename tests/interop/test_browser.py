@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from appliance_process import ACL, PATIENCE, ROBOT, ApplianceProcess, eventually
+from appliance_process import ACL, ROBOT, ApplianceProcess
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from paho.mqtt.enums import MQTTProtocolVersion
 from paho_peer import Peer
 from test_mqttjs import DIRECTORY, _installed  # noqa: F401
+from waiting import PATIENCE, eventually
 from websockets.sync.client import connect
 
 MQTT_JS = DIRECTORY / "node_modules/mqtt/dist/mqtt.min.js"

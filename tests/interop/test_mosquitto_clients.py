@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from appliance_process import HOST, PATIENCE, ApplianceProcess, BrokerProcess
+from appliance_process import HOST, ApplianceProcess, BrokerProcess
+from waiting import PATIENCE
 
 from appliance import certs
 

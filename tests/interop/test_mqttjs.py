@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from appliance_process import HOST, PATIENCE, ApplianceProcess
+from appliance_process import HOST, ApplianceProcess
+from waiting import PATIENCE
 
 DIRECTORY = Path(__file__).parent / "mqttjs"
 INSTALL_TIMEOUT = 60.0  # seconds

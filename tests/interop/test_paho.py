@@ -7,11 +7,12 @@ import time
 from typing import Any
 
 import pytest
-from appliance_process import PATIENCE, ApplianceProcess, BrokerProcess, eventually
+from appliance_process import ApplianceProcess, BrokerProcess
 from paho.mqtt.enums import MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.subscribeoptions import SubscribeOptions
 from paho_peer import V5, V311, Peer, brief, properties
+from waiting import PATIENCE, eventually
 
 QOS = [0, 1, 2]
 both_versions = pytest.mark.parametrize("version", [V311, V5], ids=["v311", "v5"])

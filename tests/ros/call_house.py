@@ -6,6 +6,8 @@ import asyncio
 import json
 import time
 
+from waiting import until
+
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, InsideLink
@@ -20,8 +22,6 @@ from appliance.ros.graph import (
     ServiceSettings,
 )
 from appliance.store import MemoryStore
-
-DEADLINE = 15.0
 
 
 class AllTypes:
@@ -191,10 +191,3 @@ def parameters(ros, **kw):
 
 def names(ros):
     return (ros,) if isinstance(ros, str) else tuple(ros)
-
-
-async def until(condition, what, deadline=DEADLINE):
-    end = time.monotonic() + deadline
-    while not condition():
-        assert time.monotonic() < end, f"not within {deadline} s: {what}"
-        await asyncio.sleep(0.005)

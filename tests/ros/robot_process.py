@@ -9,9 +9,9 @@ import sys
 import threading
 from pathlib import Path
 
-from appliance.environment import for_other_programs
+from waiting import PATIENCE
 
-DEADLINE = 20.0
+from appliance.environment import for_other_programs
 
 
 class Robot:
@@ -35,11 +35,11 @@ class Robot:
             (self._answers if kind == "ok" else self.told).put([kind, *rest])
 
     def wait(self):
-        return self._answers.get(timeout=DEADLINE)[1]
+        return self._answers.get(timeout=PATIENCE)[1]
 
     def hear(self, *expected):
         """Wait until it has told that by itself."""
-        while self.told.get(timeout=DEADLINE)[: len(expected)] != [*expected]:
+        while self.told.get(timeout=PATIENCE)[: len(expected)] != [*expected]:
             pass
 
     def do(self, *command):
@@ -50,7 +50,7 @@ class Robot:
     def stop(self):
         self._process.stdin.close()
         try:
-            self._process.wait(DEADLINE)
+            self._process.wait(PATIENCE)
         finally:
             self._process.kill()
             self._process.wait()

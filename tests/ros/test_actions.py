@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from waiting import until
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, call_routes, until
+from call_house import AllTypes, House, action, call_routes
 
 from appliance.ros import actions as module
 from appliance.ros import requests

@@ -23,7 +23,8 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
-from appliance_process import HOST, ROBOT, BrokerProcess, eventually
+from appliance_process import HOST, ROBOT, BrokerProcess
+from waiting import eventually, until
 
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
@@ -31,7 +32,7 @@ pytest.importorskip("PyInstaller")
 from robot_process import Robot
 from test_own_interfaces import DRIVE, VALUE, build_workspace
 from test_robot import TURTLE, V5, Client
-from test_ros2 import Peer, domain, string, until
+from test_ros2 import Peer, domain, string
 
 __all__ = ["domain"]  # a fixture for all tests here
 

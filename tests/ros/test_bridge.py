@@ -11,7 +11,7 @@ import time
 from dataclasses import replace
 
 import pytest
-from house import until
+from waiting import until
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message

@@ -12,11 +12,11 @@ import sys
 
 import pytest
 import yaml
-from appliance_process import ApplianceProcess, eventually
+from appliance_process import ApplianceProcess
+from waiting import PATIENCE, eventually
 
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
-from robot_process import DEADLINE
 
 from appliance import cli
 from appliance.environment import for_other_programs
@@ -154,13 +154,13 @@ def test_ctrl_c_cancels_the_goal(appliance, robot, number):
         assert process.stdout.readline().startswith("goal ")
         assert process.stdout.readline().startswith("feedback ")
         process.send_signal(number)
-        output, errors = process.communicate(timeout=DEADLINE)
+        output, errors = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
         process.communicate()
     assert output.splitlines()[-1].startswith("canceled {"), errors
     assert process.returncode == 128 + number
-    while (told := robot.told.get(timeout=DEADLINE))[2:] != [400]:
+    while (told := robot.told.get(timeout=PATIENCE))[2:] != [400]:
         pass
     assert told[0] == "walked" and told[1] < 100
 
@@ -228,7 +228,7 @@ async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
         )
 
     async def output(process):
-        out, errors = await asyncio.wait_for(process.communicate(), DEADLINE)
+        out, errors = await asyncio.wait_for(process.communicate(), PATIENCE)
         return process.returncode, out.decode(), errors.decode()
 
     list(initialise(tmp_path / "run", demo=True))
@@ -236,7 +236,7 @@ async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
     try:
         line = b""
         while b" call " not in line:
-            line = await asyncio.wait_for(demo.stdout.readline(), DEADLINE)
+            line = await asyncio.wait_for(demo.stdout.readline(), PATIENCE)
             assert line, (await demo.stderr.read()).decode()
         words = shlex.split(line.decode())[1:]
         code, answer, errors = await output(await start(*words))

@@ -10,9 +10,10 @@ from typing import ClassVar
 
 import cbor2
 import pytest
+from waiting import until
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, call_routes, parameters, service, until
+from call_house import AllTypes, House, action, call_routes, parameters, service
 
 from appliance.mqtt.codec import Property
 from appliance.ros.convert import Converters

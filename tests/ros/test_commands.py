@@ -9,6 +9,7 @@ import struct
 import time
 
 import pytest
+from waiting import until
 
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
@@ -142,14 +143,6 @@ async def house():
     await house.bridge.stop()
     assert house.broker.departures == []
     assert house.broker.guards == {}
-
-
-async def until(condition):
-    async def wait():
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.002)
-
-    await asyncio.wait_for(wait(), 5)
 
 
 # Old commands

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from waiting import until
 
 from appliance.environment import for_other_programs
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import TWIST, Peer, domain, until
+from test_ros2 import TWIST, Peer, domain
 
 pytestmark = pytest.mark.timed
 

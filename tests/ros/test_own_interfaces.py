@@ -13,12 +13,13 @@ from pathlib import Path
 import paho.mqtt.client as mqtt
 import pytest
 import yaml
+from waiting import until
 
 from appliance.environment import for_other_programs
 
 pytest.importorskip("rclpy")
 from appliance_process import HOST, ROBOT, ApplianceProcess
-from test_ros2 import Peer, domain, until
+from test_ros2 import Peer, domain
 
 __all__ = ["domain"]  # a fixture for all tests here
 

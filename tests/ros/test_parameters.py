@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from waiting import until
 
 pytest.importorskip("rcl_interfaces.srv")
-from call_house import AllTypes, House, action, call_routes, parameters, until
+from call_house import AllTypes, House, action, call_routes, parameters
 
 from appliance.ros import parameters as module
 from appliance.ros.calls import CallError

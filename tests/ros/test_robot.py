@@ -16,14 +16,14 @@ from pathlib import Path
 import cbor2
 import pytest
 import yaml
-from appliance_process import ApplianceProcess, eventually
+from appliance_process import ApplianceProcess
+from waiting import PATIENCE, eventually
 
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
 import paho.mqtt.client as paho
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
-from robot_process import DEADLINE
 
 from appliance.environment import for_other_programs
 
@@ -112,8 +112,8 @@ class Client:
 
     def _wait(self, condition, what):
         with self._changed:
-            if not self._changed.wait_for(condition, DEADLINE):
-                raise AssertionError(f"{self.name}: not within {DEADLINE} s: {what}")
+            if not self._changed.wait_for(condition, PATIENCE):
+                raise AssertionError(f"{self.name}: not within {PATIENCE} s: {what}")
 
     def _take(self, kind, *beginning):
         found = []
@@ -606,7 +606,7 @@ def visitor():
         yield process
     finally:
         process.stdin.close()
-        process.wait(DEADLINE)
+        process.wait(PATIENCE)
 
 
 def test_a_node_comes_and_goes(client_of, appliance):

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE, until
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -28,7 +29,6 @@ from appliance.store import MemoryStore
 pytest.importorskip("rclpy")
 
 DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing connections
-DEADLINE = 15.0
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 BYTES = "std_msgs/msg/UInt8MultiArray"
 TF = "tf2_msgs/msg/TFMessage"
@@ -47,13 +47,6 @@ def domain(monkeypatch):
 def string(text):
     data = text.encode() + b"\0"
     return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
-
-
-async def until(condition, what):
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {DEADLINE} s: {what}"
-        await asyncio.sleep(0.01)
 
 
 class Peer:
@@ -86,7 +79,7 @@ class Peer:
         self._answers.put_nowait("ended")
 
     async def _answer(self):
-        assert await asyncio.wait_for(self._answers.get(), DEADLINE) == "ok"
+        assert await asyncio.wait_for(self._answers.get(), PATIENCE) == "ok"
 
     async def do(self, *command):
         self.process.stdin.write(json.dumps(command).encode() + b"\n")
@@ -413,7 +406,7 @@ async def test_publishers_that_change_are_followed(house, peer):
         await peer.do("matched", "/a")
 
         seen = len(house.received)
-        deadline = time.monotonic() + DEADLINE
+        deadline = time.monotonic() + PATIENCE
         while house.received[seen:] == [] or house.received[-1][1] != qos:
             assert time.monotonic() < deadline, f"not followed: {reliability}"
             await peer.do("publish", "/a", string(reliability).hex())

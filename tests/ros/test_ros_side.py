@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 import yaml
+from waiting import until
 
 from appliance import config
 from appliance.doctor import ros as doctor
@@ -23,7 +24,7 @@ from appliance.ros.bridge import Bridge
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import STRING, House, Peer, domain, route, string, until
+from test_ros2 import STRING, House, Peer, domain, route, string
 
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description

@@ -7,9 +7,10 @@ import gc
 import json
 
 import pytest
+from waiting import until
 
 pytest.importorskip("std_srvs.srv")
-from call_house import AllTypes, House, call_routes, service, until
+from call_house import AllTypes, House, call_routes, service
 
 from appliance.broker.message import Late, Message
 from appliance.broker.session import Session

@@ -6,9 +6,10 @@ import asyncio
 import json
 
 import pytest
+from waiting import until
 
 pytest.importorskip("std_srvs.srv")
-from call_house import AllTypes, House, action, call_routes, parameters, service, until
+from call_house import AllTypes, House, action, call_routes, parameters, service
 
 from appliance import cli, control
 from appliance.ros.bridge import RouteSettings

@@ -7,8 +7,8 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from appliance_process import PATIENCE
 from ros1_world import Node, Python, Ros1Appliance, Run, World
+from waiting import PATIENCE
 
 BRIDGE = {
     "topics": [

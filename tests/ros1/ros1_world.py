@@ -26,10 +26,11 @@ from xmlrpc.client import ServerProxy
 
 import paho.mqtt.client as paho
 import psutil
-from appliance_process import ACL, PATIENCE, ApplianceProcess, eventually
+from appliance_process import ACL, ApplianceProcess
 from packaging.requirements import Requirement
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
+from waiting import PATIENCE, eventually
 
 if sys.version_info >= (3, 11):
     import tomllib

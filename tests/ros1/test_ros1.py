@@ -11,7 +11,6 @@ import time
 from functools import partial
 
 import pytest
-from appliance_process import PATIENCE, eventually
 from ros1_world import (
     HERE,
     SYSTEM_PYTHON,
@@ -24,6 +23,7 @@ from ros1_world import (
     is_installed,
     output,
 )
+from waiting import PATIENCE, eventually
 
 from appliance.environment import for_other_programs
 

@@ -11,8 +11,8 @@ from xmlrpc.client import Binary
 import cbor2
 import paho.mqtt.client as paho
 import pytest
-from appliance_process import eventually
 from ros1_world import Mqtt, Node, Ros1Appliance, Run, World, is_installed
+from waiting import eventually
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"

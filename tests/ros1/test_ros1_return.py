@@ -15,8 +15,8 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import psutil
 import pytest
-from appliance_process import eventually
 from ros1_world import Mqtt, Node, Python, Ros1Appliance, Run, World, end, is_installed, output
+from waiting import eventually
 
 from appliance.ros.node import BusError
 from appliance.ros.ros1 import POLL_INTERVAL

@@ -17,8 +17,8 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import psutil
 import pytest
-from appliance_process import PATIENCE, eventually
 from ros1_world import SYSTEM_PYTHON, Mqtt, Python, Ros1Appliance, World, end, is_installed
+from waiting import PATIENCE, eventually
 
 from appliance.ros.ros1_types import LARGEST_MESSAGE
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import psutil
 import yaml
-from appliance_process import ACL, ROBOT, BrokerProcess, eventually
+from appliance_process import ACL, ROBOT, BrokerProcess
 from durability.ordeal import BROKER, Ordeal
+from waiting import eventually
 
 PACKAGES = "systemd,systemd-sysv,dbus,iproute2,init-system-helpers"
 PASSWORD = "correct horse battery"

@@ -13,7 +13,8 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
-from appliance_process import PATIENCE, ApplianceProcess
+from appliance_process import ApplianceProcess
+from waiting import PATIENCE
 
 
 class NotifySocket:

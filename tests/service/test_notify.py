@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from appliance_process import eventually
 from raw_client import RawClient
+from waiting import eventually
 
 from appliance.control import ask
 from appliance.notify import Notifier
