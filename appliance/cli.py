@@ -18,6 +18,7 @@ from appliance.commands.certs import cert_app
 from appliance.commands.client import pub, sub
 from appliance.commands.console import CommandError
 from appliance.commands.doctor import doctor
+from appliance.commands.fastdds import fastdds
 from appliance.commands.install import install, uninstall
 from appliance.commands.routes import routes
 from appliance.commands.running import bench, check, demo, init, reload, run
@@ -34,7 +35,7 @@ app = typer.Typer(
 SETTING_UP = (init, run, check, reload)
 LOOKING = (status, doctor, routes)
 USING = (pub, sub, call, goal)
-for command in (*SETTING_UP, *LOOKING, *USING, demo, install, uninstall, bench):
+for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)
 GROUPS = {
     "param": param_app,

@@ -185,12 +185,12 @@ class Status:
             return {"count": 0, "bridged": 0, "sick": []}
         topics, calls = bridge.status(), bridge.calls.status()
         sick = [
-            {"route": name_of(route), "problem": problem}
+            {"route": name_of(route), "problem": problem, "lost": route.lost}
             for route in topics
             if (problem := problem_of(route))
         ]
         sick += [
-            {"route": call.settings.mqtt, "problem": call.counters.last_error}
+            {"route": call.settings.mqtt, "problem": call.counters.last_error, "lost": 0}
             for call in calls
             if call.counters.last_error and not call.names
         ]
@@ -251,6 +251,8 @@ def problem_of(route: RouteStatus) -> str | None:
     found = []
     if route.errors:
         found.append(f"messages that could not be carried: {route.errors} ({route.last_error})")
+    if route.lost:
+        found.append(f"messages that ROS's middleware lost on their way here: {route.lost}")
     if route.dropped:
         found.append(f"messages dropped: {route.dropped}")
     return ", ".join(found) or None

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -338,3 +339,16 @@ def test_the_readme_names_programs_that_run(tmp_path: Path) -> None:
     }
     told = {name: process.communicate()[0] for name, process in processes.items()}
     assert {name: told[name] for name, each in processes.items() if each.returncode != 0} == {}
+
+
+def test_the_file_for_fast_dds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("fastdds") == 0
+    printed = capsys.readouterr()
+    root = ElementTree.fromstring(printed.out)
+    sizes = [each.text for each in root.iter() if each.tag.endswith("segment_size")]
+    assert sizes == [str(16 << 20)]
+    assert "FASTDDS_DEFAULT_PROFILES_FILE" in printed.err
+    assert run("fastdds", "--segment", "64 MiB") == 0
+    assert str(64 << 20) in capsys.readouterr().out
+    for wrong in ("64", "1 KiB", "1 TiB", "much"):
+        assert run("fastdds", "--segment", wrong) == 2, wrong

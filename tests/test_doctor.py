@@ -361,3 +361,14 @@ def test_ros_1_that_is_not_here(here: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert found["ROS network"].level == "ok"
     far = ros1._address("http://192.0.2.1:11311")
     assert far.level == "warning" and "which other computers take for themselves" in far.text
+
+
+def test_what_ros_lost_is_told_with_what_to_do() -> None:
+    sick = [
+        {"route": "/image → r2/image", "problem": "messages lost: 88", "lost": 88},
+        {"route": "/odom → r2/odom", "problem": "messages dropped: 1", "lost": 0},
+    ]
+    told = {"version": "1", "pid": 1, "clients": 0, "warnings": [], "routes": {"sick": sick}}
+    found = by_subject(examination._running(told))
+    assert "appliance fastdds" in found["route /image → r2/image"].advice
+    assert not found["route /odom → r2/odom"].advice

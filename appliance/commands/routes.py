@@ -13,7 +13,7 @@ from appliance.commands.console import CommandError, ConfigOption, load
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
-FIGURES = ("HZ", "BYTES", "LOST", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
+FIGURES = ("HZ", "BYTES", "LOST", "DROPPED", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
 
 #: In the summary, by what `why` says.
 WHY = {
@@ -57,6 +57,10 @@ def routes(
     if bridged:
         rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
         _print_table([(*HEAD, *FIGURES), *rows])
+        if any(entry.get("lost") for entry in bridged):
+            from appliance.ros.fastdds import LOST_IN_ROS
+
+            typer.echo(f"\nLOST: {LOST_IN_ROS}")
     else:
         typer.echo("nothing is bridged now")
     if skipped:
@@ -70,7 +74,7 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
     if way not in ARROWS:  # services, actions and parameters have no figures
         return about
     latency = entry["latency_ms"]
-    counts = (entry[key] for key in ("size", "dropped", "skipped", "throttled"))
+    counts = (entry[key] for key in ("size", "lost", "dropped", "skipped", "throttled"))
     return (
         *about,
         f"{entry['rate']:g}",

@@ -14,6 +14,7 @@ from appliance.doctor.finding import Finding, Level
 from appliance.doctor.ports import ports
 from appliance.doctor.ros import ros
 from appliance.doctor.secrets import certificates, permissions
+from appliance.ros.fastdds import LOST_IN_ROS
 
 #: Seconds that the running appliance has to answer.
 PATIENCE = 5.0
@@ -67,4 +68,5 @@ def _running(told: dict[str, Any]) -> Iterator[Finding]:
     for warning in told["warnings"]:
         yield Finding("warning", "appliance", warning)
     for sick in told["routes"]["sick"]:
-        yield Finding("warning", f"route {sick['route']}", sick["problem"])
+        advice = LOST_IN_ROS if sick["lost"] else ""
+        yield Finding("warning", f"route {sick['route']}", sick["problem"], advice)

@@ -30,6 +30,7 @@ OK, WARN, ERROR = 0, 1, 2
 #: What makes a route a warning while it goes on, and what is said of it.
 _COMPLAINTS = (
     ("errors", "messages that could not be carried"),
+    ("lost", "messages lost by ROS's middleware before they came here"),
     ("dropped", "messages dropped"),
     ("refused", "commands refused"),
     ("expired", "commands that came too late"),
@@ -175,6 +176,7 @@ class Diagnostics:
             "last error": route.last_error or "",
         }
         if route.direction == "to_mqtt":
+            values["lost in ROS"] = route.lost
             values |= {"dropped": route.dropped, "throttled": route.throttled}
             values["skipped"] = route.skipped
             if route.latency_ms is not None:

@@ -56,16 +56,17 @@ class Latency:
 class Counters:
     """What is counted in one direction, all from the start; `bytes` are payload on MQTT.
 
-    `dropped` did not fit into the mailbox, `throttled` were above the rate or the budget of bytes,
-    `skipped` were not sent to a client that was slow, which counts once for each such client,
-    `errors` could not be converted or published. Of commands, `expired` came too late, `refused`
-    were against the rules, `clamped` went on with other numbers; `stops` are stop messages that a
-    route published by itself. `latency` is of a sample of the messages, from the publisher's time
-    stamp to the broker.
+    `lost` are those that ROS's middleware says it lost before they came here, `dropped` did not fit
+    into the mailbox, `throttled` were above the rate or the budget of bytes, `skipped` were not
+    sent to a client that was slow, which counts once for each such client, `errors` could not be
+    converted or published. Of commands, `expired` came too late, `refused` were against the rules,
+    `clamped` went on with other numbers; `stops` are stop messages that a route published by
+    itself. `latency` is of a sample of the messages, from the publisher's time stamp to the broker.
     """
 
     messages: int = 0
     bytes: int = 0
+    lost: int = 0
     dropped: int = 0
     throttled: int = 0
     skipped: int = 0

@@ -74,6 +74,10 @@ class RosSubscription(Protocol):
         """End it: the callback is not called again, but for what the loop's thread has taken
         already. On the ROS thread."""
 
+    def take_lost(self) -> int:
+        """How many messages the bus's middleware lost before they came here since it was asked
+        last, as far as it tells: most often once something follows them. On the ROS thread."""
+
 
 class RosPublisher(Protocol):
     """A publisher of this node."""
@@ -277,6 +281,8 @@ class FakeSubscription:
     endpoint: Endpoint
     callback: Callable[..., None]
     on_loop: TakeLot | None = None
+    #: What the middleware has lost and nobody has asked for yet.
+    lost: int = 0
 
     def take(self, cdr: bytes) -> None:
         """A message has come for it."""
@@ -284,6 +290,10 @@ class FakeSubscription:
             self.on_loop([(cdr, 0)], 0, False)
         else:
             self.callback(cdr)
+
+    def take_lost(self) -> int:
+        lost, self.lost = self.lost, 0
+        return lost
 
     def destroy(self) -> None:
         self.bus.subscriptions.remove(self)

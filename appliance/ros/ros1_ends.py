@@ -151,6 +151,9 @@ class Subscription:
             while self._held and not self._is_over:
                 self._callback(self._held.popleft())
 
+    def take_lost(self) -> int:
+        return 0  # TCP loses none, and rospy does not count what its queues drop
+
     def destroy(self) -> None:
         with self._lock:
             self._is_over = True

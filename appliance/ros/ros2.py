@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from appliance.ros import installation, uncompiled
+from appliance.ros import fastdds, installation, uncompiled
 from appliance.ros.definitions import (
     CDR,
     TypeDescription,
@@ -62,9 +62,6 @@ _LONGEST_NAME = 247
 #: Those above have no ports of their own on DDS.
 HIGHEST_DOMAIN = 232
 
-_PROFILE = Path(__file__).parent.parent / "fastdds.xml"
-_UDP_PROFILE = _PROFILE.with_name("fastdds_udp.xml")
-_PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
 
@@ -120,16 +117,16 @@ def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
         not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
         or environment.get("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4") != "UDPv4"
         or (is_old and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
-        or any(variable in environment for variable in _PROFILE_VARIABLES)
+        or any(variable in environment for variable in fastdds.VARIABLES)
         or any(Path(file).exists() for file in _PROFILE_FILES)
     ):
         return False
-    profile = _PROFILE
+    profile = fastdds.PROFILE
     if "FASTDDS_BUILTIN_TRANSPORTS" in environment:
         if not is_old:
             return False
-        profile = _UDP_PROFILE  # in Humble and before it does not know the variable
-    environment[_PROFILE_VARIABLES[1 if is_old else 0]] = str(profile)
+        profile = fastdds.UDP_PROFILE  # in Humble and before it does not know the variable
+    environment[fastdds.VARIABLES[1 if is_old else 0]] = str(profile)
     return True
 
 
@@ -366,7 +363,7 @@ class Ros2Node:
         if timed and self._is_event_driven:
             own.__class__ = _timed_subscription()
             own.since = time.monotonic_ns()
-        return _Subscription(self._node, own)
+        return _Subscription(self._node, own, _Losses(own.handle))
 
     def _subscribe_on_loop(
         self,
@@ -391,10 +388,12 @@ class Ros2Node:
                 self._node.handle, message_class, topic, _to_rclpy(qos).get_c_qos_profile()
             )
         try:
+            losses = _Losses(handle)
             own = LoopSubscription(
-                handle, message_class, self._loop, self.call_soon, callback, on_loop
+                handle, message_class, self._loop, self.call_soon, callback, on_loop, losses
             )
         except UnavailableError:
+            losses.destroy()
             handle.destroy_when_not_in_use()
             raise
         self._on_loop.add(own)
@@ -431,12 +430,49 @@ def _named(found: list[tuple[str, list[str]]]) -> dict[str, list[str]]:
     }
 
 
-class _Subscription:
-    def __init__(self, node: Any, own: Any) -> None:
-        self._node = node
-        self._own = own
+class _Losses:
+    """Asks the middleware what it lost of a subscription's messages; no executor knows of it, as
+    with EventsExecutor destroying an endpoint that one listens to can crash.
+
+    What had to make room for newer messages in the subscription's own queue is not in it.
+    """
+
+    def __init__(self, handle: Any) -> None:
+        """For rclpy's handle of a subscription. Where the middleware does not tell, it is 0."""
+        implementation = import_module("rclpy.impl.implementation_singleton").rclpy_implementation
+        kinds = implementation.rcl_subscription_event_type_t
+        # In ROS 2 Humble it has another name.
+        kind = getattr(implementation, "EventHandle", None) or implementation.QoSEvent
+        self._refusals = _errors()
+        self._event: Any = None
+        with suppress(implementation.UnsupportedEventTypeError, *self._refusals), handle:
+            self._event = kind(handle, kinds.RCL_SUBSCRIPTION_MESSAGE_LOST)
+
+    def take(self) -> int:
+        if self._event is None:
+            return 0
+        with suppress(*self._refusals), self._event:
+            told = self._event.take_event()
+            return int(told.total_count_change) if told is not None else 0
+        return 0
 
     def destroy(self) -> None:
+        if self._event is not None:
+            self._event.destroy_when_not_in_use()
+            self._event = None
+
+
+class _Subscription:
+    def __init__(self, node: Any, own: Any, losses: _Losses) -> None:
+        self._node = node
+        self._own = own
+        self._losses = losses
+
+    def take_lost(self) -> int:
+        return self._losses.take()
+
+    def destroy(self) -> None:
+        self._losses.destroy()
         self._node.destroy_subscription(self._own)
 
 

@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, TakeLot
@@ -83,6 +83,16 @@ class Doorbell:
         os.close(self.fd)
 
 
+class Losses(Protocol):
+    """What the middleware lost of a subscription's messages. For the ROS thread."""
+
+    def take(self) -> int:
+        """How many since it was asked last."""
+
+    def destroy(self) -> None:
+        """Before the subscription's own end."""
+
+
 class LoopSubscription:
     """A subscription that no executor knows; a RosSubscription.
 
@@ -98,6 +108,7 @@ class LoopSubscription:
         call_soon: Callable[[Callable[[], None]], None],
         callback: Callable[..., None],
         on_loop: TakeLot,
+        losses: Losses,
     ) -> None:
         """`handle` is rclpy's own, which becomes this one's to destroy. `call_soon` leads to the
         ROS thread, where `callback` is called, and this is. Raises UnavailableError."""
@@ -108,6 +119,7 @@ class LoopSubscription:
         self._call_soon = call_soon
         self._callback = callback
         self._on_loop = on_loop
+        self._losses = losses
         self._since = time.monotonic_ns()
         self._until_timed = 1
         self._timed = 0
@@ -128,6 +140,7 @@ class LoopSubscription:
         if self._is_ended:
             return
         self._is_ended = True
+        self._losses.destroy()
         with self._handle:
             self._doorbell.silence(self._handle.pointer)
         # If the loop's thread is taking messages at this moment, it happens when that is done.
@@ -136,6 +149,9 @@ class LoopSubscription:
             self._loop.call_soon_threadsafe(self._close)
         except RuntimeError:  # the loop is closed, and waits for nothing any more
             self._doorbell.close()
+
+    def take_lost(self) -> int:
+        return 0 if self._is_ended else self._losses.take()
 
     # The loop's thread
 

@@ -35,6 +35,7 @@ class TopicStatus:
     messages: int
     rate: float
     size: int
+    lost: int
     dropped: int
     throttled: int
     skipped: int
@@ -57,6 +58,7 @@ class RouteStatus:
     topics: tuple[Bridged, ...]
     messages: int
     bytes: int
+    lost: int
     dropped: int
     throttled: int
     skipped: int
@@ -84,6 +86,7 @@ def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
         counters.messages,
         round(flow.meter.rates[0], 1),
         counters.bytes // counters.messages if counters.messages else 0,
+        counters.lost,
         counters.dropped,
         counters.throttled,
         counters.skipped,
@@ -106,6 +109,7 @@ def route_status(route: Route, flows: Sequence[Flow]) -> RouteStatus:
         tuple(flow.bridged for flow in flows if flow.bridged is not None),
         total.messages,
         total.bytes,
+        total.lost,
         total.dropped,
         total.throttled,
         total.skipped,

@@ -112,11 +112,14 @@ class ToMqtt(Flow):
     def _unsubscribe(self) -> None:
         self.bridged = None
         if self._subscription is not None:
+            self.counters.lost += self._subscription.take_lost()
             self._subscription.destroy()
             self._subscription = None
 
     def look(self, node: RosNode, thorough: bool) -> bool:
         has_changed = super().look(node, thorough)
+        if thorough and self._subscription is not None:
+            self.counters.lost += self._subscription.take_lost()
         if self._held is not None:
             self._catch_up(monotonic())
         return has_changed

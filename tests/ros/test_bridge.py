@@ -18,7 +18,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros.bridge import Bridge, Bridged, RouteSettings
+from appliance.ros.bridge import THOROUGH_LOOK, Bridge, Bridged, RouteSettings
 from appliance.ros.flows import Echo, Route
 from appliance.ros.graph import ParameterSettings
 from appliance.ros.mailbox import LARGE
@@ -1012,3 +1012,20 @@ async def test_what_there_was_no_room_for_on_ros_is_counted(house):
     subscription.on_loop([(string("x"), 0)], 3, False)
     assert house.status().dropped == 3
     assert house.client.payloads("r2d2/a") == [b"x"]
+
+
+async def test_what_the_middleware_lost_is_counted_with_the_route(house):
+    house.start(RouteSettings("/chatter", "mqtt", "r2d2/chatter"))
+    house.node.add_publisher("/chatter", STRING)
+    await until(lambda: house.node.subscriptions)
+    house.node.subscriptions[0].lost = 88
+    for _ in range(THOROUGH_LOOK):
+        house.node.spin()
+    assert house.bridge.status()[0].lost == 88
+    assert house.bridge.topics()[0].lost == 88
+    subscription = house.node.subscriptions[0]
+    subscription.lost = 2
+    house.node.remote_publishers[0].remove()
+    house.node.add_publisher("/chatter", STRING, BEST_EFFORT)  # it is subscribed to anew
+    await until(lambda: house.node.subscriptions[0] is not subscription)
+    assert house.bridge.status()[0].lost == 90

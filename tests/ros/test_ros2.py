@@ -23,7 +23,7 @@ from appliance.mqtt.packets import Subscription
 from appliance.ros import installation, ros2
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.convert import compile_converter
-from appliance.ros.node import BusError, QosProfile
+from appliance.ros.node import BusError, QosProfile, Reliability
 from appliance.store import MemoryStore
 
 pytest.importorskip("rclpy")
@@ -448,6 +448,103 @@ async def test_images_pass_through_the_larger_shared_memory(house):
         await until(lambda: len(peer.received) == 20, "all images on the way back")
     finally:
         await peer.stop()
+
+
+@pytest.mark.parametrize("takes_on_loop", [True, False])
+async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
+    """Images that are larger than the shared memory of a publisher without our profile."""
+    node, failures, taken, dropped, lost = ros2.Ros2Node(), [], [], [], []
+    subscription = None
+
+    def on_lot(lot, had_to_go, is_late):
+        taken.extend(cdr for cdr, _ in lot)
+        dropped.append(had_to_go)
+
+    def look():
+        nonlocal subscription
+        if subscription is None:
+            qos = QosProfile(Reliability.BEST_EFFORT, depth=1000)
+            on_loop = on_lot if takes_on_loop else None
+            subscription = node.subscribe_raw("/image", BYTES, qos, on_message, on_loop=on_loop)
+        lost.append(subscription.take_lost())
+
+    def on_message(cdr, published_at=0):
+        taken.append(cdr)
+
+    def counted():
+        return sum(lost) + sum(dropped) + len(taken)
+
+    await peer.do("advertise", "/image", BYTES, "best_effort")
+    node.start(look, failures.append, asyncio.get_running_loop())
+    try:
+        await peer.do("matched", "/image")
+        published = 0
+        while not taken:  # both ends have found each other
+            await peer.do("publish_image", "/image", 10, 1, 10)
+            published += 1
+            assert published < 100, "nothing comes"
+        before = published - len(taken)  # went nowhere, before the ends had found each other
+        deadline = time.monotonic() + 4 * DEADLINE
+        while not sum(lost) or counted() < published - before:
+            assert time.monotonic() < deadline, f"{published=}, {before=}, {counted()=}, {lost=}"
+            if not sum(lost):
+                await peer.do("publish_image", "/image", 4_000_000, 10, 1000)
+                published += 10
+            # A loss is told of once something follows, which may be lost as well.
+            await peer.do("publish_image", "/image", 10, 1, 10)
+            published += 1
+        assert counted() == published - before
+    finally:
+        await asyncio.to_thread(node.stop)
+        assert failures == []
+
+
+@pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
+async def test_what_was_published_before_or_had_to_make_room_is_not_lost_by_the_middleware(
+    peer, reliability
+):
+    await peer.do("advertise", "/a", STRING, reliability)
+    await peer.do("publish", "/a", string("early").hex(), 50, 10_000)
+    node, failures, taken = ros2.Ros2Node(), [], []
+    subscription = None
+
+    def look():
+        nonlocal subscription
+        if subscription is None and node.count("/a")[0]:
+            qos = QosProfile(Reliability[reliability.upper()], depth=2)
+            subscription = node.subscribe_raw("/a", STRING, qos, taken.append)
+
+    node.start(look, failures.append)
+    try:
+        await until(lambda: subscription is not None, "the subscription")
+        await peer.do("matched", "/a")
+        await until_published(peer, taken, string("probe"))
+        taken.clear()
+        told = []
+
+        def hold_up():
+            time.sleep(0.3)
+            told.append("held")
+
+        node.call_soon(hold_up)
+        await peer.do("publish", "/a", string("late").hex(), 50, 1000)
+        await until(lambda: told, "the ROS thread is free again")
+        await until_published(peer, taken, string("last"))
+        node.call_soon(lambda: told.append(subscription.take_lost()))
+        await until(lambda: len(told) == 2, "the count")
+        assert told[1] == 0
+        assert len(taken) < 50
+    finally:
+        await asyncio.to_thread(node.stop)
+        assert failures == []
+
+
+async def until_published(peer, taken, cdr):
+    deadline = time.monotonic() + DEADLINE
+    while not any(each.startswith(cdr) for each in taken):
+        assert time.monotonic() < deadline, f"nothing came within {DEADLINE} s"
+        await peer.do("publish", "/a", cdr.hex())
+        await asyncio.sleep(0.05)
 
 
 def shared_memory():

@@ -234,3 +234,28 @@ def test_the_command(tmp_path, monkeypatch, capsys, arguments):
     else:
         assert len(lines) == 3 + 20 + 1
         assert lines[-1] == "and 13 more: appliance routes --all"
+
+
+def carried(**counts):
+    about = {"ros": "/image", "mqtt": "r2/image", "type": "sensor_msgs/msg/Image"}
+    zeros = dict.fromkeys(
+        ("lost", "dropped", "skipped", "throttled", "errors", "expired", "refused"), 0
+    )
+    figures = {"rate": 30.0, "size": 1_000_000, "latency_ms": None, "messages": 12}
+    return {**about, "direction": "to_mqtt", "encoding": "cdr", **zeros, **figures, **counts}
+
+
+def test_the_command_says_what_ros_lost_and_what_to_do(tmp_path, monkeypatch, capsys):
+    (tmp_path / "appliance.yaml").write_text("")
+    told = [carried(lost=88, dropped=3)]
+    monkeypatch.setattr(control, "ask", lambda path, what: [] if what == "skipped" else told)
+    with pytest.raises(SystemExit):
+        cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
+    head, row, *rest = capsys.readouterr().out.splitlines()
+    figures = dict(zip(head.split()[4:], row.split()[5:], strict=False))
+    assert (figures["LOST"], figures["DROPPED"]) == ("88", "3")
+    assert "appliance fastdds" in rest[-1]
+    told[0] = carried(dropped=3)
+    with pytest.raises(SystemExit):
+        cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
+    assert len(capsys.readouterr().out.splitlines()) == 2
