@@ -484,7 +484,7 @@ async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
             published += 1
             assert published < 100, "nothing comes"
         before = published - len(taken)  # went nowhere, before the ends had found each other
-        deadline = time.monotonic() + 4 * DEADLINE
+        deadline = time.monotonic() + 4 * PATIENCE
         while not sum(lost) or counted() < published - before:
             assert time.monotonic() < deadline, f"{published=}, {before=}, {counted()=}, {lost=}"
             if not sum(lost):
@@ -540,9 +540,9 @@ async def test_what_was_published_before_or_had_to_make_room_is_not_lost_by_the_
 
 
 async def until_published(peer, taken, cdr):
-    deadline = time.monotonic() + DEADLINE
+    deadline = time.monotonic() + PATIENCE
     while not any(each.startswith(cdr) for each in taken):
-        assert time.monotonic() < deadline, f"nothing came within {DEADLINE} s"
+        assert time.monotonic() < deadline, f"nothing came within {PATIENCE} s"
         await peer.do("publish", "/a", cdr.hex())
         await asyncio.sleep(0.05)
 
