@@ -78,8 +78,9 @@ START_ERRORS = (
     StoreError,
 )
 
-#: Seconds between two looks at the server's certificate and this computer's names and addresses,
-#: and after which the log is told again of what has run out or does soon.
+#: Seconds between two looks at the server's certificate, this computer's names and addresses, and
+#: the certificates of who is connected; and after which the log is told again of what has run out
+#: or does soon.
 CERTIFICATE_CHECK = 300.0
 CERTIFICATE_WARNING = 86400.0
 
@@ -261,6 +262,8 @@ class App:
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
             due.clear()
+            # Clients' certificates run out, too.
+            await self._listeners.check_certificates()
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the bus in the background: MQTT answers before ROS is there, and without it."""

@@ -127,7 +127,8 @@ class ClientProtocol:
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
-                await tls.accept(connection, context, protocol, self._network.connect_timeout)
+                timeout = self._network.connect_timeout
+                await tls.accept(connection, context, protocol, timeout, self._network.part)
         except (OSError, asyncio.TimeoutError) as error:
             self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()

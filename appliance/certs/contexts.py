@@ -5,24 +5,25 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import logging
 import ssl
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Final, Literal
-from weakref import WeakKeyDictionary
 
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.clock import RELEASED
 
+from .chains import KNOWN, Chains, is_anchored
 from .files import (
     CERTIFICATES_SIZE,
     MALFORMED,
     CertificateError,
-    issued_by,
     load_key,
     out_of_time,
     parse_certificates,
@@ -32,6 +33,8 @@ from .files import (
 from .identity import UsernameFrom, username_of
 from .registry import fingerprint, serial_text
 from .revocation import CRL_SIZE, NOTHING_REVOKED, Revocations, load_revocations
+
+log = logging.getLogger("appliance.certs")
 
 ClientCertificates = Literal["off", "optional", "required"]
 TlsVersion = Literal["1.2", "1.3"]
@@ -90,7 +93,8 @@ class LoadedTls:
     authorities: list[x509.Certificate]
     revocations: Revocations
     contexts: Mapping[str, ssl.SSLContext]
-    #: The same for as long as the computer's clock is not set: they do not look at times.
+    #: The same for as long as the computer's clock is not set, or a revocation list is out of its
+    #: time: they do not look at times.
     undated: Mapping[str, ssl.SSLContext]
     #: Counts those that were in force one after the other.
     generation: int
@@ -103,6 +107,32 @@ class LoadedTls:
         """That time, or the earliest that it can be: that of this program's release, and of the
         making of the server's certificate."""
         return max(now, RELEASED, self.chain[0].not_valid_before_utc)
+
+    def context(self, listener: str, now: datetime) -> ssl.SSLContext:
+        """The settings of a listener for a connection that begins at that time."""
+        is_dated = self.believable(now) == now
+        if self.revocations.shown:
+            is_dated = is_dated and self.revocations.is_fresh(now)
+        return (self.contexts if is_dated else self.undated)[listener]
+
+    def objection(self, chain: list[x509.Certificate], now: datetime) -> str:
+        """Why a client of that chain of certificates is not let in; empty when it is."""
+        client, *signers = chain
+        who = f"its certificate {serial_text(client.serial_number)}"
+        named = [(client, who), *((each, f"{who} is of {_name(each)}, which") for each in signers)]
+        believable = self.believable(now)
+        for certificate, what in named:
+            date = self.revocations.date(certificate)
+            start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+            if date is not None:
+                return f"{what} was revoked on {date:%Y-%m-%d}"
+            if believable > end:
+                return f"{what} expired on {end:%Y-%m-%d}"
+            if believable == now < start:
+                return f"{what} is not valid before {start:%Y-%m-%d %H:%M} UTC"
+        if self.authorities and not is_anchored(chain, self.authorities):
+            return f"{who} is of an authority that is trusted no longer"
+        return ""
 
 
 class TlsContexts:
@@ -124,10 +154,9 @@ class TlsContexts:
         clock is not set yet, or whose certificate has run out, can still be reached by those who
         do not look at that, and on its other listeners.
         """
-        self._trusted: WeakKeyDictionary[ssl.SSLContext, frozenset[x509.Certificate]]
-        self._trusted = WeakKeyDictionary()
         self._loaded = _load(files, policies, username_from, None)
-        self._remember()
+        self._chains = Chains()
+        self._told: set[x509.Certificate] = set()
 
     def prepare(
         self,
@@ -155,13 +184,8 @@ class TlsContexts:
         if loaded.generation != self._loaded.generation + 1:
             raise CertificateError("certificates were replaced meanwhile; to be read once more")
         self._loaded = loaded
-        self._remember()
+        self._told.clear()
         return True
-
-    def _remember(self) -> None:
-        loaded = self._loaded
-        for context in (*loaded.contexts.values(), *loaded.undated.values()):
-            self._trusted[context] = frozenset(self._loaded.authorities)
 
     def reload(self) -> bool:
         """Take over the files as they are now, all or nothing; see `prepare` and `take`."""
@@ -173,44 +197,47 @@ class TlsContexts:
         While the computer's clock is not set yet, a client's certificate is not refused for not
         being valid before some time, and one that has run out is found by `refusal`.
         """
-        loaded = self._loaded
-        now = datetime.now(timezone.utc)
-        return (loaded.contexts if loaded.believable(now) == now else loaded.undated)[listener]
+        return self._loaded.context(listener, datetime.now(timezone.utc))
 
     def source(self, listener: str) -> functools.partial[ssl.SSLContext]:
         """`context` of this listener, to be asked at each connection."""
         return functools.partial(self.context, listener)
 
     def refusal(self, tls: ssl.SSLObject) -> str:
-        """Why the client is not, or no longer, let in with its certificate; empty when it is."""
+        """Why the client is not, or no longer, let in with its certificate; empty when it is.
+
+        Asked at each login, as in a resumed session OpenSSL looks at nothing, and while the client
+        is connected.
+        """
         der = tls.getpeercert(binary_form=True)
         if not der:
             return ""
+        loaded = self._loaded
         try:
             certificate = x509.load_der_x509_certificate(der)
-            date = self._loaded.revocations.date(certificate)
+            chain = self._chains.of(tls, certificate, loaded.authorities)
+            reason = loaded.objection(chain, datetime.now(timezone.utc))
         except MALFORMED as error:
             return f"its certificate cannot be read: {error}"
-        who = f"its certificate {serial_text(certificate.serial_number)}"
-        if date is not None:
-            return f"{who} was revoked on {date:%Y-%m-%d}"
-        if _is_undated(tls.context):
-            now = datetime.now(timezone.utc)
-            start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-            believable = self._loaded.believable(now)
-            if believable > end:
-                return f"{who} expired on {end:%Y-%m-%d}"
-            if believable == now < start:
-                return f"{who} is not valid before {start:%Y-%m-%d %H:%M} UTC"
-        trusted = self._loaded.authorities
-        before = self._trusted.get(tls.context, frozenset())
-        # Only when one was taken away is it asked by whom it is: a chain may go through one that
-        # the client has sent, and that is not known here.
-        if not trusted or before <= frozenset(trusted):
-            return ""
-        if any(issued_by(certificate, authority) for authority in trusted):
-            return ""
-        return f"{who} is of an authority that is trusted no longer"
+        if not reason and loaded.revocations.dates:
+            self._tell_unlisted(chain[1:])
+        return reason
+
+    def _tell_unlisted(self, signers: list[x509.Certificate]) -> None:
+        """Tell, once, of authorities that clients have brought and nobody can revoke from."""
+        loaded = self._loaded
+        for signer in signers:
+            if signer in self._told or signer in loaded.authorities:
+                continue
+            self._told.add(signer)
+            if len(self._told) <= KNOWN and not loaded.revocations.lists(signer):
+                log.warning(
+                    "a client's certificate is of %s, and there is no revocation list of it: whom "
+                    "it revoked is not known; put its certificate into %s and its list into %s",
+                    _name(signer),
+                    loaded.files.ca,
+                    loaded.files.revocations,
+                )
 
     def username(self, tls: ssl.SSLObject) -> str | None:
         """The user that the client's certificate names; None when that is not asked for.
@@ -294,6 +321,8 @@ def _load(
                 undated.verify_flags = ssl.VerifyFlags(undated.verify_flags | _NO_CHECK_TIME)
                 for context in (dated, undated) if readable else ():
                     _add_certificates(context, files, policy, authorities)
+                    if policy.client_certificates != "off" and revocations.shown:
+                        _show_lists(context, revocations.shown)
     if problems:
         raise CertificateError(*problems)
     contexts = {name: made[policy][0] for name, policy in policies.items()}
@@ -362,10 +391,6 @@ def _revocations(
     return NOTHING_REVOKED
 
 
-def _is_undated(context: ssl.SSLContext) -> bool:
-    return bool(context.verify_flags & _NO_CHECK_TIME)
-
-
 def _context(policy: TlsPolicy) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = _VERSIONS[policy.min_version]
@@ -391,6 +416,19 @@ def _add_certificates(
         context.load_verify_locations(cadata=pem.decode())
         required = policy.client_certificates == "required"
         context.verify_mode = ssl.CERT_REQUIRED if required else ssl.CERT_OPTIONAL
+
+
+def _show_lists(context: ssl.SSLContext, lists: bytes) -> None:
+    """Let OpenSSL refuse who was revoked, with the alert that says so (RFC 8446, section 6.2)."""
+    with tempfile.NamedTemporaryFile() as file:  # Python hands on lists in files only
+        file.write(lists)
+        file.flush()
+        context.load_verify_locations(cafile=file.name)
+    context.verify_flags |= ssl.VERIFY_CRL_CHECK_LEAF
+
+
+def _name(certificate: x509.Certificate) -> str:
+    return certificate.subject.rfc4514_string()
 
 
 def _set_ciphers(context: ssl.SSLContext, wanted: str | None) -> None:
@@ -425,6 +463,17 @@ def _warnings(loaded: LoadedTls, now: datetime) -> Iterator[str]:
         end = authority.not_valid_after_utc
         if now <= end < now + EXPIRES_SOON:
             yield f"{files.ca} expires on {end:%Y-%m-%d}, and all client certificates with it"
+        date = loaded.revocations.date(authority)
+        if date is not None:
+            yield (
+                f"{_name(authority)} was revoked on {date:%Y-%m-%d}, and its clients are refused; "
+                f"take it out of {files.ca}"
+            )
+        elif loaded.revocations.dates and not loaded.revocations.lists(authority):
+            yield (
+                f"{files.revocations} has no list of {_name(authority)}: whom it revoked is not "
+                "known; put its list there"
+            )
     for who, end in loaded.revocations.ends:
         if end < now:
             yield (

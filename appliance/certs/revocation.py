@@ -1,8 +1,9 @@
 """Revocation lists (RFC 5280, section 5) of our own authority or a company's.
 
-They are looked through here, and not by OpenSSL. For that one a list whose time is over, or that is
-missing for one authority of several, means that nobody comes in any more: a robot whose network is
-gone for a week would lock its people out. Here what a list says stays said, however old it is.
+They are looked through here. For OpenSSL a list whose time is over, or that is missing for one
+authority of several, means that nobody comes in any more: a robot whose network is gone for a week
+would lock its people out. Here what a list says stays said, however old it is. OpenSSL gets to see
+those by which it comes to the same answer, since it alone can tell a client in a TLS alert.
 """
 
 from __future__ import annotations
@@ -15,11 +16,17 @@ from pathlib import Path
 from typing import Final
 
 from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from .files import MALFORMED, CertificateError
 
 #: Some 400,000 entries.
 CRL_SIZE: Final = 16 << 20
+
+_PLAIN: Final = (x509.AuthorityKeyIdentifier, x509.CRLNumber)
+
+#: Entries of all lists that OpenSSL gets to see, in each listener's settings.
+SHOWN: Final = 10_000
 
 _PEM: Final = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
 
@@ -28,15 +35,28 @@ _PEM: Final = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", 
 class Revocations:
     """What was revoked and when, by issuer and serial number.
 
-    `ends` says of each list by whom it is and when it is outdated.
+    `ends` says of each list by whom it is and when it is outdated. `shown` are the lists in PEM
+    form if OpenSSL comes to the same answer by them as long as they are fresh, else nothing.
     """
 
     dates: Mapping[x509.Name, Mapping[int, datetime]]
     ends: Sequence[tuple[str, datetime]]
+    begins: Sequence[datetime] = ()
+    shown: bytes = b""
 
     def date(self, certificate: x509.Certificate) -> datetime | None:
         """When the certificate was revoked; None when it was not."""
         return self.dates.get(certificate.issuer, {}).get(certificate.serial_number)
+
+    def lists(self, authority: x509.Certificate) -> bool:
+        """Whether there is a list by that authority, be it an empty one."""
+        return authority.subject in self.dates
+
+    def is_fresh(self, now: datetime) -> bool:
+        """Whether no list is outdated at that time, nor made later."""
+        return all(begin <= now for begin in self.begins) and all(
+            now <= end for _, end in self.ends
+        )
 
     def __len__(self) -> int:
         return sum(map(len, self.dates.values()))
@@ -51,13 +71,55 @@ def load_revocations(
     """All lists of a file; CertificateError when one is not whole or not of these authorities."""
     dates: dict[x509.Name, dict[int, datetime]] = {}
     ends: list[tuple[str, datetime]] = []
-    for crl in parse_crls(path, data, authorities):
+    crls = parse_crls(path, data, authorities)
+    for crl in crls:
         by_serial = dates.setdefault(crl.issuer, {})
         for item in crl:
             by_serial[item.serial_number] = item.revocation_date_utc
         if crl.next_update_utc is not None:
             ends.append((crl.issuer.rfc4514_string(), crl.next_update_utc))
-    return Revocations(dates, ends)
+    begins = [crl.last_update_utc for crl in crls]
+    return Revocations(dates, ends, begins, _shown(crls, authorities))
+
+
+def _shown(
+    crls: Sequence[x509.CertificateRevocationList], authorities: Sequence[x509.Certificate]
+) -> bytes:
+    """All lists, if by them OpenSSL answers as we do, else nothing.
+
+    It wants a list of whoever signed a client's certificate: so none may come from an authority
+    that is not in our file. And it reads more out of extensions than we do.
+    """
+    if not crls or sum(map(len, crls)) > SHOWN:
+        return b""
+    for authority in authorities:
+        lists = [crl for crl in crls if crl.issuer == authority.subject]
+        if len(lists) != 1 or not _signs_clients_alone(authority):
+            return b""
+        if not _is_plain(lists[0], authority):
+            return b""
+    return b"".join(crl.public_bytes(Encoding.PEM) for crl in crls)
+
+
+def _signs_clients_alone(authority: x509.Certificate) -> bool:
+    try:
+        constraints = authority.extensions.get_extension_for_class(x509.BasicConstraints).value
+        usage = authority.extensions.get_extension_for_class(x509.KeyUsage).value
+    except x509.ExtensionNotFound:
+        return False
+    return constraints.path_length == 0 and usage.crl_sign
+
+
+def _is_plain(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
+    values = [extension.value for extension in crl.extensions]
+    keys = [value for value in values if isinstance(value, x509.AuthorityKeyIdentifier)]
+    try:
+        own = authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+    except x509.ExtensionNotFound:
+        return False
+    return all(isinstance(value, _PLAIN) for value in values) and all(
+        (key.key_identifier, key.authority_cert_issuer) == (own.digest, None) for key in keys
+    )
 
 
 def parse_crls(

@@ -51,7 +51,7 @@ class Company:
         is_authority: bool = False,
         alternatives: list[x509.GeneralName] | None = None,
         purpose: x509.ObjectIdentifier | None = None,
-        days: int = 90,
+        days: float = 90,
     ) -> x509.Certificate:
         subject = [] if common_name is None else [(NameOID.COMMON_NAME, common_name)]
         name = x509.Name([x509.NameAttribute(oid, value) for oid, value in subject])
@@ -82,7 +82,7 @@ class Company:
         server: bool = False,
         alternatives: list[x509.GeneralName] | None = None,
         chain: bool = False,
-        days: int = 90,
+        days: float = 90,
     ) -> x509.Certificate:
         """`path`.crt, with the intermediate behind it when `chain`, and `path`.key."""
         key = ec.generate_private_key(ec.SECP256R1())

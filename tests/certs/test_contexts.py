@@ -53,7 +53,11 @@ def client_of(ca: bytes, path: Path | None = None) -> ssl.SSLContext:
 
 
 def refusal_of(contexts: TlsContexts, client: ssl.SSLContext) -> str:
-    return contexts.refusal(shake_hands(contexts, client)[0])
+    """Why it does not come in, by what OpenSSL says or by what we say; empty when it does."""
+    try:
+        return contexts.refusal(shake_hands(contexts, client)[0])
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate was revoked: {error}" if "revoked" in str(error) else str(error)
 
 
 @pytest.fixture
@@ -95,8 +99,115 @@ def test_a_session_that_is_resumed_is_looked_at_too(
     certs.revoke(own, "tablet")
     contexts.reload()
     assert "was revoked" in contexts.refusal(server)
-    server, _ = shake_hands(contexts, tablet, user.session)
-    assert "was revoked" in contexts.refusal(server)
+    with pytest.raises(ssl.SSLError, match="certificate revoked"):
+        shake_hands(contexts, tablet, user.session)
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_a_certificate_that_has_run_out_is_no_login_by_a_resumed_session(
+    own: Path, version: ssl.TLSVersion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each resumption brings a new ticket, so it would go on for ever."""
+    company = Company()
+    company.issue(own / "short", "short", days=5)
+    ca = (own / "ca.crt").read_bytes()
+    (own / "ca.crt").write_bytes(ca + company.pem())
+    contexts = TlsContexts(files_of(own), ASKING)
+    short = client_of(ca, own / "short")
+    short.maximum_version = short.minimum_version = version
+    first, user = shake_hands(contexts, short)
+    for _ in range(3):
+        server, user = shake_hands(contexts, short, user.session)
+        assert user.session_reused and contexts.refusal(server) == ""
+    clock_at(monkeypatch, NOW + timedelta(days=6))
+    assert "expired on " in contexts.refusal(first)  # who is connected goes, too
+    server, user = shake_hands(contexts, short, user.session)
+    assert user.session_reused and "expired on " in contexts.refusal(server)
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+@pytest.mark.parametrize("is_known", [False, True], ids=["sent", "in-our-file"])
+def test_an_authority_below_the_root_is_revoked(
+    own: Path, version: ssl.TLSVersion, is_known: bool
+) -> None:
+    """Whether the client sends its certificate, or it stands in broker.tls.ca itself."""
+    root = Company()
+    issuing, other = root.below(), Company("ACME Other", issuer=root)
+    issuing.issue(own / "lost", "lost", chain=True)
+    other.issue(own / "kept", "kept", chain=True)
+    ca = (own / "ca.crt").read_bytes()
+    known = issuing.pem() + other.pem() if is_known else b""
+    (own / "ca.crt").write_bytes(ca + root.pem() + known)
+    contexts = TlsContexts(files_of(own), ASKING)
+    lost, kept = client_of(ca, own / "lost"), client_of(ca, own / "kept")
+    lost.maximum_version = lost.minimum_version = version
+    first, user = shake_hands(contexts, lost)
+    server, user = shake_hands(contexts, lost, user.session)
+    assert user.session_reused
+    assert contexts.refusal(first) == contexts.refusal(server) == refusal_of(contexts, kept) == ""
+    (own / "ca.crl").write_bytes(root.crl(issuing.certificate))
+    contexts.reload()
+    why = " is of CN=ACME Issuing CA, which was revoked on "
+    assert why in contexts.refusal(first) and why in contexts.refusal(server)
+    assert why in refusal_of(contexts, lost)
+    assert refusal_of(contexts, kept) == ""
+    revoked = [text for text in contexts.warnings() if "CN=ACME Issuing CA was revoked on" in text]
+    assert len(revoked) == is_known, contexts.warnings()
+
+
+def test_authorities_without_a_list_are_told(own: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = Company()
+    issuing = root.below()
+    lost = issuing.issue(own / "lost", "lost", chain=True)
+    ca = (own / "ca.crt").read_bytes()
+    (own / "ca.crt").write_bytes(root.pem() + issuing.pem())
+    (own / "ca.crl").write_bytes(root.crl())
+    contexts = TlsContexts(files_of(own), ASKING)
+    [warning] = contexts.warnings()
+    assert "has no list of CN=ACME Issuing CA" in warning
+    (own / "ca.crl").write_bytes(root.crl() + issuing.crl(lost))
+    contexts.reload()
+    assert contexts.warnings() == []
+    assert "was revoked on " in refusal_of(contexts, client_of(ca, own / "lost"))
+    # Nor are those that only the clients know.
+    company = Company("Other")
+    company.below().issue(own / "far", "far", chain=True)
+    (own / "ca.crt").write_bytes(company.pem())
+    (own / "ca.crl").write_bytes(company.crl())
+    contexts.reload()
+    for _ in range(3):
+        assert refusal_of(contexts, client_of(ca, own / "far")) == ""
+    told = [r.getMessage() for r in caplog.records if "CN=Other Issuing CA" in r.getMessage()]
+    assert len(told) == 1 and "no revocation list of it" in told[0]
+
+
+def test_who_is_revoked_is_told_so_in_tls(
+    own: Path, contexts: TlsContexts, tablet: ssl.SSLContext
+) -> None:
+    """Alert 44, and 45 when it has run out (RFC 8446, section 6.2), as far as OpenSSL looks."""
+    certs.revoke(own, "tablet")
+    contexts.reload()
+    with pytest.raises(ssl.SSLError, match="certificate revoked"):
+        shake_hands(contexts, tablet)
+    certs.issue_client(own, "other")
+    assert (
+        refusal_of(contexts, client_of((own / "ca.crt").read_bytes(), own / "clients/other")) == ""
+    )
+
+
+def test_a_list_outside_its_time_is_for_us_to_read(
+    own: Path, contexts: TlsContexts, tablet: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For OpenSSL it would lock everybody out."""
+    certs.issue_client(own, "other")
+    with pytest.MonkeyPatch.context() as patch:
+        clock_at(patch, NOW + timedelta(days=2))
+        certs.revoke(own, "tablet")
+    contexts.reload()
+    other = client_of((own / "ca.crt").read_bytes(), own / "clients/other")
+    assert refusal_of(contexts, other) == ""
+    with pytest.raises(ssl.SSLError, match="certificate revoked"):
+        shake_hands(contexts, tablet)
 
 
 def test_a_list_that_is_outdated_locks_nobody_out_and_nobody_in(own: Path) -> None:
@@ -112,7 +223,8 @@ def test_a_list_that_is_outdated_locks_nobody_out_and_nobody_in(own: Path) -> No
     assert refusal_of(contexts, client_of(ca, own / "kept")) == ""
     # The other authority has no list, and its clients come in as well.
     assert refusal_of(contexts, client_of(ca, own / "clients/tablet")) == ""
-    [warning] = contexts.warnings()
+    missing, warning = contexts.warnings()
+    assert "company.crl has no list of CN=r2d2 CA" in missing
     assert "company.crl of CN=ACME CA should have been replaced by " in warning
 
 

@@ -23,6 +23,7 @@ from authorities import NOW, Company
 from cryptography import x509
 from raw_client import RawClient
 from waiting import PATIENCE, eventually
+from wall_clock import HOUR, WallClock
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as websocket
@@ -96,7 +97,14 @@ def context_of(process: ApplianceProcess, certificate: str | None) -> ssl.SSLCon
     return context
 
 
+def is_reloadable(process: ApplianceProcess) -> bool:
+    """Whether SIGHUP does not end it any more: it is the last thing that a start sets up."""
+    [caught] = re.findall(r"SigCgt:\s*(\w+)", Path(f"/proc/{process.pid}/status").read_text())
+    return bool(int(caught, 16) >> (signal.SIGHUP - 1) & 1)
+
+
 def reload(process: ApplianceProcess, pattern: str = "reload: reloaded: ") -> None:
+    eventually(lambda: is_reloadable(process), "the start is over")
     before = process.log.count(pattern)
     os.kill(process.pid, signal.SIGHUP)
     process.wait_for_log(pattern, before + 1)
@@ -271,15 +279,110 @@ def test_revoked_while_connected(process: ApplianceProcess) -> None:
         process.wait_for_log(f"connection closed: its certificate {entry.serial_text} was revoked")
         assert other.drain() == user.drain() == []
         assert resumable is not None
-        for session in (None, resumable):
+        for number, session in enumerate((None, resumable), 1):
             plain = socket.create_connection((HOST, process.port), PATIENCE)
-            with (
-                peer.context.wrap_socket(plain, server_hostname=HOST, session=session) as again,
-                contextlib.suppress(ConnectionError),
-            ):
-                again.sendall(Connect("a").encode())
-                assert again.recv(100) == b""
-        process.wait_for_log("no TLS connection: its certificate .* was revoked", 2)
+            with peer.context.wrap_socket(plain, server_hostname=HOST, session=session) as again:
+                process.wait_for_log("no TLS connection: .*certificate revoked", number)
+                for _ in range(2):  # in TLS 1.3 it does not know yet, and what it sends is no error
+                    again.sendall(Connect("a").encode())
+                with pytest.raises(ssl.SSLError, match=r"(?i)alert.certificate.revoked"):
+                    again.recv(100)
+
+
+@pytest.mark.parametrize("version", ["tls1_2", "tls1_3"])
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_openssl_is_told_that_it_is_revoked_or_expired(
+    process: ApplianceProcess, version: str
+) -> None:
+    directory = process.directory / "certs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(certs.authority, "_now", lambda: NOW - certs.authority.CERTIFICATE_VALID * 2)
+        patch.setattr(certs.authority, "out_of_time", lambda *_: "")
+        certs.issue_client(directory, "old")
+    certs.revoke(directory, "tablet")
+    reload(process, "reload: reloaded: certificates")
+
+    def ask(name: str) -> str:
+        path = directory / "clients" / name
+        where = ["-connect", f"{HOST}:{process.port}", f"-{version}", "-CAfile", str(process.ca)]
+        pair = ["-cert", f"{path}.crt", "-key", f"{path}.key"]
+        with subprocess.Popen(
+            ["openssl", "s_client", *where, *pair, "-ign_eof"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+        ) as client:
+            try:
+                return client.communicate(timeout=PATIENCE)[0]
+            finally:
+                client.kill()
+
+    assert "SSL alert number 44" in ask("tablet")
+    assert "SSL alert number 45" in ask("old")
+
+
+@pytest.mark.skipif(shutil.which("mosquitto_sub") is None, reason="mosquitto-clients not installed")
+@pytest.mark.parametrize("version", ["tlsv1.2", "tlsv1.3"])
+def test_mosquitto_says_that_it_is_revoked(process: ApplianceProcess, version: str) -> None:
+    clients = process.directory / "certs/clients"
+    certs.revoke(process.directory / "certs", "tablet")
+    reload(process, "reload: reloaded: certificates")
+    where = ["-h", HOST, "-p", str(process.port), "--cafile", str(process.ca)]
+    where += ["--tls-version", version]
+    pair = ["--cert", f"{clients}/tablet.crt", "--key", f"{clients}/tablet.key"]
+    ended = subprocess.run(
+        ["mosquitto_sub", *where, *pair, "-d", "-t", "r2d2/tablet/x", "-C", "1"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert ended.returncode and "alert certificate revoked" in ended.stdout, ended
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_a_certificate_runs_out(tmp_path: Path, version: ssl.TLSVersion) -> None:
+    """Who is connected goes, and comes back neither with it nor by resuming the TLS session."""
+    process = make(tmp_path, username_from="subject")
+    company = Company()
+    process.ca.write_bytes(process.ca.read_bytes() + company.pem())
+    company.issue(tmp_path / "certs/clients/short", "tablet", days=1 / 24)
+    clock = WallClock(tmp_path / "clock")
+    process.environment = clock.environment
+    process.start()
+    try:
+        process.port = _ports(process)[0]
+        with Peer(process, "short") as peer:
+            peer.context.maximum_version = version
+            assert peer.log_in("a") == 0
+        context = context_of(process, "short")
+        context.maximum_version = version
+        session: ssl.SSLSession | None = None
+
+        def log_in() -> bytes:
+            nonlocal session
+            plain = socket.create_connection((HOST, process.port), PATIENCE)
+            with context.wrap_socket(plain, server_hostname=HOST, session=session) as again:
+                assert again.session_reused is (session is not None)
+                again.sendall(Connect("b", clean_start=True).encode())
+                answer = again.recv(100)
+                session = again.session
+                return answer
+
+        for _ in range(3):
+            assert log_in()[0] == 0x20
+        with Peer(process, "short") as peer:
+            assert peer.log_in("a") == 0
+            clock.set(1.2 * HOUR)  # not so far that the TLS session has run out
+            answer = peer.decode(peer.receive())
+            assert answer == Disconnect(ReasonCode.NOT_AUTHORIZED)
+        process.wait_for_log("connection closed: its certificate .* expired on ")
+        for _ in range(3):
+            assert log_in() == b""
+        process.wait_for_log("no TLS connection: its certificate .* expired on ", 1)
+    finally:
+        process.stop()
 
 
 @pytest.mark.timed
