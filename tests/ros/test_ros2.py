@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import select
 import struct
 import sys
 import threading
@@ -84,6 +85,14 @@ class Peer:
     async def do(self, *command):
         self.process.stdin.write(json.dumps(command).encode() + b"\n")
         await self._answer()
+
+    async def do_beside_a_busy_loop(self, *command):
+        """`do`, while the event loop has other things to do from its begin to its end."""
+        doing = asyncio.create_task(self.do(*command))
+        await asyncio.sleep(0)  # now it is told
+        pipe = self.process._transport.get_pipe_transport(1).get_extra_info("pipe")
+        assert select.select([pipe], [], [], PATIENCE)[0], f"no answer to {command[0]}"
+        await doing
 
     async def stop(self):
         self.process.stdin.close()
