@@ -8,6 +8,11 @@ from collections.abc import Generator, Iterator
 
 import pytest
 from appliance_process import ACL, ROBOT, ApplianceProcess
+from hypothesis import settings
+
+# How long an example takes is the computer's matter.
+settings.register_profile("default", deadline=None)
+settings.load_profile("default")
 
 IN_CI = os.environ.get("CI") == "true"
 

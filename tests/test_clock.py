@@ -70,7 +70,7 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
             sleeper.receive()
             sleeper.send(Disconnect())
         began = time.monotonic()
-        old, new = join("old", 4, keep_alive=5), join("new", 5, keep_alive=5)
+        old, new = join("old", 4, keep_alive=60), join("new", 5, keep_alive=60)
         old.send(Subscribe(1, [Subscription(WILLS, 1)]))
         old.receive()
         new.send(expiring(b"for long", 600, packet_id=1), expiring(b"not for long", 2, packet_id=2))

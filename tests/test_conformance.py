@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 from conformance import TESTS, main
+from waiting import PATIENCE
 
 
 def test_every_statement_that_a_server_can_show_has_a_test() -> None:
     tool = [sys.executable, TESTS / "conformance.py"]
-    done = subprocess.run(tool, capture_output=True, text=True, cwd=TESTS.parent, timeout=100)
+    done = subprocess.run(
+        tool, capture_output=True, text=True, cwd=TESTS.parent, timeout=4 * PATIENCE
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     lines = [line for line in done.stdout.splitlines() if line]
     assert [line.partition(":")[0] for line in lines] == ["MQTT 3.1.1", "MQTT 5.0"]

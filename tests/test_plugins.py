@@ -196,11 +196,14 @@ async def test_so_many_at_once_and_no_more(
 
 
 async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
-    backend: Backend, tmp_path: Path
+    backend: Backend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    loop = asyncio.get_running_loop()
+    clock, ahead = loop.time, 0.0
+    monkeypatch.setattr(loop, "time", lambda: clock() + ahead)
     users = tmp_path / "users.passwd"
     users.touch(0o600)
-    async with running(backend.plugins(), users=users, answers=Answers(0.6, 0.2)) as rig:
+    async with running(backend.plugins(), users=users, answers=Answers(600, 200)) as rig:
 
         async def ask(password: str = PASSWORD, client_id: str = "c1") -> ReasonCode:
             return code_of(await rig.frame.authenticate(bob(client_id, password), HOST))
@@ -212,12 +215,12 @@ async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
         assert await ask(client_id="c2") == ReasonCode.SUCCESS  # which is another question
         assert len(backend.asked) == 3
         backend.passwords["bob"] = "wrong"
-        await asyncio.sleep(0.25)
+        ahead += 250
         assert await ask() == ReasonCode.SUCCESS  # held
         assert await ask("wrong") == ReasonCode.SUCCESS  # the no has ended
         rig.files.reload()
         assert await ask() == ReasonCode.NOT_AUTHORIZED
-        await asyncio.sleep(0.65)
+        ahead += 650
         backend.passwords["bob"] = PASSWORD
         assert await ask("wrong") == ReasonCode.NOT_AUTHORIZED  # the yes has ended
 

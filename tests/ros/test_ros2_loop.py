@@ -220,9 +220,9 @@ async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, house,
     topics = {"latest": "/a", 2000: "/b"}
     house.start(*(replace(route(ros, "mqtt", "cdr"), keep=keep) for keep, ros in topics.items()))
     oldest = {}
-    for keep, ros in topics.items():
+    for count, (keep, ros) in enumerate(topics.items(), 1):
         await peer.do("advertise", ros, "geometry_msgs/msg/Vector3")
-        await until(lambda n=len(oldest): len(house.bridged()) > n, ros)
+        await until(lambda count=count: len(house.bridged()) == count, ros)
         await peer.do("matched", ros)
         ages.clear()
         await peer.do("publish_times", ros, 2000, 1000)
