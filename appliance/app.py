@@ -48,10 +48,11 @@ from appliance.crash import CrashReports
 from appliance.listeners import Listeners
 from appliance.notify import Notifier
 from appliance.reload import Parts, Reload, ReloadError
+from appliance.ros import discovery
 from appliance.ros.bridge import Bridge
 from appliance.ros.node import RosNode
 from appliance.ros.ros1 import Ros1Node
-from appliance.ros.ros2 import Ros2Node, use_fastdds_profile
+from appliance.ros.ros2 import Ros2Node
 from appliance.store import MemoryStore, SqliteStore, StoreError
 from appliance.watch import watch
 
@@ -276,7 +277,9 @@ class App:
         if bridge.bus == "ros1":
             node = Ros1Node(bridge.node, bridge.namespace, arguments)
         else:
-            use_fastdds_profile(os.environ)
+            unheeded = discovery.use(bridge.discovery, os.environ)
+            if unheeded:
+                log.warning("%s", unheeded)
             node = Ros2Node(
                 bridge.node, bridge.namespace, bridge.domain_id, arguments, bridge.use_sim_time
             )

@@ -17,7 +17,7 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
-from appliance.ros import installation, ros1, ros2
+from appliance.ros import discovery, installation, ros1, ros2
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
 
@@ -207,3 +207,14 @@ def _bridge(settings: Settings) -> Iterator[Finding]:
         routes = sum(not route.is_exclusion for route in (*bridge.topics, *called))
         found = ros1.found() if is_ros1 else installation.find()
         yield Finding("ok", "bridge", f"{found}; routes: {routes}")
+    if is_ros1:
+        yield Finding("warning", "bridge", discovery.OPEN_ROS1)
+    elif bridge.discovery == "localhost" or (
+        bridge.discovery == "environment" and discovery.is_local(os.environ)
+    ):
+        yield Finding("ok", "bridge.discovery", "ROS nodes of this computer only")
+    elif discovery.is_secured(os.environ):
+        yield Finding("ok", "bridge.discovery", "ROS nodes that have keys, by SROS 2")
+    else:
+        text = f"{discovery.OPEN}; {discovery.OPEN_ADVICE}"
+        yield Finding("warning", "bridge.discovery", text)

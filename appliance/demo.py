@@ -18,8 +18,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from appliance.ros import fastdds
 from appliance.ros.definitions import import_message
-from appliance.ros.ros2 import available, use_fastdds_profile
+from appliance.ros.ros2 import available
 
 COMMAND_TIMEOUT = 1.0  # seconds
 ODOMETRY_RATE = 20.0  # Hz
@@ -175,7 +176,7 @@ def main() -> int:
     if not is_available:
         sys.stderr.write(f"{Path(__file__).stem}: {reason}\n")
         return 1
-    use_fastdds_profile(os.environ)
+    fastdds.use_profile(os.environ)
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node

@@ -24,6 +24,8 @@ CONFIGURATION = """\
 robot: {robot}          # the first level of all its MQTT topics
 
 bridge:
+  discovery: localhost   # ROS nodes of this computer only; subnet lets whoever is on the network
+                         # command the robot, past the users and rules of MQTT
   topics: []
   # A route each, for example (and services, actions, parameters likewise: services: [/reset]):
   #  - {{ros: /odom, to: mqtt, rate: 10}}
@@ -45,6 +47,7 @@ broker:
     - bind: 127.0.0.1:${{APPLIANCE_PLAIN_PORT:-1883}}
 
 bridge:
+  discovery: localhost
   topics:
     - {{ros: /odom, to: mqtt, rate: 10}}
     - {{ros: /battery, to: mqtt}}

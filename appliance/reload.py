@@ -39,6 +39,7 @@ NEEDS_RESTART: Final = (
     "broker.limits.connect_timeout",
     "broker.limits.failed_logins",
     "bridge.bus",
+    "bridge.discovery",
     "bridge.node",
     "bridge.namespace",
     "bridge.domain_id",

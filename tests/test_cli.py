@@ -14,8 +14,9 @@ import pytest
 import yaml
 from waiting import PATIENCE, eventually
 
-from appliance import cli
+from appliance import cli, config
 from appliance.access import Passwords
+from appliance.check import check
 from appliance.commands import connection
 from appliance.store import database
 
@@ -352,3 +353,23 @@ def test_the_file_for_fast_dds(capsys: pytest.CaptureFixture[str]) -> None:
     assert str(64 << 20) in capsys.readouterr().out
     for wrong in ("64", "1 KiB", "1 TiB", "much"):
         assert run("fastdds", "--segment", wrong) == 2, wrong
+
+
+@pytest.mark.parametrize(
+    ("said", "variable", "level", "text"),
+    [
+        ("localhost", "SUBNET", "ok", "this computer only"),
+        ("environment", "LOCALHOST", "ok", "this computer only"),
+        ("environment", "SUBNET", "warning", "publish commands"),
+        ("subnet", "LOCALHOST", "warning", "publish commands"),
+    ],
+)
+def test_check_says_who_is_on_the_robots_bus(
+    here: Path, monkeypatch: pytest.MonkeyPatch, said: str, variable: str, level: str, text: str
+) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", variable)
+    file = here / "appliance.yaml"
+    file.write_text(file.read_text().replace("discovery: localhost", f"discovery: {said}"))
+    found = {each.subject: each for each in check(config.load(file))}
+    assert found["bridge.discovery"].level == level
+    assert text in found["bridge.discovery"].text

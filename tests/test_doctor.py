@@ -22,6 +22,7 @@ from appliance.config import Settings
 from appliance.doctor import computer, examination, ports, ros, ros1, secrets
 from appliance.doctor.examination import Part, examine
 from appliance.doctor.finding import Finding
+from appliance.ros import discovery, fastdds
 
 
 def run(*arguments: str) -> int:
@@ -321,7 +322,9 @@ def test_it_looks_with_the_environment_of_the_running_one(
 
 def test_the_running_one_may_be_seen_after_others(here: Path) -> None:
     """That it was not seen at first is no reason to say that nodes do not find each other."""
-    seen_by = SimpleNamespace(name="/me", nodes=lambda: ["/me", "/peer"], topics=dict)
+    seen_by = SimpleNamespace(
+        name="/me", nodes=lambda: ["/me", "/peer"], topics=dict, elsewhere=set
+    )
     seen = ros._Seen(seen_by, "/appliance")  # type: ignore[arg-type]
     seen.look()
     assert not seen._is_done.is_set()
@@ -372,3 +375,38 @@ def test_what_ros_lost_is_told_with_what_to_do() -> None:
     found = by_subject(examination._running(told))
     assert "appliance fastdds" in found["route /image → r2/image"].advice
     assert not found["route /odom → r2/odom"].advice
+
+
+def test_an_open_bus_is_warned_of(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (*ros._DISCOVERY, "ROS_SECURITY_ENABLE", *fastdds.VARIABLES):
+        monkeypatch.setenv(name, "")  # what is set below is undone
+        monkeypatch.delenv(name)
+    [_, finding] = ros._discovery(write(here, bridge={}))
+    assert finding.level == "warning" and "publish commands" in finding.text
+    assert "bridge.discovery: localhost" in finding.advice
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+    assert len(list(ros._discovery(write(here, bridge={})))) == 1
+    monkeypatch.delenv("ROS_SECURITY_ENABLE")
+    settings = write(here, bridge={"discovery": "localhost"})
+    discovery.use(settings.bridge.discovery, os.environ)
+    [finding] = ros._discovery(settings)
+    assert "nodes of this computer only" in finding.text
+
+
+def test_nodes_of_other_computers_are_named(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def node(*_: object) -> SimpleNamespace:
+        return SimpleNamespace(
+            name="/me",
+            start=lambda look, failed: look(),
+            stop=lambda: None,
+            nodes=lambda: ["/me", "/near", "/far"],
+            topics=dict,
+            elsewhere=lambda: {"/far"},
+        )
+
+    monkeypatch.setattr(ros, "Ros2Node", node)
+    monkeypatch.setattr(ros, "LEAST_PATIENCE", 0.0)
+    seen, elsewhere = ros._look(write(here, bridge={}), None)
+    assert seen.level == "ok" and "2 (/far, /near)" in seen.text
+    assert elsewhere.level == "warning" and "1 (/far)" in elsewhere.text

@@ -225,3 +225,11 @@ def test_robot_names(text: str, name: str) -> None:
 
 def test_a_long_robot_name() -> None:
     config.loads(f"robot: {robot_name('r' * 99)}", Path("x.yaml"), {})
+
+
+@pytest.mark.parametrize("demo", [False, True])
+def test_ros_stays_on_this_computer_unless_the_file_says_otherwise(
+    tmp_path: Path, demo: bool
+) -> None:
+    list(initialise(tmp_path, demo=demo))
+    assert config.load(tmp_path / "appliance.yaml").bridge.discovery == "localhost"

@@ -376,6 +376,7 @@ class Bridge(_Section):
     node: Annotated[str, AfterValidator(check_node)] = "appliance"
     namespace: Annotated[str, AfterValidator(check_namespace)] = "/"
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    discovery: Literal["localhost", "subnet", "environment"] = "environment"
     ros_arguments: Annotated[list[str], AfterValidator(check_ros_arguments)] = []
     use_sim_time: bool = False
     diagnostics: Annotated[Duration, Field(ge=0)] = 1.0

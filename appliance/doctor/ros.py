@@ -17,7 +17,8 @@ from appliance.config import Settings
 from appliance.doctor.finding import Finding
 from appliance.doctor.ros1 import ros1
 from appliance.environment import of_service
-from appliance.ros import installation
+from appliance.ros import discovery, installation
+from appliance.ros.discovery import OPEN, OPEN_ADVICE
 from appliance.ros.ros2 import Ros2Node, available
 
 #: Seconds in which other nodes are looked for: most are seen in a tenth of one, some take three.
@@ -65,6 +66,9 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
     if adopted:
         text = f"as the appliance has it: {', '.join(adopted)}"
         yield Finding("ok", "ROS environment", text)
+    unheeded = discovery.use(settings.bridge.discovery, os.environ)
+    if unheeded:
+        yield Finding("warning", "ROS environment", unheeded)
     yield which_ros(is_needed=_has_routes(settings))
     yield from _discovery(settings)
     yield from shared_memory()
@@ -133,14 +137,15 @@ def _discovery(settings: Settings) -> Iterator[Finding]:
         yield Finding("warning", "ROS network", text, advice)
     else:
         yield Finding("ok", "ROS network", text)
+    if not (discovery.is_local(environment) or discovery.is_secured(environment)):
+        yield Finding("warning", "ROS network", OPEN, OPEN_ADVICE)
 
 
 def _range(environment: Mapping[str, str]) -> str:
-    chosen = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    if chosen == "LOCALHOST" or environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"):
+    if environment.get(discovery.RANGE, "").upper() == "OFF":
+        return f"no nodes are looked for ({discovery.RANGE})"
+    if discovery.is_local(environment):
         return "nodes of this computer only"
-    if chosen == "OFF":
-        return "no nodes are looked for (ROS_AUTOMATIC_DISCOVERY_RANGE)"
     peers = environment.get("ROS_STATIC_PEERS") or environment.get("ROS_DISCOVERY_SERVER")
     return "nodes of the network" + (f", and {peers}" if peers else "")
 
@@ -237,6 +242,10 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
     named = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
     text = f"seen: {len(others)} ({named}), with {len(seen.topics)} topics"
     yield Finding("ok", subject, text)
+    if seen.elsewhere and not discovery.is_secured(os.environ):
+        named = ", ".join(sorted(seen.elsewhere)[:5]) + (", …" if len(seen.elsewhere) > 5 else "")
+        text = f"on other computers or in containers: {len(seen.elsewhere)} ({named}); {OPEN}"
+        yield Finding("warning", subject, text, OPEN_ADVICE)
 
 
 class _Seen:
@@ -246,6 +255,8 @@ class _Seen:
         """`ours` is the running appliance's node, which is waited for beside others."""
         self.nodes: set[str] = set()
         self.topics: set[str] = set()
+        #: Those of them on other computers.
+        self.elsewhere: set[str] = set()
         self.problem = ""
         self._node = node
         self._ours = ours
@@ -254,6 +265,7 @@ class _Seen:
     def look(self) -> None:
         self.nodes = {name for name in self._node.nodes() if name != self._node.name}
         self.topics = set(self._node.topics()) - _OF_EVERY_NODE
+        self.elsewhere = self._node.elsewhere()
         if self.nodes - {self._ours} and (self._ours is None or self._ours in self.nodes):
             self._is_done.set()
 

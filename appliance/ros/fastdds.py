@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
+from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 
-#: Ours: the built-in transports with room for a few images; and without shared memory.
-PROFILE = Path(__file__).parent.parent / "fastdds.xml"
-UDP_PROFILE = PROFILE.with_name("fastdds_udp.xml")
+_FOLDER = Path(__file__).parent.parent
+#: Ours: the built-in transports, with room for a few images.
+PROFILE = _FOLDER / "fastdds.xml"
+#: By whether it is for nodes of this computer only, and for UDP without shared memory.
+_PROFILES = {
+    (False, False): PROFILE,
+    (False, True): _FOLDER / "fastdds_udp.xml",
+    (True, False): _FOLDER / "fastdds_local.xml",
+    (True, True): _FOLDER / "fastdds_local_udp.xml",
+}
 
 #: What names the file to a node, and what did up to ROS 2 Jazzy, when it was called Fast RTPS.
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
 #: What to do about messages that the middleware lost on their way here.
 LOST_IN_ROS = (
@@ -26,3 +37,43 @@ def profile(segment: int) -> str:
     """The file's text, with so many bytes of memory for what a node publishes."""
     without_comment = re.sub(r"<!--.*?-->\n", "", PROFILE.read_text(), flags=re.DOTALL)
     return _SEGMENT.sub(str(segment), without_comment)
+
+
+def shares() -> Iterator[Path]:
+    """The folders that ROS's packages share files in; those of the wheels are in the venv."""
+    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
+
+
+def is_old() -> bool:
+    """Whether it is Fast RTPS, up to ROS 2 Jazzy, which warns of the old variable since."""
+    return any((share / "fastrtps").is_dir() for share in shares())
+
+
+def use_profile(environment: MutableMapping[str, str], *, is_local: bool = False) -> bool:
+    """Let Fast DDS read our profile: room for images and, where `is_local`, nodes of this computer
+    only. False when it must not: the user's own settings go first.
+
+    On ROS 2 up to Jazzy a profile's transports would also undo `ROS_LOCALHOST_ONLY`, which Kilted
+    does not know any more.
+    """
+    transports = environment.get("FASTDDS_BUILTIN_TRANSPORTS")
+    is_udp = transports is not None
+    if (
+        not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
+        or transports not in (None, "UDPv4")
+        or (is_old() and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
+        or any(variable in environment for variable in VARIABLES)
+        or any(Path(file).exists() for file in _FILES)
+        # In Humble and before it does not know the variable, and the profile says it.
+        or (is_udp and not is_old() and not is_local)
+    ):
+        return False
+    environment[VARIABLES[1 if is_old() else 0]] = str(_PROFILES[is_local, is_udp])
+    return True
+
+
+def is_local(environment: Mapping[str, str]) -> bool:
+    """Whether Fast DDS reads our profile for nodes of this computer only."""
+    ours = {str(path) for (local, _), path in _PROFILES.items() if local}
+    return any(environment.get(variable) in ours for variable in VARIABLES)

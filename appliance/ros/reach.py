@@ -18,6 +18,8 @@ from pathlib import Path
 
 import psutil
 
+from appliance.ros import discovery
+
 #: Where Fast DDS is loaded from: the library's name up to ROS 2 Jazzy, and since.
 _FAST_DDS = re.compile(r"(/\S+/lib(?:fastrtps|fastdds)\.so\S*)$", re.MULTILINE)
 
@@ -33,7 +35,6 @@ class Reach(IntEnum):
 def reach(environment: Mapping[str, str] | None = None) -> Reach:
     """What there is now, as far as ROS may use it."""
     environment = os.environ if environment is None else environment
-    is_local = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     found = Reach.NOBODY
     states = psutil.net_if_stats()
     for name, addresses in psutil.net_if_addrs().items():
@@ -44,7 +45,7 @@ def reach(environment: Mapping[str, str] | None = None) -> Reach:
                 continue
             is_loopback = ipaddress.IPv4Address(address.address).is_loopback
             found = max(found, Reach.THIS_COMPUTER if is_loopback else Reach.NETWORK)
-    return min(found, Reach.THIS_COMPUTER) if is_local else found
+    return min(found, Reach.THIS_COMPUTER) if discovery.is_local(environment) else found
 
 
 def look_again() -> None:

@@ -11,10 +11,9 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from appliance.ros import fastdds, installation, uncompiled
@@ -62,8 +61,6 @@ _LONGEST_NAME = 247
 #: Those above have no ports of their own on DDS.
 HIGHEST_DOMAIN = 232
 
-_PROFILE_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
-
 
 def available() -> tuple[bool, str]:
     """Whether a node can be started here, and if not, one line that says why and what to do.
@@ -94,40 +91,10 @@ def _wrong_domain() -> str:
 
 def _resources(kind: str) -> Iterator[str]:
     """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
-    for folder in _shares():
+    for folder in fastdds.shares():
         index = folder / "ament_index" / "resource_index" / kind
         if index.is_dir():
             yield from (entry.name for entry in index.iterdir())
-
-
-def _shares() -> Iterator[Path]:
-    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
-
-
-def use_fastdds_profile(environment: MutableMapping[str, str]) -> bool:
-    """Let Fast DDS read our profile (fastdds.xml: room for images); False when it must not.
-
-    The user's own settings go first. On ROS 2 up to Jazzy a profile's transports would also undo
-    `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
-    """
-    # Fast DDS was called Fast RTPS up to ROS 2 Jazzy, and warns of the old variable since.
-    is_old = any((share / "fastrtps").is_dir() for share in _shares())
-    if (
-        not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
-        or environment.get("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4") != "UDPv4"
-        or (is_old and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
-        or any(variable in environment for variable in fastdds.VARIABLES)
-        or any(Path(file).exists() for file in _PROFILE_FILES)
-    ):
-        return False
-    profile = fastdds.PROFILE
-    if "FASTDDS_BUILTIN_TRANSPORTS" in environment:
-        if not is_old:
-            return False
-        profile = fastdds.UDP_PROFILE  # in Humble and before it does not know the variable
-    environment[fastdds.VARIABLES[1 if is_old else 0]] = str(profile)
-    return True
 
 
 class Ros2Node:
@@ -182,7 +149,7 @@ class Ros2Node:
         if reason:
             failed(reason)
             return
-        use_fastdds_profile(os.environ)
+        fastdds.use_profile(os.environ)
         if self._thread is not None:  # it has failed, and is about to end
             self._thread.join()
         # Not a daemon: one that is alive when Python ends aborts the process.
@@ -296,6 +263,27 @@ class Ros2Node:
     def nodes(self) -> list[str]:
         found = self._node.get_node_names_and_namespaces()
         return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
+
+    def elsewhere(self) -> set[str]:
+        """The nodes that have endpoints on other computers, or in containers with a network of
+        their own; none where the middleware is not Fast DDS, which tells by its ids."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
+        middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
+        if not middleware.startswith("rmw_fastrtps"):
+            return set()
+        hosts: dict[str, set[bytes]] = {}
+        for topic in self.topics():
+            for info in (
+                *self._node.get_publishers_info_by_topic(topic),
+                *self._node.get_subscriptions_info_by_topic(topic),
+            ):
+                name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                if "_NODE_NAME_UNKNOWN_" in name:  # it has not said so yet, or is no node of ROS
+                    name = "one without a name"
+                hosts.setdefault(name, set()).add(bytes(info.endpoint_gid[2:4]))
+        here = hosts.get(self.name, set())
+        return {name for name, at in hosts.items() if here and not at <= here}
 
     def topics(self) -> dict[str, list[str]]:
         return _named(self._node.get_topic_names_and_types())

@@ -74,9 +74,9 @@ def send(seconds: float) -> None:
     from rclpy.node import Node
     from std_msgs.msg import String, UInt8MultiArray
 
-    from appliance.ros.ros2 import use_fastdds_profile
+    from appliance.ros import fastdds
 
-    use_fastdds_profile(os.environ)
+    fastdds.use_profile(os.environ)
     rclpy.init(args=[])
     node = Node("sender")
     texts = node.create_publisher(String, "/text", 100)

@@ -21,7 +21,7 @@ from appliance.broker.message import Message
 from appliance.environment import for_other_programs
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros import installation, ros2
+from appliance.ros import fastdds, installation, ros2
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.convert import compile_converter
 from appliance.ros.node import BusError, QosProfile, Reliability
@@ -675,7 +675,7 @@ def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
 )
 def test_the_users_own_settings_of_fast_dds_go_first(environment):
     before = dict(environment)
-    assert not ros2.use_fastdds_profile(environment)
+    assert not fastdds.use_profile(environment)
     assert environment == before
 
 
@@ -683,27 +683,27 @@ def test_fast_dds_2_has_a_variable_of_its_own_and_goes_nowhere_else(tmp_path, mo
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     (tmp_path / "share" / "fastrtps").mkdir(parents=True)
     environment = {"ROS_LOCALHOST_ONLY": "1"}
-    assert not ros2.use_fastdds_profile(environment)
+    assert not fastdds.use_profile(environment)
     environment["ROS_LOCALHOST_ONLY"] = "0"
-    assert ros2.use_fastdds_profile(environment)
+    assert fastdds.use_profile(environment)
     assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
 def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     environment = {}
-    assert ros2.use_fastdds_profile(environment)
+    assert fastdds.use_profile(environment)
     assert [Path(value).is_file() for value in environment.values()] == [True]
     Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
-    assert not ros2.use_fastdds_profile({})
+    assert not fastdds.use_profile({})
 
 
 def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(tmp_path, monkeypatch):
     environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-    assert not ros2.use_fastdds_profile(environment)
+    assert not fastdds.use_profile(environment)
     (tmp_path / "fastrtps").mkdir()
-    monkeypatch.setattr(ros2, "_shares", lambda: [tmp_path])
-    assert ros2.use_fastdds_profile(environment)
+    monkeypatch.setattr(fastdds, "shares", lambda: [tmp_path])
+    assert fastdds.use_profile(environment)
     profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
     assert "UDPv4" in profile and "SHM" not in profile
 

@@ -1,0 +1,145 @@
+"""Whom the bridge's node finds, and who finds it: `bridge.discovery`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance.environment import for_other_programs
+from appliance.ros import discovery, fastdds
+from appliance.ros.reach import Reach, reach
+
+RANGE = discovery.RANGE
+
+
+@pytest.fixture(autouse=True)
+def newer_than_humble(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(discovery, "_knows_range", lambda: True)
+    monkeypatch.setattr(fastdds, "is_old", lambda: False)
+
+
+def test_localhost_is_a_profile_without_a_socket_on_the_network():
+    environment = {}
+    assert discovery.use("localhost", environment) == ""
+    profile = Path(environment["FASTDDS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<address>127.0.0.1</address>" in profile and "FILTER_DIFFERENT_HOST" in profile
+    assert "SHM" in profile
+    assert discovery.is_local(environment)
+    assert reach(environment) <= Reach.THIS_COMPUTER
+    before = dict(environment)
+    assert discovery.use("localhost", environment) == ""  # the node is started anew
+    assert environment == before
+
+
+def test_the_service_of_a_user_of_its_own_has_no_shared_memory():
+    environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    discovery.use("localhost", environment)
+    profile = Path(environment["FASTDDS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<address>127.0.0.1</address>" in profile and "SHM" not in profile
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {"FASTDDS_DEFAULT_PROFILES_FILE": "/mine.xml"}],
+)
+def test_where_the_profile_cannot_be_used_it_is_ross_own_variable(given, monkeypatch):
+    environment = dict(given)
+    assert discovery.use("localhost", environment) == ""
+    assert environment == {**given, RANGE: "LOCALHOST"}
+    assert discovery.is_local(environment)
+    monkeypatch.setattr(discovery, "_knows_range", lambda: False)
+    environment = dict(given)
+    discovery.use("localhost", environment)
+    assert environment["ROS_LOCALHOST_ONLY"] == "1"  # as it is called in Humble
+
+
+@pytest.mark.parametrize(
+    ("wanted", "given", "told"),
+    [
+        ("localhost", {RANGE: "SUBNET"}, f"{RANGE}=SUBNET"),
+        ("localhost", {RANGE: "OFF"}, f"{RANGE}=OFF"),
+        ("localhost", {RANGE: "localhost"}, ""),
+        ("localhost", {"ROS_STATIC_PEERS": "10.0.0.2"}, "ROS_STATIC_PEERS=10.0.0.2"),
+        ("subnet", {RANGE: "LOCALHOST"}, f"{RANGE}=LOCALHOST"),
+        ("subnet", {"ROS_STATIC_PEERS": "10.0.0.2"}, ""),
+        ("environment", {RANGE: "OFF", "ROS_STATIC_PEERS": "10.0.0.2"}, ""),
+    ],
+)
+def test_the_key_goes_before_the_variables_and_says_so(wanted, given, told):
+    environment = dict(given)
+    said = discovery.use(wanted, environment)
+    assert told in said and bool(told) is bool(said)
+    if said:
+        assert f"bridge.discovery is {wanted}" in said and "discovery: environment" in said
+    if wanted == "environment":
+        assert environment == given
+    else:
+        assert discovery.is_local(environment) is (wanted == "localhost")
+
+
+def test_what_kilted_does_not_know_makes_nothing_local(monkeypatch):
+    """`doctor` called a bus local on which everybody on the network could publish."""
+    assert not discovery.is_local({"ROS_LOCALHOST_ONLY": "1"})
+    monkeypatch.setattr(fastdds, "is_old", lambda: True)  # Jazzy knows it
+    assert discovery.is_local({"ROS_LOCALHOST_ONLY": "1"})
+
+
+@pytest.mark.parametrize(
+    ("enable", "strategy", "secured"),
+    [("true", "Enforce", True), ("true", "Permissive", False), ("false", "Enforce", False)],
+)
+def test_only_enforced_security_is_security(enable, strategy, secured):
+    environment = {"ROS_SECURITY_ENABLE": enable, "ROS_SECURITY_STRATEGY": strategy}
+    assert discovery.is_secured(environment) is secured
+
+
+def has_namespaces():
+    try:
+        trial = [
+            "unshare",
+            "-n",
+            "ip",
+            "link",
+            "add",
+            "veth1",
+            "type",
+            "veth",
+            "peer",
+            "name",
+            "veth2",
+        ]
+        return subprocess.run(trial, capture_output=True).returncode == 0
+    except OSError:
+        return False
+
+
+def test_another_computer_of_the_network():
+    pytest.importorskip("rclpy")
+    if not has_namespaces():
+        pytest.skip("needs root, iproute2 and network namespaces, for two computers")
+    program = Path(__file__).with_name("two_computers.py")
+    environment = {
+        name: value
+        for name, value in for_other_programs().items()
+        if not name.startswith("FASTDDS")
+    }
+    environment.pop(RANGE, None)
+    environment["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    done = subprocess.run(
+        ["unshare", "-n", sys.executable, str(program)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    subnet, localhost = map(json.loads, done.stdout.splitlines())
+    subnet["elsewhere"] = [name for name in subnet["elsewhere"] if name != "one without a name"]
+    assert subnet == {"heard": ["far", "near"], "elsewhere": ["/far"], "open": True}
+    assert localhost == {"heard": ["near"], "elsewhere": [], "open": False}
