@@ -8,10 +8,11 @@ import socket
 def network(address: str) -> bytes:
     """One address of IPv4; of IPv6 a network of 64 bits, as one site has; or one Unix socket.
 
-    `address` is a host, with its port or without: "127.0.0.1", "127.0.0.1:54321", "[::1]:54321".
+    `address` is a host, with its port or without: "127.0.0.1", "127.0.0.1:54321", "[::1]:54321";
+    or a Unix socket and the connection's number, "unix:/run/mqtt.sock:17".
     """
     if address.startswith("unix:"):
-        return address.encode()
+        return address.rpartition(":")[0].encode()
     host = address.rpartition("]")[0][1:] if address.startswith("[") else address
     if host.count(":") < 2:
         return socket.inet_aton(host.partition(":")[0])

@@ -17,10 +17,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from appliance.logs import VISIBLE
+from appliance.logs import VISIBLE_IN_LINES
 
 ANSWER_TIMEOUT = 10.0  # seconds to wait for the broker's answer to a packet that needs one
-NOT_LINE_ENDS = {code: text for code, text in VISIBLE.items() if code not in (0x09, 0x0A)}
 
 
 class ClientError(Exception):
@@ -104,7 +103,7 @@ def subscribe(
 def write_line(output: BinaryIO, line: bytes) -> None:
     """Writes it as it is, or so that a payload cannot send commands to a terminal."""
     if output.isatty():
-        line = line.decode(errors="backslashreplace").translate(NOT_LINE_ENDS).encode()
+        line = line.decode(errors="backslashreplace").translate(VISIBLE_IN_LINES).encode()
     output.write(line + b"\n")
     output.flush()
 

@@ -187,7 +187,8 @@ class Listeners:
         now = asyncio.get_running_loop().time()
         refusal = host = ""
         if listener.path is not None:
-            address = f"unix:{listener.path}"
+            # In the place of a port a number that no other connection has at the time.
+            address = f"unix:{listener.path}:{connection.fileno()}"
         else:
             host, port = cast("tuple[str, int]", peer)[:2]
             address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

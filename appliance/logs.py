@@ -18,9 +18,15 @@ _COLOURS = {"DEBUG": "\x1b[2m", "WARNING": "\x1b[33m", "ERROR": "\x1b[31m", "CRI
 _RESET = "\x1b[0m"
 
 # Client ids, user names and topics come from strangers and end up in log lines: without this they
-# could forge lines, or send commands to the terminal that shows them. C0, DEL and C1.
+# could forge lines, send commands to the terminal that shows them, or turn the order of what it
+# shows. C0, DEL and C1; ends of lines and the bidirectional controls of Unicode (UAX 9).
+_BIDIRECTIONAL = (0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
 VISIBLE = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
-VISIBLE |= {0x2028: "\\u2028", 0x2029: "\\u2029"}
+VISIBLE |= {code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *_BIDIRECTIONAL)}
+#: The same of texts that have several lines.
+VISIBLE_IN_LINES = {code: text for code, text in VISIBLE.items() if code not in (0x09, 0x0A)}
+# JSON escapes the first of them itself.
+_VISIBLE_IN_JSON = {code: f"\\u{code:04x}" for code in VISIBLE if code >= 0x7F}
 
 #: The last lines that were logged, for a crash's report.
 recent: deque[str] = deque(maxlen=100)
@@ -71,7 +77,8 @@ class HumanFormatter(logging.Formatter):
         if self._colour and record.levelname in _COLOURS:
             line = f"{_COLOURS[record.levelname]}{line}{_RESET}"
         if record.exc_info:
-            line += "\n" + self.formatException(record.exc_info)
+            traceback = self.formatException(record.exc_info).translate(VISIBLE_IN_LINES)
+            line += "\n" + traceback.replace("\n", "\n  ")  # an exception's text forges no line
         return line
 
 
@@ -88,4 +95,10 @@ class JsonFormatter(logging.Formatter):
         }
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
-        return json.dumps(entry, ensure_ascii=False)
+        return json_text(entry)
+
+
+def json_text(value: object, indent: int | None = None) -> str:
+    """JSON for people and machines: what would act on a terminal is escaped, and only that."""
+    text = json.dumps(value, ensure_ascii=False, indent=indent)
+    return text.translate(_VISIBLE_IN_JSON)

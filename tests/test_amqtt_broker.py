@@ -1045,6 +1045,27 @@ async def test_files_that_no_plugin_stands_for_are_needed(tmp_path: Path) -> Non
         await App(settings).start()
 
 
+async def test_clients_of_a_unix_socket(tmp_path: Path) -> None:
+    """With any plugin; and each is shown its own login, although all have the same address."""
+    path = tmp_path / "mqtt.sock"
+    plugins: dict[str, Any] = {own(Login): {}, own(Gate): {}, EVENT_LOGGER: {}}
+    app = App(settings_of(tmp_path, plugins, listeners=[{"bind": f"unix:{path}"}]))
+    await app.start()
+    try:
+        ends = [await asyncio.open_unix_connection(path) for _ in range(3)]
+        for number, (_, writer) in enumerate(ends):
+            writer.write(Connect(f"c{number}", username="bob", password=b"x").encode())
+        for reader, _ in ends:
+            answer = await asyncio.wait_for(reader.read(100), PATIENCE)
+            assert answer[0] == 0x20 and answer[3] == 0, answer
+        for _, writer in ends:
+            writer.close()
+    finally:
+        await app.stop()
+    assert {session.remote_address for session in Login.seen} == {f"unix:{path}"}
+    assert len({session.remote_port for session in Login.seen}) == 3
+
+
 async def test_plugins_see_the_tls_connection(tmp_path: Path) -> None:
     certs.create_authority(tmp_path)
     certs.issue_server(tmp_path, ["localhost"], [])

@@ -7,6 +7,7 @@ import json
 import logging
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -56,6 +57,35 @@ def test_strangers_cannot_forge_lines_or_command_the_terminal() -> None:
     logs.setup(stream=stream)
     logging.getLogger("appliance.x").info("client %s", "a\nERROR b\x1b[2J\x9b\u2028é")
     assert stream.getvalue().endswith("x: client a\\x0aERROR b\\x1b[2J\\x9b\\u2028é\n")
+
+
+#: What acts on a terminal, or turns the order of what it shows: C0, DEL, C1, ends of lines, and
+#: Unicode's bidirectional control characters (UAX 9).
+ACTING = "".join(
+    map(chr, (*range(0x20), *range(0x7F, 0xA0), 0x61C, 0x200E, 0x200F, *range(0x2028, 0x202F)))
+) + "".join(map(chr, range(0x2066, 0x206A)))
+
+
+@pytest.mark.parametrize("form", ["human", "json"])
+def test_nothing_in_a_line_acts_on_who_reads_it(form: Any) -> None:
+    stream = io.StringIO()
+    logs.setup(form=form, stream=stream)
+    try:
+        raise ValueError(f"no client {ACTING}\n2026-01-01 00:00:00.000 INFO forged")
+    except ValueError:
+        logging.getLogger("appliance.x").exception("client %s é€", ACTING)
+    raw = stream.getvalue().rstrip("\n")
+    if form == "json":
+        assert not set(raw) & set(ACTING)
+    else:  # a traceback has several lines, none of which looks like one of the log
+        assert not set(raw) & (set(ACTING) - {"\n", "\t"})
+        assert not any(line.startswith("2026-01-01") for line in raw.splitlines())
+    assert "é€" in raw
+    if form == "json":
+        assert json.loads(raw)["message"] == f"client {ACTING} é€"
+        assert ACTING in json.loads(raw)["exception"]
+    else:
+        assert "\\u202e" in raw and "ValueError: no client \\x00" in raw
 
 
 def test_colour_only_on_a_terminal_that_wants_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,6 +29,7 @@ class Unclaimed(Identity):
 
 
 def _split(address: str) -> tuple[str, int]:
+    """A connection's host and port; of a Unix socket its path and the connection's number."""
     host, _, port = address.rpartition(":")
     return host.strip("[]"), int(port)
 

@@ -21,7 +21,7 @@ from appliance.broker.handshake import (
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
 from appliance.broker.output import CANNOT_KEEP, Output
-from appliance.broker.ports import Exchange, Identity, Refusal, Wire
+from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
 from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
 from appliance.broker.subscribing import subscribe, unsubscribe
@@ -416,6 +416,10 @@ class Client:
         if not packet.client_id and not packet.clean_start and packet.version != 5:
             # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
+            return
+        if packet.client_id.startswith(INSIDE):
+            reason = f"client ids that begin with {INSIDE} are the appliance's own"
+            self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, reason)
             return
         will = packet.will
         excess = self._router.excess(will.topic) if will is not None else ""

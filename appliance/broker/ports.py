@@ -346,6 +346,9 @@ class Features:
     response_information: str = ""
 
 
+#: What client ids of sessions inside the appliance begin with, and no client's.
+INSIDE = "_"
+
 #: The largest packet that a client can count on without being told, in bytes.
 USUAL_PACKET_SIZE = 16 * 1024 * 1024
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -24,6 +23,7 @@ def status(
     """Ask the running appliance how it is; exit code 1 when none is running."""
     from appliance.config import load_control
     from appliance.control import ControlError, NotRunningError, ask
+    from appliance.logs import VISIBLE, json_text
 
     broken: CommandError | None = None
     try:
@@ -39,13 +39,13 @@ def status(
     if broken is not None:
         told["warnings"].append(str(broken))
     if as_json:
-        typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
+        typer.echo(json_text(told, indent=2))
         return
     for name, text in _lines(told):
-        typer.echo(f"{name:<14}{text}")
+        typer.echo(f"{name:<14}{text.translate(VISIBLE)}")
     for text in told["warnings"]:
         typer.secho("warning       ", fg="yellow", nl=False)
-        typer.echo(text)
+        typer.echo(text.translate(VISIBLE))
 
 
 def _lines(told: dict[str, Any]) -> Iterator[tuple[str, str]]:

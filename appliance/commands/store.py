@@ -61,14 +61,13 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
 def store_export(config: ConfigOption = None) -> None:
     """Print all of it as JSON, one session or retained message a line."""
     path = _store_path(config)
-    import json
-
+    from appliance.logs import json_text
     from appliance.store import StoreError
     from appliance.store.inspection import export
 
     try:
         for entry in export(path):
-            typer.echo(json.dumps(entry, ensure_ascii=False))
+            typer.echo(json_text(entry))
     except StoreError as error:
         raise CommandError(str(error)) from None
 

@@ -9,7 +9,7 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Limits
+from appliance.broker.ports import Action, Identity, Limits
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,
@@ -256,6 +256,32 @@ def test_a_client_cannot_have_the_id_of_a_session_inside_the_appliance(broker: B
     broker.attach("_bridge", FakeLink())
     answer = Peer(broker).connect("_bridge")
     assert answer.reason_code == ReasonCode.CLIENT_IDENTIFIER_NOT_VALID
+
+
+@pytest.mark.parametrize("version", [4, 5])
+def test_a_client_cannot_have_an_id_that_may_be_needed_inside(broker: Broker, version: int):
+    """Whether the part of the appliance is there now, or comes with the next configuration."""
+    answer = Peer(broker, version).connect("_bridge")
+    assert answer.reason_code == ReasonCode.CLIENT_IDENTIFIER_NOT_VALID
+    assert not broker.sessions
+
+
+def test_a_session_of_before_does_not_keep_the_appliance_from_its_id(
+    broker: Broker, caplog: pytest.LogCaptureFixture
+):
+    """From a version that let clients have such ids."""
+    session, _ = broker.connect(
+        FakeLink(), Identity("ann", "_bridge"), clean_start=False, expiry=100, will=None
+    )
+    broker.subscribe(session, Subscription("a"))
+    link = session.link
+    assert link is not None
+    broker.disconnect(session, link, publish_will=False)
+    inside = broker.attach("_bridge", FakeLink())
+    assert broker.sessions["_bridge"] is inside and broker.subscription_count == 0
+    assert "'_bridge'" in caplog.text
+    with pytest.raises(ValueError, match="already"):
+        broker.attach("_bridge", FakeLink())
 
 
 # --- retained messages
