@@ -45,6 +45,7 @@ from appliance.config import (
 )
 from appliance.control import Control, ControlError
 from appliance.crash import CrashReports
+from appliance.entries import Entries, shield
 from appliance.listeners import Listeners
 from appliance.notify import Notifier
 from appliance.reload import Parts, Reload, ReloadError
@@ -149,9 +150,14 @@ class App:
             wiring.broker_limits(settings),
             wiring.features(settings),
         )
+        self._entries = Entries(loop, broker.faults)
+        if self._crashes is not None:
+            broker.faults.report = self._crashes.fault
+            self._crashes.watch(loop, broker.faults)
         audit = broker_settings.audit
         if audit.path is not None:
-            self.audit = broker.journal = Audit(audit.path, audit.size, audit.keep)
+            self.audit = Audit(audit.path, audit.size, audit.keep)
+            broker.journal = shield("audit", broker.faults, self.audit)
             self._stack.callback(self.audit.close)
             self.audit.began()
             self._stack.callback(self.audit.ended)
@@ -230,7 +236,7 @@ class App:
 
     def _beside(self, work: Coroutine[object, object, None]) -> None:
         """Run this beside everything else, until the stop."""
-        task = asyncio.ensure_future(work)
+        task = self._entries.task("app.beside", work)
 
         async def end() -> None:
             task.cancel()
@@ -254,6 +260,8 @@ class App:
                     reason = ""
             except (CertificateError, OSError) as error:
                 problems = [f"the server's certificate is not renewed: {error}"]
+            except Exception as error:
+                self.broker.faults.caught("app.certificates", error)
             now = loop.time()
             told = {text: at for text, at in told.items() if now - at < CERTIFICATE_WARNING}
             for text in (*problems, *tls.warnings()):
@@ -303,26 +311,31 @@ class App:
         )
         interval = self.settings.broker.sys_interval
         next_sys = loop.time() + min(interval, TICK)
-        timer: asyncio.TimerHandle
         steps = StepWatch(loop.time())
+        run = self.broker.faults.run
 
-        def tick() -> None:
-            nonlocal timer, next_sys
-            now = loop.time()
+        def look_at_clock(now: float) -> None:
             step = steps.look(now)
             if step:
                 self._clock_was_set(step)
-            due = self.broker.tick(now)
+
+        def publish_sys() -> None:
+            for topic, payload in sys_topics.update():
+                run("clock.sys_topic", self._publish, topic, payload, True, otherwise=None)
+
+        def tick() -> float:
+            nonlocal next_sys
+            now = loop.time()
+            run("clock.step", look_at_clock, now, otherwise=None)
+            due = run("clock.broker", self.broker.tick, now, otherwise=now + TICK)
             if self._status is not None:
-                self._status.tick(now)
+                run("clock.status", self._status.tick, now, otherwise=None)
             if interval and now >= next_sys:
                 next_sys = now + interval
-                for topic, payload in sys_topics.update():
-                    self._publish(topic, payload, retain=True)
-            timer = loop.call_at(min(now + TICK, max(due, now + SHORTEST_TICK)), tick)
+                run("clock.sys", publish_sys, otherwise=None)
+            return min(now + TICK, max(due, now + SHORTEST_TICK))
 
-        timer = loop.call_later(TICK, tick)
-        self._stack.callback(lambda: timer.cancel())
+        self._stack.callback(self._entries.every("clock", TICK, tick).cancel)
 
     def _clock_was_set(self, step: float) -> None:
         """The wall clock says something else; only dates depend on it."""
@@ -334,7 +347,7 @@ class App:
         self._certificates_due.set()
         self._listeners.network.in_background(self._listeners.check_certificates())
 
-    def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+    def _publish(self, topic: str, payload: bytes, retain: bool = False) -> None:
         self.broker.publish(Message(topic, payload, 0, retain), self._inside)
         self.broker.flush()
 
@@ -346,11 +359,9 @@ class App:
         """Start, run until SIGTERM or SIGINT (or `request_stop`), stop."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.request_stop)
-        if self._crashes is not None:
-            self._crashes.watch(loop)
+            loop.add_signal_handler(number, self.request_stop)  # sets an event, and no more
         await self.start()
-        loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
+        self._entries.signal("signal.reload", signal.SIGHUP, self._on_hangup)
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
         assert self._status is not None
         self._notifier.start(loop, self._status.line)
@@ -368,7 +379,12 @@ class App:
 
     async def _try_reload(self) -> None:
         with contextlib.suppress(ReloadError):  # the log was told
-            await self.reload()
+            try:
+                await self.reload()
+            except (ReloadError, asyncio.CancelledError):
+                raise
+            except Exception as error:
+                self.broker.faults.caught("app.reload", error)
 
     def _on_hangup(self) -> None:
         self._listeners.network.in_background(self._try_reload())
@@ -411,7 +427,7 @@ class App:
             "status": self._answer_status,
             "skipped": self._answer_skipped,
         }
-        control = Control(settings.control, commands)
+        control = Control(settings.control, commands, self.broker.faults)
         try:
             await control.start()
         except OSError as error:

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from appliance.broker.faults import Faults
 from appliance.sockets import listen_on_path
 
 log = logging.getLogger(__name__)
@@ -43,8 +44,9 @@ class NotRunningError(ControlError):
 class Control:
     """Answers commands on a Unix socket; belongs to the event loop's thread."""
 
-    def __init__(self, path: Path, commands: Mapping[str, Command]) -> None:
+    def __init__(self, path: Path, commands: Mapping[str, Command], faults: Faults) -> None:
         self._path = path
+        self._faults = faults
         self._commands = commands
         self._server: asyncio.Server | None = None
 
@@ -75,6 +77,9 @@ class Control:
         except (OSError, asyncio.TimeoutError) as error:
             log.debug("no answer could be given: %s", error)
             writer.transport.abort()  # else the rest of it waits for a reader for ever
+        except Exception as error:
+            self._faults.caught("control.connection", error)
+            writer.transport.abort()
         finally:
             writer.close()
 
@@ -94,6 +99,9 @@ class Control:
             return {"ok": await command()}
         except ControlError as error:
             return {"error": str(error)}
+        except Exception as error:
+            self._faults.caught("control.command", error, name)
+            return {"error": f"a fault in the appliance, see its log: {type(error).__name__}"}
 
 
 def ask(path: Path, command: str, timeout: float = 30.0) -> Any:

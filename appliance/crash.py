@@ -28,6 +28,7 @@ import yaml
 
 from appliance import logs
 from appliance.amqtt_broker.guard import redacted
+from appliance.broker.faults import Faults
 from appliance.config import Settings, describe, secrets_in
 
 log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class CrashReports:
         self._wanted = folder is not None
         self._settings = settings
         self._running: int | None = None
-        self._reported = 0
+        self._reported = self._faults = 0
         secrets = secrets_in(settings.broker.plugins)
         self._secrets = [secret for secret in secrets if len(secret) >= SHORTEST_SECRET]
 
@@ -102,26 +103,47 @@ class CrashReports:
                 _write(self._running, f"{_REPORTED}{path.name}\n")
             self._close()
 
-    def watch(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Report what the loop's callbacks and tasks fail with, which does not end the process."""
-        loop.set_exception_handler(self._on_loop)
+    def watch(self, loop: asyncio.AbstractEventLoop, faults: Faults) -> None:
+        """Count, as a fault, what callbacks and tasks fail with that are no entry of ours."""
+
+        def on_loop(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+            error = context.get("exception")
+            if error is None or isinstance(error, OSError):  # those are the network's
+                loop.default_exception_handler(context)
+            else:
+                faults.caught("loop", error, context.get("message", ""))
+
+        loop.set_exception_handler(on_loop)
+
+    def fault(self, error: BaseException, what: str) -> Path | None:
+        """Report one that was contained: the run goes on, and keeps its reports of crashes."""
+        if self._faults >= OF_ONE_RUN:
+            return None
+        self._faults += 1
+        return self._write(error, what, "fault")
 
     def report(self, error: BaseException, what: str) -> Path | None:
         """Write a report of an exception; the log says where it is, and so does what returns."""
-        if self._running is None or self._reported >= OF_ONE_RUN:
+        if self._reported >= OF_ONE_RUN:
             return None
         self._reported += 1
+        path = self._write(error, what, "crash")
+        if path is not None:
+            why = redacted(f"{type(error).__name__}: {error}", self._secrets)
+            log.critical("%s: %s; the report is %s", what, why, path)
+        return path
+
+    def _write(self, error: BaseException, what: str, kind: str) -> Path | None:
+        if self._running is None:
+            return None
         lines = "".join(traceback.format_exception(error))[-LARGEST // 2 :]
         text = "\n".join(logs.recent)[-LARGEST // 4 :]
         told = f"{what}\n{lines}\n-- the last lines of the log --\n{text}\n"
         try:
-            path = self._save(_encoded(f"{self._head()}{redacted(told, self._secrets)}"))
+            return self._save(_encoded(f"{self._head()}{redacted(told, self._secrets)}"), kind)
         except OSError as failure:
             log.error("%s, and no report can be written: %s", what, failure)
             return None
-        why = redacted(f"{type(error).__name__}: {error}", self._secrets)
-        log.critical("%s: %s; the report is %s", what, why, path)
-        return path
 
     def _find_previous(self) -> Path | None:
         assert self._running is not None
@@ -156,9 +178,9 @@ class CrashReports:
             f"\n{settings}\n{_END_OF_HEAD}"
         )
 
-    def _save(self, data: bytes) -> Path:
+    def _save(self, data: bytes, kind: str = "crash") -> Path:
         moment = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
-        path = self._folder / f"crash-{moment}.txt"
+        path = self._folder / f"{kind}-{moment}.txt"
         flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC
         descriptor = os.open(path, flags, 0o600)
         try:
@@ -170,7 +192,7 @@ class CrashReports:
         finally:
             os.close(descriptor)
         # By when they were written: a clock that was set back must not delete the newest.
-        reports = sorted(self._folder.glob("crash-*.txt"), key=lambda p: p.stat().st_ctime_ns)
+        reports = sorted(self._folder.glob(f"{kind}-*.txt"), key=lambda p: p.stat().st_ctime_ns)
         for old in reports[:-KEPT]:
             old.unlink(missing_ok=True)
         return path
@@ -188,12 +210,6 @@ class CrashReports:
         if arguments.exc_value is not None:
             name = arguments.thread.name if arguments.thread else "?"
             self.report(arguments.exc_value, f"the thread {name} ended")
-
-    def _on_loop(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        loop.default_exception_handler(context)
-        error = context.get("exception")
-        if error is not None and not isinstance(error, OSError):  # those are the network's
-            self.report(error, str(context.get("message", "the event loop failed")))
 
 
 def _write(descriptor: int, data: bytes | str) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 from collections.abc import Callable
+
+from appliance.entries import Entries
 
 #: Seconds that a closed connection is listened to, and the bytes that may come.
 TIMEOUT = 2.0
@@ -21,18 +22,20 @@ class Farewell:
     nothing more will come, and what still comes in is thrown away, for a while.
     """
 
-    def __init__(self, connection: socket.socket, ended: Callable[[Farewell], None]) -> None:
+    def __init__(
+        self, connection: socket.socket, ended: Callable[[Farewell], None], entries: Entries
+    ) -> None:
         self._socket = connection
         self._ended = ended
         self._left = BYTES
-        self._loop = asyncio.get_running_loop()
-        self._timeout = self._loop.call_later(TIMEOUT, self.end)
+        self._entries = entries
+        self._timeout = entries.later("farewell.timeout", TIMEOUT, self.end, failed=self.end)
 
     def listen(self) -> None:
         """Begin; it ends by itself."""
         try:
             self._socket.shutdown(socket.SHUT_WR)
-            self._loop.add_reader(self._socket, self._discard)
+            self._entries.reader("farewell.chunk", self._socket, self._discard, failed=self.end)
         except OSError:  # the other side was quicker
             self.end()
 
@@ -51,6 +54,6 @@ class Farewell:
         """Close it; may be called twice."""
         self._timeout.cancel()
         if self._socket.fileno() >= 0:
-            self._loop.remove_reader(self._socket)
+            self._entries.loop.remove_reader(self._socket)
             self._socket.close()
         self._ended(self)

@@ -239,8 +239,9 @@ class Listeners:
     def wait_for_handshakes(self) -> None:
         """Open the doors again when a handshake has ended, or when none does for a while."""
         if self._stall is None:
-            loop = asyncio.get_running_loop()
-            self._stall = loop.call_later(HANDSHAKE_STALL, self._pass_stalled)
+            self._stall = self.network.entries.later(
+                "listener.stall", HANDSHAKE_STALL, self._pass_stalled, failed=self._open_doors
+            )
 
     def _pass_stalled(self) -> None:
         self._handshakes.clear()  # they go on, and are not counted any more
@@ -251,12 +252,15 @@ class Listeners:
             self._stall.cancel()
             self._stall = None
         for door in self._doors:
-            door.open()
+            self.broker.faults.run("listener.open", door.open, otherwise=None)
 
     async def check_certificates(self) -> None:
         """End the connections whose client's certificate is not, or no longer, accepted."""
         for number, member in enumerate(list(self.network.open)):
-            member.check_certificate()
+            try:
+                member.check_certificate()
+            except Exception as error:
+                member.fault("connection.certificate", error)
             if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
                 await asyncio.sleep(0)
 
@@ -281,7 +285,7 @@ class _Door:
     ) -> None:
         self._listeners = listeners
         self.settings = settings
-        self._loop = asyncio.get_running_loop()
+        self._entries = listeners.network.entries
         self._is_open = False
         if settings.path is not None:
             self._socket = listen_on_path(settings.path, settings.mode)
@@ -307,12 +311,19 @@ class _Door:
         """Accept what comes; does nothing when it is open, or closed for good."""
         if not self._is_open and self._socket.fileno() >= 0:
             self._is_open = True
-            self._loop.add_reader(self._socket, self._accept)
+            self._entries.reader(
+                "listener.accept", self._socket, self._accept, served=self, failed=self._pause
+            )
 
     def _shut(self) -> None:
         if self._is_open:
             self._is_open = False
-            self._loop.remove_reader(self._socket)
+            self._entries.loop.remove_reader(self._socket)
+
+    def _pause(self) -> None:
+        """Accept nothing for a while."""
+        self._shut()
+        self._entries.later("listener.reopen", ACCEPT_PAUSE, self.open, served=self)
 
     def _accept(self) -> None:
         for _ in range(ACCEPTED_A_TURN):
@@ -327,10 +338,13 @@ class _Door:
             except OSError as error:
                 # Out of file descriptors, most likely: it passes, and asking on would spin.
                 log.error("no connection can be accepted: %s", error)
-                self._shut()
-                self._loop.call_later(ACCEPT_PAUSE, self.open)
+                self._pause()
                 return
-            self._listeners.admit(connection, peer, self.settings)
+            try:
+                self._listeners.admit(connection, peer, self.settings)
+            except Exception as error:
+                self._listeners.broker.faults.caught("listener.admit", error, self)
+                connection.close()
 
     def close(self) -> None:
         """Listen no more."""

@@ -12,6 +12,7 @@ from typing import Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.entries import Entries
 from appliance.farewell import Farewell
 from appliance.mqtt.packets import Connect
 
@@ -59,6 +60,9 @@ class Member(Protocol):
     def take_turn(self) -> None:
         """The others have had their turn."""
 
+    def fault(self, entry: str, error: Exception) -> None:
+        """Count what escaped while it was served, and end it; never raises."""
+
     def close(self) -> None:
         """Write out what waits, then close."""
 
@@ -87,6 +91,7 @@ class Network:
         self.certificates = certificates
         self.authenticate = authenticate
         self.exchange = exchange
+        self.entries = Entries(asyncio.get_running_loop(), broker.faults)
         self.use(connect_timeout, publish_rate)
         self.open: set[Member] = set()
         #: What runs in the background for a connection: TLS handshakes and logins.
@@ -124,7 +129,7 @@ class Network:
         if not self._counting:
             self._counting = True
             self._effort_begun = self.broker.counters.effort
-            asyncio.get_running_loop().call_soon(self._new_round)
+            self.entries.soon("network.round", self._new_round, failed=self._new_round)
         effort = self.broker.counters.effort - self._effort_begun
         return effort > EFFORT_A_ROUND or bool(self._turns)
 
@@ -135,26 +140,36 @@ class Network:
         """Call `take_turn` when it is the member's."""
         self._turns.append(member)
         if len(self._turns) == 1:
-            asyncio.get_running_loop().call_soon(self._run_turns)
+            self._schedule_turns()
+
+    def _schedule_turns(self) -> None:
+        self.entries.soon("network.turns", self._run_turns, failed=self._schedule_turns)
 
     def _run_turns(self) -> None:
         end = self.broker.counters.effort + EFFORT_A_ROUND
         left = len(self._turns)
-        while left:
-            left -= 1
-            # Taken out after its turn, so that no entry meanwhile is the first, to be scheduled.
-            self._turns[0].take_turn()
-            self._turns.popleft()
-            if self.broker.counters.effort > end:
-                break
-        if self._turns:
-            asyncio.get_running_loop().call_soon(self._run_turns)
+        try:
+            while left:
+                left -= 1
+                member = self._turns[0]
+                try:
+                    member.take_turn()
+                except Exception as error:
+                    member.fault("connection.turn", error)
+                finally:
+                    # After its turn, so that no entry meanwhile is the first, to be scheduled.
+                    self._turns.popleft()
+                if self.broker.counters.effort > end:
+                    break
+        finally:
+            if self._turns:
+                self._schedule_turns()
 
     def in_background(self, work: Coroutine[object, object, None]) -> None:
         """Run a connection's handshake or login beside everything else."""
-        task = asyncio.get_running_loop().create_task(work)
+        task = self.entries.task("network.background", work)
         self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
+        self.entries.when_done("network.background_end", task, self.tasks.discard, task)
 
     def count_output(self, size: int) -> None:
         """So many bytes more, or less, wait to be read by a client."""
@@ -186,7 +201,7 @@ class Network:
     def part(self, connection: socket.socket) -> None:
         """Close a connection whose last bytes are on their way, see `Farewell`."""
         if len(self._farewells) < FAREWELLS:
-            farewell = Farewell(connection, self._parted)
+            farewell = Farewell(connection, self._parted, self.entries)
             self._farewells.add(farewell)
             farewell.listen()
         else:

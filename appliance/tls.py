@@ -15,6 +15,8 @@ import ssl
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
+from appliance.entries import Entries, Faulty, contained
+
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
 #: Bytes of plaintext in a record, at most (RFC 8446, section 5.1): a read of this size never leaves
@@ -46,6 +48,7 @@ async def accept(
     context: ssl.SSLContext,
     protocol: asyncio.Protocol,
     timeout: float,
+    entries: Entries,
     part: Callable[[socket.socket], None] = socket.socket.close,
 ) -> None:
     """Shake hands as the server on an accepted connection; from then on it is the protocol's.
@@ -58,7 +61,7 @@ async def accept(
         ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
         OSError: the client is gone.
     """
-    error = await TlsTransport(protocol, context, part).shake_hands(connection, timeout)
+    error = await TlsTransport(protocol, context, entries, part).shake_hands(connection, timeout)
     if error is not None:
         try:
             raise error
@@ -82,9 +85,11 @@ class TlsTransport:
         self,
         protocol: asyncio.Protocol,
         context: ssl.SSLContext,
+        entries: Entries,
         part: Callable[[socket.socket], None] = socket.socket.close,
     ) -> None:
-        self._loop = asyncio.get_running_loop()
+        self._entries = entries
+        self._loop = entries.loop
         #: The end of the handshake, and why it failed if it did.
         self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
         self._protocol = protocol
@@ -119,31 +124,45 @@ class TlsTransport:
 
     # --- the protocol of the TCP connection ----------------------------------------------------
 
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        if self._connected and self._protocol is not _NOBODY:
+            cast(Faulty, self._protocol).fault(entry, error)
+            return
+        self._entries.faults.caught(entry, error)
+        if not self._handshake.done():
+            self._handshake.set_result(ConnectionAbortedError("a fault in the appliance"))
+        self.abort()
+
+    @contained("tls.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The TCP connection is there; in TLS the client speaks first."""
         self._tcp = cast(asyncio.Transport, transport)
 
     def data_received(self, data: bytes) -> None:
         """Hand on what a chunk from the network says."""
-        if not self._open:
-            if not self._connected:
-                self._handshake_received(data)
-            return
-        parts: list[bytes] = []
-        if len(data) <= PIECE:
-            self._incoming.write(data)
-            self._read(parts)
-        else:
-            view = memoryview(data)
-            for start in range(0, len(view), PIECE):
-                self._incoming.write(view[start : start + PIECE])
+        try:
+            if not self._open:
+                if not self._connected:
+                    self._handshake_received(data)
+                return
+            parts: list[bytes] = []
+            if len(data) <= PIECE:
+                self._incoming.write(data)
                 self._read(parts)
-                if self._ended:
-                    break
-        if parts:
-            self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
-        if self._ended or self._outgoing.pending:
-            self._react()
+            else:
+                view = memoryview(data)
+                for start in range(0, len(view), PIECE):
+                    self._incoming.write(view[start : start + PIECE])
+                    self._read(parts)
+                    if self._ended:
+                        break
+            if parts:
+                self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
+            if self._ended or self._outgoing.pending:
+                self._react()
+        except Exception as error:
+            self.fault("tls.chunk", error)
 
     def _read(self, parts: list[bytes]) -> None:
         """Append the plaintext of complete records; `_ended` when none can follow them."""
@@ -204,11 +223,13 @@ class TlsTransport:
             return
         self._flush()
 
+    @contained("tls.eof")
     def eof_received(self) -> None:
         """The client has closed the TCP connection; some do so without close_notify."""
         self._ended = True
         self._react()
 
+    @contained("tls.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The TCP connection is gone."""
         self._open = False
@@ -223,11 +244,13 @@ class TlsTransport:
         if self._connected:
             protocol.connection_lost(exc or self._error)
 
+    @contained("tls.pause")
     def pause_writing(self) -> None:
         """The client reads slower than it is written to."""
         self._writable = False
         self._protocol.pause_writing()
 
+    @contained("tls.resume")
     def resume_writing(self) -> None:
         """The client has caught up."""
         self._writable = True
@@ -270,7 +293,7 @@ class TlsTransport:
         if self._tcp.is_closing():
             return
         self._open = False
-        self._deadline = self._loop.call_later(CLOSE_TIMEOUT, self._tcp.abort)
+        self._deadline = self._entries.later("tls.cut", CLOSE_TIMEOUT, self._tcp.abort)
         with contextlib.suppress(ssl.SSLError):  # it asks for the client's close_notify as well
             self._tls.unwrap()
         self._flush()
@@ -295,7 +318,7 @@ class TlsTransport:
         self._reading = True
         self._tcp.resume_reading()
         if self._ended:
-            self._loop.call_soon(self._react)
+            self._entries.soon("tls.react", self._react, failed=self.abort)
 
     def is_reading(self) -> bool:
         """Whether what arrives is handed on."""

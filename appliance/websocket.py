@@ -14,6 +14,8 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
+from appliance.entries import Entries, contained
+
 #: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
 PATH = "/mqtt"
 SUBPROTOCOLS = ("mqtt", "mqttv3.1")
@@ -67,6 +69,12 @@ class Upper(Protocol):
     def close(self) -> None:
         """Close the connection: what is below was told why."""
 
+    def abort(self) -> None:
+        """Close it at once."""
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """Count what escaped while the connection was served, and end it; never raises."""
+
 
 class WebSocket(asyncio.Transport, asyncio.Protocol):
     """A protocol to the transport below, and a transport to the `protocol` above.
@@ -78,10 +86,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     password to it by itself.
     """
 
-    def __init__(self, protocol: Upper) -> None:
+    def __init__(self, protocol: Upper, entries: Entries) -> None:
         super().__init__()
         self._protocol = protocol
-        self._loop = asyncio.get_running_loop()
+        self._entries = entries
+        self._loop = entries.loop
         self._frames = _Frames(logger=_library_log)
         #: The HTTP request, until it is complete.
         self._head = bytearray()
@@ -94,11 +103,17 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     # --- towards the transport -----------------------------------------------------------------
 
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        self._protocol.fault(entry, error)
+
+    @contained("websocket.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The connection is there; what is above may close it, and read when it is upgraded."""
         self._transport = cast(asyncio.Transport, transport)
         self._protocol.connection_made(self)
 
+    @contained("websocket.chunk")
     def data_received(self, data: bytes) -> None:
         """Hand on what the frames hold, whole or in part."""
         self._held = memoryview(bytes(self._held) + data if self._held else data)
@@ -115,8 +130,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
                 self._receive_frames(data)
             if self._held and self._loop.time() > until:
                 self._transport.pause_reading()
-                self._loop.call_soon(self._take_on)
+                self._take_later()
                 break
+
+    def _take_later(self) -> None:
+        self._entries.soon("websocket.turn", self._take_on, failed=self._protocol.abort)
 
     def _take_on(self) -> None:
         self._take()
@@ -227,11 +245,13 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if any(writes):
             self._transport.write(writes[0] if len(writes) == 1 else b"".join(writes))
 
+    @contained("websocket.pause")
     def pause_writing(self) -> None:
         """The other side reads slower than it is written to."""
         self._writing = False
         self._protocol.pause_writing()
 
+    @contained("websocket.resume")
     def resume_writing(self) -> None:
         """It has caught up."""
         self._writing = True
@@ -240,10 +260,12 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._transport.write(pong)
         self._protocol.resume_writing()
 
+    @contained("websocket.eof")
     def eof_received(self) -> bool | None:
         """The other side will send no more."""
         return self._protocol.eof_received()
 
+    @contained("websocket.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection ended, whoever ended it."""
         self._protocol.connection_lost(exc)
@@ -280,7 +302,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         """Go on with what was received meanwhile."""
         self._reading = True
         if self._held or self._frames.close_rcvd is not None:
-            self._loop.call_soon(self._take_on)
+            self._take_later()
         else:
             self._transport.resume_reading()
 

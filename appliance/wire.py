@@ -13,6 +13,7 @@ from typing import cast
 from appliance import farewell, tls
 from appliance.broker.client import Client
 from appliance.broker.ports import Exchange, Refusal, Secured
+from appliance.entries import contained
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -74,7 +75,8 @@ class ClientProtocol:
         self._ledger = network.broker.ledger
         self._counters = network.broker.counters
         self._transport: asyncio.Transport | None = None
-        self._loop = asyncio.get_running_loop()
+        self._entries = network.entries
+        self._loop = network.entries.loop
         self._client = Client(self._broker, self)
         self._closing = False
         # Input: what was received and waits, and what it waits for.
@@ -108,7 +110,16 @@ class ClientProtocol:
         #: The connection under the transport, to be closed after it.
         self._connection: socket.socket | None = None
         # Slow strangers: the whole way to the end of CONNECT has one time limit.
-        self._timeout = self._loop.call_later(network.connect_timeout, self._too_late)
+        self._timeout = self._entries.later(
+            "connection.login_timeout",
+            network.connect_timeout,
+            self._too_late,
+            served=self,
+            failed=self.abort,
+        )
+
+    def __str__(self) -> str:
+        return str(self._client)
 
     # --- the connection ------------------------------------------------------------------------
 
@@ -118,7 +129,7 @@ class ClientProtocol:
         """Take over an accepted connection, with TLS through its handshake."""
         # Not left to asyncio's own server for one reason: when a handshake fails, that would
         # say nothing, and who it was and why is what the log is asked for.
-        protocol = cast(asyncio.Protocol, WebSocket(self) if websocket else self)
+        protocol = cast(asyncio.Protocol, WebSocket(self, self._entries) if websocket else self)
         try:
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -127,13 +138,27 @@ class ClientProtocol:
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
-                timeout = self._network.connect_timeout
-                await tls.accept(connection, context, protocol, timeout, self._network.part)
+                timeout, part = self._network.connect_timeout, self._network.part
+                await tls.accept(connection, context, protocol, timeout, self._entries, part)
         except (OSError, asyncio.TimeoutError) as error:
             self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
             self._forget()
+        except Exception as error:
+            self._broker.faults.caught("connection.begin", error, self)
+            connection.close()
+            self._forget()
 
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        broker, client = self._broker, self._client
+        broker.fault(entry, error, client)
+        broker.faults.run("connection.flush", broker.flush, otherwise=None)
+        if self._transport is None:
+            client.cut_off()
+        self._forget()
+
+    @contained("connection.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)
@@ -167,7 +192,7 @@ class ClientProtocol:
         else:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
         self._broker.flush()
-        self._loop.call_later(REVOKED_TIMEOUT, self.abort)
+        self._entries.later("connection.revoked", REVOKED_TIMEOUT, self.abort, served=self)
 
     def _too_late(self) -> None:
         timeout = f"{self._network.connect_timeout:g} s"
@@ -182,9 +207,11 @@ class ClientProtocol:
         if self._broker.journal is not None:
             self._broker.journal.refused(self.address, f"{what}: {why}")
 
+    @contained("connection.eof")
     def eof_received(self) -> None:
         """The client sends no more; the transport closes."""
 
+    @contained("connection.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection ended, whoever ended it."""
         self._forget()
@@ -197,19 +224,27 @@ class ClientProtocol:
         self._ledger.now = self._loop.time()
         if not self._closing:
             self._closing = True
-            self._client.receive(bytes(self._held))
+            try:
+                self._client.receive(bytes(self._held))
+            except Exception as error:
+                self._broker.fault("connection.last_chunk", error, self._client)
         self._transport = None
         self.keep(0)
-        self._leave()
         if self._connection is not None:
             self._network.part(self._connection)
+        self._leave()
 
     def _leave(self) -> None:
         """End the client when what it said before it left is done, in as many turns as it takes."""
         if self._sends_on:
             self._sends_on = False
-            self._client.send_on()
-            self._loop.call_soon(self._leave)
+            try:
+                self._client.send_on()
+            except Exception as error:
+                self._broker.fault("connection.last_turn", error, self._client)
+            self._entries.soon(
+                "connection.leave", self._leave, served=self, failed=self._client.cut_off
+            )
             self._broker.flush()
         else:
             self._client.lost()
@@ -225,32 +260,38 @@ class ClientProtocol:
     def abort(self) -> None:
         """Close at once."""
         if self._transport is not None:
-            self._transport.abort()
+            try:
+                self._transport.abort()
+            except Exception as error:
+                self._broker.faults.caught("connection.abort", error, self)
         self._forget()
 
     # --- bytes in ------------------------------------------------------------------------------
 
     def data_received(self, data: bytes) -> None:
         """Hand the chunk to the client; then everyone is written to, once, what it caused."""
-        if len(data) > self._little and not self._in_turn:
-            data = self._receive_much(data)
-            if not data:
-                return
-        counters = self._counters
-        self._ledger.now = self._loop.time()
-        published = counters.publish_received
-        self._client.receive(data)
-        published -= counters.publish_received
-        if self._broker.unflushed:
-            self._broker.flush()
-        if published:  # so many less than none
-            self._countdown += published
-            if self._countdown <= 0:
-                self._check_publisher()
-        if self._slow is not None and self._output_size() > self._output_limit:
-            # It asks on, and does not read the answers.
-            self._choked = True
-            self._pause_reading()
+        try:
+            if len(data) > self._little and not self._in_turn:
+                data = self._receive_much(data)
+                if not data:
+                    return
+            counters = self._counters
+            self._ledger.now = self._loop.time()
+            published = counters.publish_received
+            self._client.receive(data)
+            published -= counters.publish_received
+            if self._broker.unflushed:
+                self._broker.flush()
+            if published:  # so many less than none
+                self._countdown += published
+                if self._countdown <= 0:
+                    self._check_publisher()
+            if self._slow is not None and self._output_size() > self._output_limit:
+                # It asks on, and does not read the answers.
+                self._choked = True
+                self._pause_reading()
+        except Exception as error:
+            self.fault("connection.chunk", error)
 
     def _receive_much(self, data: bytes) -> bytes:
         """Let who sends much wait where that is due; returns what is to be taken in now."""
@@ -295,7 +336,9 @@ class ClientProtocol:
         """Read nothing for so long."""
         if self._resting is not None:
             self._resting.cancel()
-        self._resting = self._loop.call_later(seconds, self._rested)
+        self._resting = self._entries.later(
+            "connection.rested", seconds, self._rested, served=self, failed=self.abort
+        )
         self._pause_reading()
 
     def _rested(self) -> None:
@@ -330,7 +373,7 @@ class ClientProtocol:
             portion = bytes(self._held[: self._network.portion])
             self._held = self._held[self._network.portion :]
             self._in_turn = True
-            self.data_received(portion)
+            self.data_received(portion)  # which never raises
             self._in_turn = False
             self._read_later()
         else:
@@ -416,7 +459,7 @@ class ClientProtocol:
             self._client.output.writable = False
             # From here on its output grows by what it is answered only, and by no more than this.
             self._output_limit = size + limit
-            self._slow = self._loop.call_later(SLOW_AFTER, self._tell_slow)
+            self._slow = self._entries.later("connection.slow", SLOW_AFTER, self._tell_slow)
 
     def _tell_slow(self) -> None:
         self._broker.complaints.tell(
@@ -427,11 +470,13 @@ class ClientProtocol:
             self._output_size(),
         )
 
+    @contained("connection.pause")
     def pause_writing(self) -> None:
         """The client reads slower than it is written to."""
         self._paused = True
         self._count_output()
 
+    @contained("connection.resume")
     def resume_writing(self) -> None:
         """It has caught up."""
         self._paused = False
@@ -463,14 +508,17 @@ class ClientProtocol:
         self._network.in_background(self._log_in(connect))
 
     async def _log_in(self, connect: Connect) -> None:
-        who = await self._network.authenticate(connect, self.address, self._tls)
-        self._logging_in = False
-        if isinstance(who, Refusal):
-            self._client.refuse(who.code, who.reason)
-        else:
-            self._client.accept(who.username)
-        self._broker.flush()
-        self._read_on()
+        try:
+            who = await self._network.authenticate(connect, self.address, self._tls)
+            self._logging_in = False
+            if isinstance(who, Refusal):
+                self._client.refuse(who.code, who.reason)
+            else:
+                self._client.accept(who.username)
+            self._broker.flush()
+            self._read_on()
+        except Exception as error:
+            self.fault("connection.login", error)
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered.
@@ -570,7 +618,7 @@ class ClientProtocol:
             return
         self._closing = True
         self._timeout.cancel()
-        self._timeout = self._loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
+        self._timeout = self._entries.later("connection.cut", CLOSE_TIMEOUT, self._transport.abort)
         if self._waiting:
             self._pause_reading()
         else:
@@ -580,7 +628,9 @@ class ClientProtocol:
         assert self._transport is not None
         if not self._transport.get_write_buffer_size():
             self._timeout.cancel()
-            self._timeout = self._loop.call_later(farewell.TIMEOUT, self._transport.abort)
+            self._timeout = self._entries.later(
+                "connection.cut", farewell.TIMEOUT, self._transport.abort
+            )
         if self._connection is None and not self._transport.is_closing():
             # A transport closes its socket as soon as it has written: of that only a copy is left.
             with contextlib.suppress(OSError):
@@ -625,4 +675,7 @@ class _Gone:
         return False
 
     def close(self) -> None:
+        """It is closed."""
+
+    def abort(self) -> None:
         """It is closed."""

@@ -50,6 +50,7 @@ def broker_limits(settings: Settings) -> Limits:
         inflight=limits.inflight,
         sessions=limits.sessions,
         subscriptions=limits.subscriptions,
+        client_id_length=limits.client_id_length,
         topic_length=limits.topic_length,
         topic_levels=limits.topic_levels,
         retained_messages=limits.retained_messages,

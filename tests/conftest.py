@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import uuid
 from collections.abc import Generator, Iterator
@@ -40,6 +41,28 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The one that takes minutes goes first, or the others' workers end up waiting for it."""
     items.sort(key=lambda item: item.path.name != "test_compiled.py")
+
+
+class Escaped(logging.Handler):
+    """The faults of the appliance that were caught where they entered, and so fail no test."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.told.append(logging.Formatter().format(record))
+
+
+@pytest.fixture(autouse=True)
+def escaped() -> Iterator[list[str]]:
+    """What was caught like that; a test that means it to happen empties the list."""
+    handler = Escaped()
+    log = logging.getLogger("appliance.broker.faults")
+    log.addHandler(handler)
+    yield handler.told
+    log.removeHandler(handler)
+    assert not handler.told, "\n".join(handler.told)
 
 
 @pytest.fixture(scope="session")

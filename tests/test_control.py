@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from appliance import control
+from appliance.broker.faults import Faults
 from appliance.control import Control, ControlError, NotRunningError, ask
 
 
@@ -27,7 +28,7 @@ async def path(request, tmp_path: Path):
     place = tmp_path / ("x" * 120 if request.param == "long" else "s")
     place.mkdir()
     path = place / "control.sock"
-    served = Control(path, {"answer": answer, "refuse": refuse})
+    served = Control(path, {"answer": answer, "refuse": refuse}, Faults())
     await served.start()
     yield path
     await served.stop()
@@ -86,7 +87,7 @@ async def test_who_does_not_read_is_not_waited_for_for_ever(tmp_path, monkeypatc
     def open_files():
         return len(list(Path("/proc/self/fd").iterdir()))
 
-    served = Control(tmp_path / "s", {"talk": talk})
+    served = Control(tmp_path / "s", {"talk": talk}, Faults())
     await served.start()
     before = open_files()
     with socket.socket(socket.AF_UNIX) as connection:
@@ -102,7 +103,7 @@ async def test_who_does_not_read_is_not_waited_for_for_ever(tmp_path, monkeypatc
 
 async def test_a_second_appliance_does_not_take_the_place_of_the_first(path):
     with pytest.raises(OSError, match="another process listens"):
-        await Control(path, {}).start()
+        await Control(path, {}, Faults()).start()
     assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
 
 
@@ -114,7 +115,8 @@ async def test_none_is_running(tmp_path):
         gone.bind(str(left))
     with pytest.raises(NotRunningError):
         ask(left, "answer")
-    served = Control(left, {"answer": answer})  # what one that was killed has left is no obstacle
+    # What one that was killed has left is no obstacle.
+    served = Control(left, {"answer": answer}, Faults())
     await served.start()
     assert await asyncio.to_thread(ask, left, "answer") == {"n": 1}
     await served.stop()

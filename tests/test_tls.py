@@ -23,6 +23,8 @@ from hypothesis import strategies as st
 from waiting import PATIENCE, until
 
 from appliance import certs, tls
+from appliance.broker.faults import Faults
+from appliance.entries import Entries
 from appliance.tls import RECORD_SIZE, TlsTransport
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
@@ -33,8 +35,16 @@ ALERT = 0x15  # the record's type (RFC 8446, section 5.1)
 OWN = tls.accept
 
 
+def entries() -> Entries:
+    return Entries(asyncio.get_running_loop(), Faults())
+
+
 async def asyncios(
-    connection: socket.socket, context: ssl.SSLContext, protocol: asyncio.Protocol, timeout: float
+    connection: socket.socket,
+    context: ssl.SSLContext,
+    protocol: asyncio.Protocol,
+    timeout: float,
+    entries: Entries,
 ) -> None:
     """The same with the loop's own transport."""
     await asyncio.get_running_loop().connect_accepted_socket(
@@ -250,7 +260,7 @@ class House:
         served = Served(on_data)
         self.all.append(served)
         shaking = asyncio.ensure_future(caller.shake_hands(behind))
-        await accept(accepted, self.server, served, PATIENCE)
+        await accept(accepted, self.server, served, PATIENCE, entries())
         await shaking
         return caller, served
 
@@ -447,7 +457,7 @@ async def refused(house: House, accepted: socket.socket, timeout: float = PATIEN
     """What `accept` raises; the protocol must not have heard of the connection."""
     served = Served()
     with pytest.raises((OSError, asyncio.TimeoutError)) as caught:
-        await tls.accept(accepted, house.server, served, timeout)
+        await tls.accept(accepted, house.server, served, timeout, entries())
     accepted.close()
     assert not served.heard
     return caught.value
@@ -509,7 +519,9 @@ async def test_a_handshake_that_is_cut_off(house: House, part, reset):
     caller, accepted = await house.dial()
     hello = caller.step()
     served = Served()
-    accepting = asyncio.ensure_future(tls.accept(accepted, house.server, served, PATIENCE))
+    accepting = asyncio.ensure_future(
+        tls.accept(accepted, house.server, served, PATIENCE, entries())
+    )
     await caller.put(hello[: int(part * len(hello))])
     await turns()
     if reset:
@@ -534,7 +546,9 @@ async def test_a_handshake_that_never_ends(house: House, part):
 async def test_accepting_can_be_cancelled(house: House):
     caller, accepted = await house.dial()
     served = Served()
-    accepting = asyncio.ensure_future(tls.accept(accepted, house.server, served, PATIENCE))
+    accepting = asyncio.ensure_future(
+        tls.accept(accepted, house.server, served, PATIENCE, entries())
+    )
     await caller.put(caller.step())
     await caller.get()
     accepting.cancel()
@@ -708,7 +722,7 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
         served = Served()
         both_ends.append(weakref.ref(served))
         with contextlib.suppress(OSError, asyncio.TimeoutError):
-            await tls.accept(accepted, house.server, served, timeout)
+            await tls.accept(accepted, house.server, served, timeout, entries())
             if end.startswith("closed"):
                 served.transport.write(bytes(4 * MIB if end == "closed unread" else 10))
                 served.transport.close()
@@ -770,7 +784,7 @@ async def test_new_keys_and_a_refused_renegotiation(server, directory, version, 
     served = Served(echo)
     try:
         accepted, _ = await asyncio.get_running_loop().sock_accept(listening)
-        await tls.accept(accepted, server, served, PATIENCE)
+        await tls.accept(accepted, server, served, PATIENCE, entries())
         process.stdin.write(b"before\n")
         assert await asyncio.wait_for(process.stdout.readline(), PATIENCE) == b"before\n"
         process.stdin.write(command.encode() + b"\n")
@@ -880,7 +894,7 @@ async def test_any_split_of_the_bytes_says_the_same(server, client, sizes, cuts,
     seen = []
     for split in (False, True):
         served, network = Served(), Network()
-        transport = TlsTransport(served, server)
+        transport = TlsTransport(served, server, entries())
         transport.connection_made(network)  # type: ignore[arg-type]
         with socket.socket() as unused:
             caller = Caller(unused, client)

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.complaints import Complaints
+from appliance.broker.faults import Faults
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import (
@@ -55,6 +56,12 @@ class Ticking(Protocol):
     def resume(self) -> None:
         """The store keeps again what is to be kept."""
 
+    def fault(self) -> None:
+        """End the connection, as a fault arose with it."""
+
+    def cut_off(self) -> None:
+        """Cut it, as not even its end went well; never raises."""
+
 
 class Flushing(Protocol):
     """What a network client is sent, as the flush and the commits see it."""
@@ -90,7 +97,9 @@ class Broker:
         self.limits = limits or Limits()
         self.features = features or Features()
         self.complaints = Complaints()
-        self.ledger = Ledger(self.limits, store)
+        #: What escaped somewhere, and was caught where it entered.
+        self.faults = Faults(self.complaints)
+        self.ledger = Ledger(self.limits, store, faults=self.faults)
         #: What the broker counts.
         self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
@@ -154,7 +163,7 @@ class Broker:
             if owner is None or owner.username != identity.username:
                 raise ProtocolError(
                     ReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
-                    f"client id '{identity.client_id}' belongs to {session}",
+                    f"client id {quote(identity.client_id)} belongs to {session}",
                 )
             if session.link is not None:  # [MQTT-3.1.4-3], v3.1.1 [MQTT-3.1.4-2]
                 session.close_link(ReasonCode.SESSION_TAKEN_OVER, f"taken over by {identity}")
@@ -250,7 +259,7 @@ class Broker:
 
     def _tell_departure(self, session: Session) -> None:
         for told in tuple(self.departures):
-            told(session)
+            self.faults.run("broker.departure", told, session, otherwise=None)
 
     def _end(self, session: Session) -> None:
         """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
@@ -297,7 +306,17 @@ class Broker:
         session.will_at = None
         if will is None:
             return
-        message = will.message
+        try:
+            self._publish_late(will.message, session)
+        except ProtocolError as error:  # the limits are not what they were at its CONNECT
+            self.counters.publish_dropped += 1
+            self.complain(session, "its will cannot be published: %s", error)
+        except Exception as error:
+            self.counters.publish_dropped += 1
+            self.faults.caught("broker.will", error, session)
+
+    def _publish_late(self, message: Message, session: Session) -> None:
+        """Publish a will; its time to expire begins only now."""
         if message.properties and Property.MESSAGE_EXPIRY_INTERVAL in message.properties:
             message.expires_at = self.now + int(
                 message.properties[Property.MESSAGE_EXPIRY_INTERVAL]  # type: ignore[arg-type]
@@ -387,7 +406,11 @@ class Broker:
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
-            if session.deliver(message, qos, retain and as_published, subscription_ids):
+            try:
+                delivered = session.deliver(message, qos, retain and as_published, subscription_ids)
+            except Exception as error:  # it is this receiver who misses it, and nobody else
+                delivered = self._not_delivered(session, error)
+            if delivered:
                 taken = True
             elif qos:
                 if self.ledger.refusing and session.persistent:
@@ -419,7 +442,15 @@ class Broker:
         session, qos, as_published, subscription_ids = target
         qos = min(qos, message.qos)
         retain = message.retain and as_published
-        return session.deliver(message, qos, retain, subscription_ids, share) or not qos
+        try:
+            return session.deliver(message, qos, retain, subscription_ids, share) or not qos
+        except Exception as error:
+            return self._not_delivered(session, error)
+
+    def _not_delivered(self, session: Session, error: Exception) -> bool:
+        self.counters.publish_dropped += 1
+        self.faults.caught("broker.delivery", error, session)
+        return False
 
     def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
@@ -456,16 +487,18 @@ class Broker:
         """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
 
         `age` is in seconds from its coming.
-
-        Raises:
-            ProtocolError: the topic is not valid.
         """
         message, full, _ = held
         if age > LATE:
             message = Late(message, age)
         if self.ledger.has_expired(message):
             return
-        route = self.router.route(origin, message.topic_wire)
+        try:
+            route = self.router.route(origin, message.topic_wire)
+        except ProtocolError as error:  # the limits are not what they were at its PUBREC
+            self.counters.publish_dropped += 1
+            self.complain(origin, "its message cannot be published: %s", error)
+            return
         targets: list[Target] = []
         for target in route.targets:
             session, qos, as_published, ids = target
@@ -558,7 +591,7 @@ class Broker:
             if not session.fits(subscription_size(topic_filter)):
                 reason = "no memory for it (broker.limits.queue_bytes, broker.limits.memory)"
                 return ReasonCode.QUOTA_EXCEEDED, reason
-        decision = self.router.access.decide(session.identity, Action.SUBSCRIBE, topic_filter)
+        decision = self.router.decide(session.identity, Action.SUBSCRIBE, topic_filter)
         if not decision:
             return ReasonCode.NOT_AUTHORIZED, decision.reason
         return None
@@ -638,12 +671,17 @@ class Broker:
         others. Between two ticks `ledger.now` may be moved on, so that what begins then is not cut
         short.
         """
-        self.ledger.now = now
-        self.complaints.tick(now)
-        self.retained.expire(now)
+        faults = self.faults
+        self.ledger.now = faults.now = now
+        faults.run("clock.complaints", self.complaints.tick, now, otherwise=None)
+        faults.run("clock.retained", self.retained.expire, now, otherwise=None)
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
-            left -= client.tick(now)
+            try:
+                left -= client.tick(now)
+            except Exception as error:
+                self.fault("clock.keep_alive", error, client)
+                left -= 1
             if not left:
                 self.flush()
                 return now
@@ -653,15 +691,38 @@ class Broker:
             # Entries are never removed early: one that no longer holds is passed over here.
             if session.link is not None or self.sessions.get(session.client_id) is not session:
                 continue
-            if session.will_at is not None and session.will_at <= now:
-                self._publish_will(session)
-                self.store.session_saved(session)
-            if session.ends_at is not None and session.ends_at <= now:
-                log.info("%s: the session expired", session)
-                self.counters.sessions_expired += 1
-                self._end(session)
+            try:
+                self._fall_due(session, now)
+            except Exception as error:
+                faults.caught("clock.session", error, session)
         self.flush()
         return self._deadlines[0][0] if self._deadlines else math.inf
+
+    def _fall_due(self, session: Session, now: float) -> None:
+        """Publish an absent client's will, or end its session, if it is time for that."""
+        if session.will_at is not None and session.will_at <= now:
+            self._publish_will(session)
+            self.store.session_saved(session)
+        if session.ends_at is not None and session.ends_at <= now:
+            log.info("%s: the session expired", session)
+            self.counters.sessions_expired += 1
+            self._end(session)
+
+    # --- faults --------------------------------------------------------------------------------
+
+    def fault(self, entry: str, error: Exception, client: Ticking) -> None:
+        """Count what escaped at an entry, and end the connection that it arose with."""
+        self.faults.caught(entry, error, client)
+        try:
+            client.fault()
+        except Exception as second:
+            self.faults.caught("broker.end", second, client)
+            client.cut_off()
+
+    def _abandon(self, entry: str, error: Exception, output: Flushing) -> None:
+        """The same, with a connection whose output cannot be relied on any more."""
+        self.faults.caught(entry, error, output)
+        self.faults.run("broker.abandon", output.abandon, otherwise=None)
 
     # --- bytes out, and the commits that they wait for -----------------------------------------
 
@@ -672,9 +733,7 @@ class Broker:
         """
         overflowed = self.ledger.overflowed
         while overflowed:
-            overflowed.pop().close_link(
-                ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
-            )
+            self.faults.run("flush.overflow", self._close_full, overflowed.pop(), otherwise=None)
         if not self.unflushed:
             # Such as a retained message of the bridge's that had to queue: what a client is sent
             # later does not depend on it.
@@ -686,7 +745,15 @@ class Broker:
             if self.store.staged:
                 outputs = self._hold_back(outputs)
             for output in outputs:
-                output.flush()
+                try:
+                    output.flush()
+                except Exception as error:
+                    self._abandon("flush", error, output)
+
+    def _close_full(self, session: Session) -> None:
+        session.close_link(
+            ReasonCode.QUOTA_EXCEEDED, "its queue is full (broker.limits.queue_full)"
+        )
 
     def _hold_back(self, outputs: list[Flushing]) -> list[Flushing]:
         """Let those wait whose bytes depend on what is not committed; returns the others."""
@@ -694,19 +761,28 @@ class Broker:
         committed = self.store.committed
         free: list[Flushing] = []
         for output in outputs:
-            if output.wait(committed):
-                self._waiting[output] = None
-            else:
-                free.append(output)
+            try:
+                if output.wait(committed):
+                    self._waiting[output] = None
+                else:
+                    free.append(output)
+            except Exception as error:
+                self._abandon("flush.wait", error, output)
         if self._waiting:
             self.store.hurry()
         return free
 
     def _committed(self, kept: bool) -> None:
         waiting, self._waiting = self._waiting, {}
+        faults = self.faults
         if kept:
             committed = self.store.committed
-            self._waiting = {output: None for output in waiting if output.release(committed)}
+            for output in waiting:
+                try:
+                    if output.release(committed):
+                        self._waiting[output] = None
+                except Exception as error:
+                    self._abandon("commit.release", error, output)
             if self.ledger.failing:
                 self._recover()
         else:
@@ -715,7 +791,7 @@ class Broker:
                 for session in self.sessions.values():
                     session.hold_back()
             for output in waiting:
-                output.abandon()
+                faults.run("commit.abandon", output.abandon, otherwise=None)
         if self._waiting:
             self.store.hurry()
         self.flush()
@@ -724,9 +800,12 @@ class Broker:
         """What had to wait for the store can go on."""
         self.ledger.failing = self.ledger.refusing = False
         for client in tuple(self.clients):
-            client.resume()
-        for session in self.sessions.values():
-            session.go_on()
+            try:
+                client.resume()
+            except Exception as error:
+                self.fault("commit.resume", error, client)
+        for session in tuple(self.sessions.values()):
+            self.faults.run("commit.go_on", session.go_on, otherwise=None)
 
     def close(self, close: Callable[[Session], None]) -> None:
         """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""
@@ -734,5 +813,5 @@ class Broker:
             if session.link is not None:
                 session.set_will(None)
                 if session.identity is not None:
-                    close(session)
+                    self.faults.run("stop.session", close, session, otherwise=None)
         self.flush()

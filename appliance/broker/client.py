@@ -20,7 +20,7 @@ from appliance.broker.handshake import (
 )
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Late, Message
-from appliance.broker.output import CANNOT_KEEP, Output
+from appliance.broker.output import CANNOT_KEEP, Output, in_words
 from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
 from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
@@ -413,6 +413,14 @@ class Client:
         self.output.maximum_packet_size = maximum_packet_size(packet)
         properties = packet.properties or {}
         properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
+        longest = self.broker.limits.client_id_length
+        size = len(packet.client_id.encode())
+        if size > longest:  # [MQTT-3.1.3-9], 3.1.1 [MQTT-3.1.3-9]
+            reason = (
+                f"its id has {size} bytes, more than {longest} (broker.limits.client_id_length)"
+            )
+            self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, reason)
+            return
         if not packet.client_id and not packet.clean_start and packet.version != 5:
             # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
@@ -624,6 +632,33 @@ class Client:
         else:
             self._leave(str(error), publish_will=True)
 
+    def fault(self) -> None:
+        """Something went wrong in here: tell the client so (0x83), and end its connection."""
+        if self._closed:
+            return
+        code = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
+        if self.session is not None:
+            self._end(code, "a fault in the appliance")
+            return
+        if self.connection.version == 5:
+            self.output.version = 5
+            self._send(Connack(False, code))
+        self._shut()
+
+    def cut_off(self) -> None:
+        """Cut the connection, as not even its end went well; nothing refers to it any more."""
+        self._closed = True
+        self._work = None
+        self.broker.clients.discard(self)
+        session = self.session
+        if session is not None and session.link is self.output:
+            try:
+                self.broker.disconnect(session, self.output, publish_will=True)
+            except Exception as error:
+                self.broker.faults.caught("client.cut_off", error, self)
+                session.link = None
+        self.wire.abort()
+
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
         log.info("%s: connection closed: %s", self, message)
@@ -631,8 +666,7 @@ class Client:
 
     def _end(self, reason: ReasonCode, message: str) -> None:
         if self._version == 5:
-            words: Properties = {Property.REASON_STRING: message}
-            self._send(Disconnect(reason, words if self.output.explains else None))
+            self._send(Disconnect(reason, in_words(message) if self.output.explains else None))
         self._leave(message, publish_will=True)
 
     def _complain(self, message: str, *args: object) -> None:

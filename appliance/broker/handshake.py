@@ -11,6 +11,9 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
+#: Bytes of a string, at most (5.0 section 1.5.4).
+LONGEST_STRING = 0xFFFF
+
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
@@ -90,7 +93,8 @@ def connack_properties(
     if asked and features.response_information:  # [MQTT-3.1.2-28]
         information = features.response_information.replace("%c", identity.client_id)
         information = information.replace("%u", identity.username or "")
-        properties[Property.RESPONSE_INFORMATION] = information
+        if len(information.encode()) <= LONGEST_STRING:  # a user name may be that long by itself
+            properties[Property.RESPONSE_INFORMATION] = information
     properties |= authentication
     if limits.packet_size < USUAL_PACKET_SIZE:
         properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size

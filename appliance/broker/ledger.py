@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from appliance.broker.faults import Faults
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits, Store
 
@@ -58,6 +59,7 @@ class Ledger:
     limits: Limits
     store: Store
     counters: Counters = field(default_factory=Counters)
+    faults: Faults = field(default_factory=Faults)
     #: Seconds of the clock that `Broker.tick` was last given.
     now: float = 0.0
     #: Bytes that the queues, subscriptions and wills of all sessions hold, and the output buffers.

@@ -19,6 +19,10 @@ OVERHEAD = 512
 PAIR_OVERHEAD = 160
 
 
+#: The longest interval that a property can name, in seconds. More may be left of it than was asked
+#: for, as the clock of a restored message may have gone back.
+LONGEST_INTERVAL = 0xFFFF_FFFF
+
 #: Payloads from this size on, in bytes, are not kept a second time while a message waits.
 LARGE = 1024
 
@@ -162,7 +166,7 @@ class Message:
             before[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
         properties = encode_property_list(before) + self._properties_of_all()
         if self.expires_at is not None:
-            left = max(0, round(self.expires_at - now))
+            left = round(min(max(0.0, self.expires_at - now), LONGEST_INTERVAL))
             properties += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: left})
         body = self.topic_wire if named else b"\0\0"
         if first & 0x06:

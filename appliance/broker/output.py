@@ -9,7 +9,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Wire
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubrec, Suback
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
@@ -22,6 +22,16 @@ _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
 #: Why a message is refused while the store cannot take it.
 CANNOT_KEEP = "it cannot be stored: see the log of the store"
+
+
+#: Characters of a reason string: there may be a topic in it, as long as a string can be.
+LONGEST_REASON = 256
+
+
+def in_words(reason: str) -> Properties:
+    """The reason string of an answer; what no string of MQTT may have in it is left out."""
+    text = reason if len(reason) <= LONGEST_REASON else reason[: LONGEST_REASON - 1] + "…"
+    return {Property.REASON_STRING: text.encode(errors="replace").decode().replace("\0", "")}
 
 
 class Talker(Protocol):
@@ -70,6 +80,9 @@ class Output:
         #: Whether a packet may go out as it came in from another client.
         self._mirrors = True
         self._closed = False
+
+    def __str__(self) -> str:
+        return str(self._client or self.session or "a client")
 
     def open(self, session: Session, aliases: int, *, explains: bool) -> None:
         """The client has logged in: send it what its session has, with so many topic aliases."""
@@ -239,7 +252,7 @@ class Output:
         if code:
             if self.version == 5:
                 if code >= 0x80 and self.explains and reason:
-                    self.send(_REFUSALS[first](packet_id, code, {Property.REASON_STRING: reason}))
+                    self.send(_REFUSALS[first](packet_id, code, in_words(reason)))
                     return
                 packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
             elif code == ReasonCode.QUOTA_EXCEEDED and self._ledger.refusing:
@@ -333,9 +346,11 @@ class Output:
         """Close without sending what waits: what it would acknowledge could not be kept."""
         self._waiting.clear()
         self._out.clear()
-        if self._client is not None:
-            self._client.lost()
-        self.wire.close()
+        try:
+            if self._client is not None:
+                self._client.lost()
+        finally:
+            self.wire.close()
 
     def resume_writing(self) -> None:
         """The network takes bytes again: send what waited."""

@@ -311,6 +311,9 @@ class Wire(Protocol):
     def close(self) -> None:
         """Write what was written so far, then close."""
 
+    def abort(self) -> None:
+        """Close at once; never raises."""
+
 
 class Journal(Protocol):
     """Told of who comes, who is refused, and who leaves: an audit log. Not of messages."""
@@ -367,6 +370,7 @@ class Limits:
     keep: int = 0
     inflight: int = 20
     subscriptions: int = 1000
+    client_id_length: int = 1024
     topic_length: int = 65535
     topic_levels: int = 201
     retained_messages: int = 100_000

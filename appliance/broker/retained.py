@@ -121,4 +121,4 @@ class Retained:
             left -= 1
             _, _, message = heapq.heappop(self._expiring)
             if self._messages.get(message.topic) is message:
-                self.delete(message.topic)
+                self._ledger.faults.run("clock.expiry", self.delete, message.topic, otherwise=None)

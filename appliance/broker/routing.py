@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.ledger import Ledger
-from appliance.broker.ports import Access, Action, Decision, Guard
+from appliance.broker.ports import Access, Action, Decision, Guard, Identity
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target
 from appliance.mqtt.codec import decode_string
@@ -27,6 +27,7 @@ CACHED_IN_ALL = 500_000
 ROUTE_EFFORT = 20
 
 _ALLOWED = Decision(True, "the appliance itself")
+_FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
 
 
 @dataclass(slots=True)
@@ -61,6 +62,7 @@ class Router:
         self.shares: dict[str, Share] = {}
         self._ledger = ledger
         self._counters = ledger.counters
+        self._faults = ledger.faults
         self._sessions = sessions
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
             SubscriptionTree()
@@ -136,7 +138,10 @@ class Router:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         decision = self._may_publish(session, topic)
         if decision and topic in self.guards:
-            verdicts = [guard.decide(session) for guard in self.guards[topic]]
+            verdicts = [
+                self._faults.run("broker.guard", guard.decide, session, otherwise=_FAULT)
+                for guard in self.guards[topic]
+            ]
             decision = next((verdict for verdict in verdicts if not verdict), decision)
         matches = self._subscriptions.match(topic) if decision else []
         self._counters.effort += ROUTE_EFFORT + len(matches)
@@ -152,7 +157,13 @@ class Router:
         if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
             reason = "topics that begin with $ are the broker's own"
             return Decision(False, reason)
-        return self.access.decide(session.identity, Action.PUBLISH, topic)
+        return self.decide(session.identity, Action.PUBLISH, topic)
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        """What the rules in force say; when that ends in a fault, it is not allowed."""
+        return self._faults.run(
+            "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
+        )
 
     def excess(self, topic: str) -> str:
         """What the topic or filter has too much of, if anything."""
@@ -218,7 +229,7 @@ class Router:
             session.readable_epoch = self.access.epoch
         allowed = readable.get(topic)
         if allowed is None:
-            decision = self.access.decide(session.identity, Action.RECEIVE, topic)
+            decision = self.decide(session.identity, Action.RECEIVE, topic)
             allowed = decision.allowed
             if len(topic) <= CACHED_TOPIC and not decision.pending:
                 readable[topic] = allowed
@@ -232,4 +243,4 @@ class Router:
         """
         if session.identity is None or self.may_receive(session, topic):
             return True
-        return self.access.decide(session.identity, Action.RECEIVE, topic).pending
+        return self.decide(session.identity, Action.RECEIVE, topic).pending

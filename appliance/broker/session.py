@@ -334,8 +334,11 @@ class Session:
             message, qos, retain, subscription_ids, _ = delivery
             if self._is_forbidden(message):
                 self.give_up(packet_id)
-            else:
+                continue
+            try:
                 link.publish(message, qos, packet_id, True, retain, subscription_ids)
+            except Exception as error:
+                self._cannot_be_sent(error, packet_id)
 
     def _pump_replays(self, link: Link) -> bool:
         """Send retained messages; False when there are more than one turn is for."""
@@ -352,9 +355,13 @@ class Session:
                     if self.expiry and needs_window:
                         self.ledger.store.subscribed(self, self.subscriptions[topic_filter])
                     break
+                except Exception as error:
+                    self.ledger.faults.caught("session.replay", error, self)
+                    del self.replays[topic_filter]
+                    break
                 if delivery is None:
                     continue
-                message, qos, retain, subscription_ids, _ = delivery
+                message, qos, _, _, _ = delivery
                 if (
                     self.inflight and not self.fits(message.size)
                     if qos
@@ -366,7 +373,7 @@ class Session:
                 if qos:
                     self._send(link, delivery)
                 else:
-                    link.publish(message, 0, 0, False, retain, subscription_ids)
+                    self._publish(link, delivery)
         return True
 
     def _pump_queue(self, link: Link) -> None:
@@ -448,23 +455,42 @@ class Session:
         while packet_id in inflight:  # [MQTT-2.2.1-3]
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
+        self.bytes += message.size
+        self.ledger.queued_bytes += message.size
         inflight[packet_id] = delivery
         if self.expiry:
             self._staged()
             self.ledger.store.sent(self, delivery, packet_id)
-        self.bytes += message.size
-        self.ledger.queued_bytes += message.size
-        link.publish(message, qos, packet_id, False, retain, subscription_ids)
+        try:
+            link.publish(message, qos, packet_id, False, retain, subscription_ids)
+        except Exception as error:
+            self._cannot_be_sent(error, packet_id)
+
+    def _publish(self, link: Link, delivery: Delivery) -> None:
+        """Send what waited, and is of QoS 0."""
+        message, _, retain, subscription_ids, _ = delivery
+        try:
+            link.publish(message, 0, 0, False, retain, subscription_ids)
+        except Exception as error:
+            self._cannot_be_sent(error)
+
+    def _cannot_be_sent(self, error: Exception, packet_id: int = 0) -> None:
+        """A fault: the message is given up, so that it stands in nobody's way, at no later try."""
+        self.ledger.counters.publish_dropped += 1
+        self.ledger.faults.caught("session.send", error, self)
+        if packet_id:
+            self.give_up(packet_id)
 
     def _pump_latest(self, link: Link) -> None:
         while link.writable and (waiting := self.latest or self.large):
             oldest = next(iter(waiting))
             if waiting is self.large and link.is_behind():
                 return
-            message, _, retain, subscription_ids, _ = waiting.pop(oldest)
+            delivery = waiting.pop(oldest)
+            message = delivery[0]
             self._uncount(message)
             if not (self.ledger.has_expired(message) or self._is_forbidden(message)):
-                link.publish(message, 0, 0, False, retain, subscription_ids)
+                self._publish(link, delivery)
 
     def _is_forbidden(self, message: Message) -> bool:
         """Whether rules that have changed meanwhile no longer let the client have it; counted."""

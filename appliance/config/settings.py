@@ -152,6 +152,7 @@ class Limits(_Section):
     inflight: Annotated[int, Field(ge=1, le=65535)] = 20
     sessions: Count = 10_000
     subscriptions: Count = 1000
+    client_id_length: Annotated[Size, Field(ge=23, le=65535)] = 1024
     topic_length: Annotated[Size, Field(ge=1, le=65535)] = 65535
     topic_levels: Annotated[int, Field(ge=1, le=32768)] = 201
     retained_messages: Annotated[int, Field(ge=0)] = 100_000

@@ -30,6 +30,7 @@ from typing import Any, Literal
 
 from appliance.broker.message import Message
 from appliance.broker.session import Session
+from appliance.entries import Entries
 from appliance.mqtt.codec import Properties, Property
 from appliance.ros import goals
 from appliance.ros.calls import (
@@ -123,12 +124,13 @@ class _Goal:
 class _Tasks:
     """Tasks that nobody waits for, kept until they end."""
 
+    entries: Entries
     running: set[asyncio.Task[None]] = field(default_factory=set)
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
+        task = self.entries.task("actions.task", work)
         self.running.add(task)
-        task.add_done_callback(self.running.discard)
+        self.entries.when_done("actions.end", task, self.running.discard, task)
 
     async def stop(self) -> None:
         for task in self.running:
@@ -145,7 +147,7 @@ class ActionRoutes:
         requests: Requests,
         converters: Converters,
         node: RosNode,
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         post: Callable[..., None],
         mailbox: Mailbox,
     ) -> None:
@@ -153,7 +155,6 @@ class ActionRoutes:
         self._requests = requests
         self._converters = converters
         self._node = node
-        self._loop = loop
         self._post = post
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
@@ -162,7 +163,7 @@ class ActionRoutes:
         self._past: list[Action] = []
         #: Actions that patterns speak of and do not take.
         self._refused: list[Skip] = []
-        self._tasks = _Tasks()
+        self._tasks = _Tasks(entries)
         #: Goals under way of each client, for the limit.
         self.goals: Counter[Session] = Counter()
         #: Who has sent a goal, by its id: also when it has ended, or its route was changed.
@@ -301,7 +302,10 @@ class ActionRoutes:
     def look(self) -> None:
         """Follow the actions' topics."""
         for action in list(self._actions.values()):
-            action.look(self._node)
+            try:
+                action.look(self._node)
+            except Exception as error:
+                self._post(self._tasks.entries.faults.caught, "actions.look", error, action.ros)
 
     def lost(self) -> None:
         """The bus is gone, and with it all subscriptions."""

@@ -24,6 +24,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
+from appliance.entries import Entries, Repeated
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.commands import Commands, Surroundings
@@ -70,6 +71,9 @@ LONGEST_RETRY = 60.0
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
 
+#: Seconds until the mailbox is emptied again, when that went wrong.
+DRAIN_AGAIN = 0.05
+
 BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
 JSON_PROPERTIES: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE["json"]}
@@ -107,6 +111,8 @@ class Bridge:
         self._node = node
         self._broker = broker
         self._loop = loop
+        self._faults = broker.faults
+        self._entries = entries = Entries(loop, broker.faults)
         self._topic = f"{robot}/_appliance/routes"
         self._skipped_topic = f"{robot}/_appliance/skipped"
         self._schemas = f"{robot}/_appliance/schema/"
@@ -116,7 +122,7 @@ class Bridge:
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
-        self._meter_timer: asyncio.TimerHandle | None = None
+        self._meter_timer: Repeated | None = None
         self._metered = 0
         #: What was last told of what is bridged.
         self._announced = b""
@@ -146,7 +152,7 @@ class Bridge:
         self._is_joined = False
         #: Services, actions and parameters.
         self.calls = Calls(
-            node, broker, loop, self._converters, self._mailbox, self._post, self._announce
+            node, broker, entries, self._converters, self._mailbox, self._post, self._announce
         )
         self.replace(routes)
         self.calls.replace(calls or CallRoutes())
@@ -213,7 +219,7 @@ class Bridge:
     def _new_to_ros(self, route: Route, ros: str) -> ToRos:
         if route.settings.rules is None:
             return ToRos(route, ros, self._converters, self._tell)
-        around = Surroundings(self._loop, self._post, self._broker)
+        around = Surroundings(self._entries, self._post, self._broker)
         return Commands(route, ros, self._converters, self._tell, around)
 
     def _subscribe(self) -> None:
@@ -273,13 +279,18 @@ class Bridge:
         self.calls.start()
         self._forget_schemas(self._session)
         self._announce()
-        self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
+        self._meter_timer = self._entries.every("bridge.meter", METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
-            self._diagnostics.start(self._loop)
+            self._diagnostics.start(self._entries)
         self._join()
 
     def _join(self) -> None:
-        self._node.start(self._look, self._failed, self._loop)
+        self._node.start(self._look, self._failed, self._entries)
+
+    def _join_later(self, delay: float = LONGEST_RETRY) -> None:
+        self._retry_timer = self._entries.later(
+            "bridge.join", delay, self._join, failed=self._join_later
+        )
 
     @property
     def state(self) -> BusState:
@@ -350,13 +361,21 @@ class Bridge:
         is_long = len(payload) > LITTLE or payload.startswith(ZSTD_MAGIC)
         begun = thread_time() if is_long else 0.0
         for receiver in self._receivers.get(message.topic, ()):
-            receiver.receive(message, retain, origin)
+            try:
+                receiver.receive(message, retain, origin)
+            except Exception as error:
+                self._faults.caught("bridge.receive", error, receiver)
+                receiver.counters.errors += 1
         if is_long:
             self._broker.counters.effort += int((thread_time() - begun) * 1e6)
 
     def _drain(self) -> None:
         if self._deliver():
-            self._loop.call_soon(self._drain)
+            self._entries.soon("bridge.drain", self._drain, failed=self._drain_later)
+
+    def _drain_later(self) -> None:
+        # Whatever it was: nobody wakes it up again before the mailbox was empty once.
+        self._entries.later("bridge.drain", DRAIN_AGAIN, self._drain, failed=self._drain_later)
 
     def _deliver(self) -> bool:
         """Publish what waits in the mailbox, up to a batch; True when there may be more."""
@@ -379,7 +398,11 @@ class Bridge:
                 counters.latency.observe((time_ns() - timed[1]) / 1e9)
             counters.messages += 1
             counters.bytes += len(message.payload)
-            publish(message, session)
+            try:
+                publish(message, session)
+            except Exception as error:
+                self._faults.caught("bridge.message", error, message.topic)
+                counters.errors += 1
         self._broker.flush()
 
     def _announce(self) -> None:
@@ -407,7 +430,6 @@ class Bridge:
         self._metered += 1
         if self._metered % METERS_TO_ANNOUNCE == 0:
             self._announce()
-        self._meter_timer = self._loop.call_later(METER_INTERVAL, self._meter)
 
     def _tell_schemas(self, types: set[str], session: Session) -> None:
         for name in sorted(types ^ self._told):
@@ -454,20 +476,26 @@ class Bridge:
                 reason,
                 LONGEST_RETRY,
             )
-        self._retry_timer = self._loop.call_later(delay, self._join)
+        self._join_later(delay)
 
     # Any thread
 
     def _wake(self) -> None:
-        self._post(self._drain)
+        self._post(self._drain, failed=self._drain_later)
 
     def _tell(self, level: int, text: str, *args: object) -> None:
         if log.isEnabledFor(level):
             self._post(log.log, level, text, *args)
 
-    def _post(self, callback: Callable[..., object], *args: object) -> None:
+    def _post(
+        self,
+        callback: Callable[..., object],
+        *args: object,
+        failed: Callable[[], object] | None = None,
+    ) -> None:
+        served = getattr(callback, "__qualname__", "")
         try:
-            self._loop.call_soon_threadsafe(callback, *args)
+            self._entries.from_thread("bridge.post", callback, *args, served=served, failed=failed)
         except RuntimeError:  # the loop is closed: there is nobody to hear it
             log.debug("the event loop is closed")
 
@@ -489,9 +517,7 @@ class Bridge:
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
-        for flow in self._flows():
-            is_thorough = (flow.turn + self._looks) % THOROUGH_LOOK == 0
-            has_changed |= flow.look(self._node, is_thorough)
+        has_changed |= self._look_at_flows()
         self.calls.look()
         ready = [flow for flow in self._found.values() if flow.bridged is not None]
         if ready != self._ready:
@@ -501,6 +527,26 @@ class Bridge:
             self._diagnostics.look(self._node, self._converters, self._tell)
         if has_changed:
             self._post(self._announce)
+
+    def _look_at_flows(self) -> bool:
+        """Let each follow its topic; one that fails begins anew, and keeps no other from it.
+
+        Raises what all of them fail with: then it is the bus.
+        """
+        has_changed = False
+        flows = self._flows()
+        failures = 0
+        for flow in flows:
+            is_thorough = (flow.turn + self._looks) % THOROUGH_LOOK == 0
+            try:
+                has_changed |= flow.look(self._node, is_thorough)
+            except Exception as error:
+                failures += 1
+                if failures == len(flows) > 1:
+                    raise
+                self._post(self._faults.caught, "bridge.look", error, str(flow))
+                flow.begin_anew(f"a fault in the appliance: {error!r:.200}")
+        return has_changed
 
     def _follow_routes(self) -> bool:
         """Begin and end flows as the routes have changed; True when what is bridged has changed."""
@@ -591,7 +637,7 @@ class Bridge:
         self.calls.lost()
         if self._diagnostics is not None:
             self._diagnostics.lost()
-        self._post(self._stopped, reason)
+        self._post(self._stopped, reason, failed=self._join_later)
         self._post(self._announce)
 
 

@@ -30,6 +30,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
+from appliance.entries import Entries
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -69,6 +70,9 @@ REPORT_INTERVAL = 60.0
 #: Bytes that are converted in a microsecond or so, and count for that in the broker's
 #: `Counters.effort`: who sends much then waits for the others.
 BYTES_AN_EFFORT = 16
+
+#: Bytes of a topic, as of every string in MQTT.
+LONGEST_TOPIC = 0xFFFF
 
 #: Bytes of payload of all calls under way.
 TOTAL_BYTES = 64 * 1024 * 1024
@@ -177,13 +181,12 @@ class Ear(InsideLink):
 class Switchboard:
     """Takes calls from MQTT, has them handled, and answers each of them once."""
 
-    def __init__(
-        self, broker: Broker, loop: asyncio.AbstractEventLoop, limits: CallLimits | None = None
-    ) -> None:
+    def __init__(self, broker: Broker, entries: Entries, limits: CallLimits | None = None) -> None:
         self.limits = limits or CallLimits()
         self._backlog = Backlog()
         self._broker = broker
-        self._loop = loop
+        self._entries = entries
+        self._loop = entries.loop
         self._session: Session | None = None
         #: Who gets what comes, by the identifier of the subscription it came through.
         self._receivers: dict[int, Receive] = {}
@@ -325,15 +328,14 @@ class Switchboard:
         offer.counters.calls += 1
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
-        fallback = Message(own, b"", 1)
         said = (message.properties or {}).get(Property.CONTENT_TYPE)
         named = named_encoding(said)
         encoding = named or offer.encoding
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
-            may_tell = _is_level(caller.client_id)
-            self._fail(offer, caller, fallback if may_tell else None, encoding, error)
+            fallback = Message(own, b"", 1) if _is_own_topic(caller, own) else None
+            self._fail(offer, caller, fallback, encoding, error)
             return
         call = Call(caller, message.payload, topic, reply, encoding)
         if isinstance(said, str) and named is None:
@@ -351,8 +353,8 @@ class Switchboard:
         offer.counters.under_way += 1
         self._calls.add(call)
         self._bytes += len(call.payload)
-        call.task = self._loop.create_task(self._run(offer, call))
-        call.task.add_done_callback(lambda _: self._forget(offer, call))
+        call.task = self._entries.task("calls.call", self._run(offer, call), served=offer.name)
+        self._entries.when_done("calls.end", call.task, self._forget, offer, call)
 
     def _way_back(self, caller: Session, message: Message, own: str, token: str) -> Message:
         """An empty answer with its topic and correlation. Raises CallError."""
@@ -372,6 +374,8 @@ class Switchboard:
                     f"the client id {quote(caller.client_id)} cannot be a level of a topic",
                 )
             topic = f"{own}/{token}"
+            if not _is_own_topic(caller, topic):
+                raise CallError("no_response_topic", "the topic of the answer would be too long")
         # What is below the id of a client `alice/1` belongs to the client `alice`.
         if _is_level(caller.client_id) and (topic == own or topic.startswith(f"{own}/")):
             if not self._broker.may_receive(caller, topic):
@@ -421,7 +425,7 @@ class Switchboard:
             if call.task is not None:
                 call.task.cancel()
 
-        timer = self._loop.call_later(offer.timeout, expire)
+        timer = self._entries.later("calls.timeout", offer.timeout, expire, served=offer.name)
         try:
             answer = await offer.handle(call)
         except CallError as error:
@@ -433,7 +437,7 @@ class Switchboard:
             end = CallError("timeout", text) if call.is_late else _stopping()
             self._fail(offer, call.caller, call.reply, call.encoding, end)
         except Exception as problem:  # a fault in here must not leave the caller without an answer
-            log.exception("a call of %s failed", offer.name)
+            self._entries.faults.caught("calls.handle", problem, offer.name)
             end = CallError("ros_error", repr(problem))
             self._fail(offer, call.caller, call.reply, call.encoding, end)
         else:
@@ -446,14 +450,14 @@ class Switchboard:
             timer.cancel()
 
     def _forget(self, offer: Offer, call: Call) -> None:
-        if call.task is not None and call.task.cancelled():  # before it had begun
-            self._fail(offer, call.caller, call.reply, call.encoding, _stopping())
         offer.counters.under_way -= 1
         self._calls.discard(call)
         self._bytes -= len(call.payload)
         self._under_way[call.caller] -= 1
         if not self._under_way[call.caller]:
             del self._under_way[call.caller]
+        if call.task is not None and call.task.cancelled():  # before it had begun
+            self._fail(offer, call.caller, call.reply, call.encoding, _stopping())
 
     def _fail(
         self,
@@ -475,7 +479,9 @@ class Switchboard:
         if reply is not None:
             # In a turn of its own: the caller's chunk is still being worked on.
             about = [("status", "error")]
-            self._loop.call_soon(self._answer, reply, *error_payload(error, encoding), about)
+            self._entries.soon(
+                "calls.answer", self._answer, reply, *error_payload(error, encoding), about
+            )
 
     def _answer(
         self, reply: Message, payload: bytes, encoding: CallEncoding, about: list[tuple[str, str]]
@@ -500,6 +506,11 @@ def error_payload(
 def _is_level(client_id: str) -> bool:
     """Whether the id can be one level of a topic, as `_reply/{client id}` needs it."""
     return not set("/+#\0") & set(client_id)
+
+
+def _is_own_topic(caller: Session, topic: str) -> bool:
+    """Whether there can be such a topic with the caller's id, which may be any text, in it."""
+    return _is_level(caller.client_id) and len(topic.encode()) <= LONGEST_TOPIC
 
 
 def _stopping() -> CallError:

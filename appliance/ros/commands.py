@@ -16,6 +16,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Decision
 from appliance.broker.session import Session
+from appliance.entries import Entries
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.backlog import Backlog
 from appliance.ros.convert import ConversionError, Converter, Converters
@@ -38,7 +39,7 @@ _FREE = Decision(True, "nobody commands it")
 class Surroundings:
     """What commands need beside a flow: the loop, a way to it from any thread, and the broker."""
 
-    loop: asyncio.AbstractEventLoop
+    entries: Entries
     post: Callable[..., None]
     broker: Broker
 
@@ -197,7 +198,7 @@ class Commands(ToRos):
         if is_will:
             is_old = rules.oldest < math.inf
         else:
-            is_old = self._backlog.has(message, origin, rules.oldest, self._around.loop.time())
+            is_old = self._backlog.has(message, origin, rules.oldest, self._around.entries.time())
         if is_old or (retain and rules.expire is not None and expires_at is None):
             return self._count_expired("it was sent some time before", origin)
         return True
@@ -224,7 +225,7 @@ class Commands(ToRos):
         return limited
 
     def _commanded(self, cdr: bytes, origin: Session | None) -> None:
-        now = self._around.loop.time()
+        now = self._around.entries.time()
         self._heard_at = now
         self._source = origin
         self._is_driven = self._stop is not None and cdr != self._stop.example
@@ -299,12 +300,18 @@ class Commands(ToRos):
             heard_at = min((at for _, at in self._drivers.values()), default=math.inf)
             due = min(due, heard_at + rules.on_silence.after)
         if due < math.inf:
-            loop = self._around.loop
-            self._timer = loop.call_at(max(due, loop.time()), self._check)
+            entries = self._around.entries
+            self._timer = entries.at(
+                "commands.check",
+                max(due, entries.time()),
+                self._check,
+                served=self,
+                failed=self._check_later,
+            )
 
     def _check(self) -> None:
         self._timer = None
-        silence = self._around.loop.time() - self._heard_at
+        silence = self._around.entries.time() - self._heard_at
         on_silence = self.rules.on_silence
         is_over = self._holder is not None and silence >= self.rules.lease
         if is_over:
@@ -323,7 +330,7 @@ class Commands(ToRos):
 
     def _disconnect_silent(self, after: float) -> None:
         """Disconnect who drove and has said nothing for so long, also when others drive on."""
-        latest = self._around.loop.time() - after
+        latest = self._around.entries.time() - after
         silent = [(who, cdr) for who, (cdr, at) in self._drivers.items() if at <= latest]
         for session, cdr in silent:
             self._drivers[session] = cdr, math.inf
@@ -360,32 +367,44 @@ class Commands(ToRos):
         if out is None:  # the publisher is being set up anew
             self._stop_later()
             return
-        cdr = stop.cdr()
         try:
+            cdr = stop.cdr()
             if self.echo is not None:
                 self.echo.sent(cdr)
             out[1].publish(cdr)
         except BusError as error:
-            self.fail(f"that stops could not be published: {error}")
-            if not self._is_left:
-                self._stop_later()
+            self._cannot_stop(error)
+            return
+        except Exception as error:  # whatever it is, the robot is to stop
+            self._around.broker.faults.caught("commands.stop", error, self)
+            self._cannot_stop(error)
             return
         self._is_driven = self._must_stop = False
         self._has_stopped = self._looks >= LOOKS_TO_MATCH
         self.counters.stops += 1
         self._mention("stopped", "%s: the stop message was published: %s", why)
 
+    def _cannot_stop(self, error: Exception) -> None:
+        self.fail(f"that stops could not be published: {error}")
+        if not self._is_left:
+            self._stop_later()
+
     def _stop_later(self) -> None:
         self._is_driven = self._must_stop = True
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self._around.loop.call_later(RETRY, self._check)
+        self._check_later()
+
+    def _check_later(self) -> None:
+        self._timer = self._around.entries.later(
+            "commands.check", RETRY, self._check, served=self, failed=self._check_later
+        )
 
     # The log
 
     def _mention(self, what: str, text: str, *args: object) -> None:
         """Log what may happen with every message once a minute."""
-        now = self._around.loop.time()
+        now = self._around.entries.time()
         if now >= self._told.get(what, -math.inf):
             self._told[what] = now + REPORT_INTERVAL
             self._tell(logging.WARNING, text, self, *args)

@@ -5,12 +5,12 @@ Names, levels and keys are as diagnostic_aggregator and rqt_robot_monitor show t
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Iterator
 from typing import Any, Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
+from appliance.entries import Entries, Repeated
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.flows import Tell
@@ -62,8 +62,7 @@ class Diagnostics:
         #: Replaced as one by the ROS thread.
         self._out: tuple[Converter, RosPublisher] | None = None
         self._has_looked = False
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: Repeated | None = None
         #: What had been counted when it was last told, by the name of the status.
         self._told: _Told = {}
 
@@ -87,10 +86,9 @@ class Diagnostics:
 
     # The loop's thread
 
-    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+    def start(self, entries: Entries) -> None:
         """Publish from now on, when there is ROS."""
-        self._loop = loop
-        self._timer = loop.call_later(self._interval, self._tick)
+        self._timer = entries.every("diagnostics", self._interval, self._tick)
 
     def stop(self) -> None:
         """Publish no more; may be called twice."""
@@ -99,8 +97,6 @@ class Diagnostics:
             self._timer = None
 
     def _tick(self) -> None:
-        assert self._loop is not None
-        self._timer = self._loop.call_later(self._interval, self._tick)
         if self._out is None:
             return
         converter, publisher = self._out

@@ -12,6 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
@@ -268,6 +269,14 @@ class Flow(ABC):
         self._problem = None
         self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
         self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
+
+    def begin_anew(self, problem: str) -> None:
+        """A fault: what was set up is closed, and the next look sets it up again."""
+        self._problem = self.counters.last_error = problem
+        self._wanted, self._is_due = None, True
+        with suppress(Exception):  # it was counted, and what there is of it may be half a thing
+            self.close()
+        self.bridged = None
 
     def skips(self) -> list[Skip]:
         """What of the topic is not carried; from any thread."""

@@ -6,12 +6,12 @@ thread is in the methods `look` and `lost`, all else is for the event loop's thr
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from appliance.broker.broker import Broker
+from appliance.entries import Entries
 from appliance.ros.actions import ActionRoutes, ActionSettings
 from appliance.ros.calls import CallCounters, CallLimits, Switchboard
 from appliance.ros.convert import Converters
@@ -63,7 +63,7 @@ class Calls:
         self,
         node: RosNode,
         broker: Broker,
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         converters: Converters,
         mailbox: Mailbox,
         post: Callable[..., None],
@@ -72,20 +72,22 @@ class Calls:
         """`post` calls on the loop's thread; `announce` is called there when what `bridged` gives
         may have changed."""
         self._broker = broker
+        self._faults = broker.faults
+        self._post = post
         self._announce = announce
         self._routes = CallRoutes()
-        self.board = Switchboard(broker, loop)
-        self._requests = Requests(node, loop, post, self._follow)
-        self._services = ServiceRoutes(self.board, self._requests, converters, node, loop, post)
+        self.board = Switchboard(broker, entries)
+        self._requests = Requests(node, entries.loop, post, self._follow)
+        self._services = ServiceRoutes(self.board, self._requests, converters, node, entries, post)
         self._actions = ActionRoutes(
-            self.board, self._requests, converters, node, loop, post, mailbox
+            self.board, self._requests, converters, node, entries, post, mailbox
         )
         self._parameters: ParameterRoutes | ServerParameters
         if node.parameter_server is not None:
-            self._parameters = ServerParameters(self.board, node, loop, post, announce)
+            self._parameters = ServerParameters(self.board, node, entries.loop, post, announce)
         else:
             self._parameters = ParameterRoutes(
-                self.board, self._requests, converters, node, loop, post
+                self.board, self._requests, converters, node, entries, post
             )
 
     def replace(self, routes: CallRoutes) -> None:
@@ -98,11 +100,14 @@ class Calls:
         self._keep_ready()
 
     def _follow(self) -> None:
-        self._services.follow()
-        self._actions.follow()
-        self._parameters.follow()
-        self._keep_ready()
-        self._announce()
+        for follow in (
+            self._services.follow,
+            self._actions.follow,
+            self._parameters.follow,
+            self._keep_ready,
+            self._announce,
+        ):
+            self._faults.run("calls.follow", follow, otherwise=None)
 
     def _keep_ready(self) -> None:
         self._requests.keep_ready((*self._services.keys(), *self._actions.keys()))
@@ -153,11 +158,14 @@ class Calls:
     def look(self) -> None:
         """Follow what has come and gone on the graph."""
         routes = self._routes
+        looks = [self._services.look, self._actions.look, self._parameters.look]
         if routes.services or routes.actions or routes.parameters or self._requests.has_clients:
-            self._requests.look()
-        self._services.look()
-        self._actions.look()
-        self._parameters.look()
+            looks.insert(0, self._requests.look)
+        for look in looks:
+            try:
+                look()
+            except Exception as error:
+                self._post(self._faults.caught, "calls.look", error)
 
     def lost(self) -> None:
         """The bus is gone, and with it all that was set up."""

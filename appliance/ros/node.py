@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
+from appliance.entries import Entries
 from appliance.ros.definitions import CDR, TypeDescription, UnknownTypeError, Wire, describe
 
 
@@ -162,14 +162,14 @@ class RosNode(Protocol):
         self,
         poll: Callable[[], None],
         failed: Callable[[str], None],
-        loop: asyncio.AbstractEventLoop | None = None,
+        entries: Entries | None = None,
     ) -> None:
         """Join the bus in the background and return at once.
 
         `poll` is called when the node is there and then 5 to 10 times a second: the time to look
         at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
-        node ends by itself; nothing is called after it, until the node is started again. `loop` is
-        the one whose thread may take messages itself.
+        node ends by itself; nothing is called after it, until the node is started again.
+        `entries` are of the loop whose thread may take messages itself, and is told of faults.
         """
 
     def stop(self) -> None:
@@ -479,7 +479,7 @@ class FakeNode:
         self,
         poll: Callable[[], None],
         failed: Callable[[str], None],
-        loop: asyncio.AbstractEventLoop | None = None,
+        entries: Entries | None = None,
     ) -> None:
         self._poll = poll
         self._failed = failed

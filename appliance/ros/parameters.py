@@ -18,6 +18,7 @@ from typing import Any
 
 import pybase64
 
+from appliance.entries import Entries
 from appliance.ros.calls import (
     Call,
     CallError,
@@ -89,14 +90,14 @@ class ParameterRoutes(ParameterTopics[_Node]):
         requests: Requests,
         converters: Converters,
         node: RosNode,
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         post: Callable[..., None],
     ) -> None:
         super().__init__(board)
         self._requests = requests
         self._converters = converters
         self._node = node
-        self._loop = loop
+        self._entries = entries
         self._post = post
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_stopped = False
@@ -181,11 +182,17 @@ class ParameterRoutes(ParameterTopics[_Node]):
             self._begin(self._read(node))
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = self._loop.create_task(work)
+        task = self._entries.task("parameters.read", work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._entries.when_done("parameters.end", task, self._tasks.discard, task)
 
     async def _read(self, node: _Node) -> None:
+        try:
+            await self._read_all(node)
+        finally:
+            node.is_loading = False
+
+    async def _read_all(self, node: _Node) -> None:
         has_failed = False
         while node.is_stale and not node.is_gone:
             node.is_stale = False
@@ -208,7 +215,6 @@ class ParameterRoutes(ParameterTopics[_Node]):
                 for name, value in values.items():
                     self._show(node, name, value)
                 log.info("%d parameters of %s are at %s", len(values), node.name, node.base)
-        node.is_loading = False
 
     async def _get_all(self, node: _Node) -> dict[str, Any]:
         listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
@@ -235,6 +241,9 @@ class ParameterRoutes(ParameterTopics[_Node]):
         if node.wants(name):
             payload = b"" if value is None else _to_payload(value, node.route.encoding)
             self._publish(node, name, payload)
+
+    def _sleep(self) -> None:
+        self._is_awake = False
 
     def _take_events(self) -> None:
         self._is_awake = False
@@ -315,7 +324,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
             self._events.append(cdr)
         if not self._is_awake:
             self._is_awake = True
-            self._post(self._take_events)
+            self._post(self._take_events, failed=self._sleep)
 
     def lost(self) -> None:
         """The bus is gone, and with it the subscription."""

@@ -8,7 +8,6 @@ are made again. And it starts only once: to join anew, it is imported anew.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import queue
@@ -23,6 +22,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from appliance.entries import Entries
 from appliance.ros.definitions import PACKED, TypeDescription, UnknownTypeError
 from appliance.ros.node import (
     BusError,
@@ -188,7 +188,7 @@ class Ros1Node:
         self,
         poll: Callable[[], None],
         failed: Callable[[str], None],
-        loop: asyncio.AbstractEventLoop | None = None,
+        entries: Entries | None = None,
     ) -> None:
         is_available, reason = available()
         if not is_available:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import logging
 import os
@@ -16,6 +15,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
+from appliance.entries import Entries
 from appliance.ros import fastdds, installation, uncompiled
 from appliance.ros.definitions import (
     CDR,
@@ -133,16 +133,18 @@ class Ros2Node:
         self._clock: Any = None
         #: Who could be heard when the bus was joined.
         self._reach = Reach.NOBODY
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._entries: Entries | None = None
+        #: Whether the loop's thread may take messages itself, as far as is known.
+        self._takes_on_loop = True
         self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
     def start(
         self,
         poll: Callable[[], None],
         failed: Callable[[str], None],
-        loop: asyncio.AbstractEventLoop | None = None,
+        entries: Entries | None = None,
     ) -> None:
-        self._loop = loop
+        self._entries = entries
         _, reason = available()
         if self._domain_id is None:
             reason = reason or _wrong_domain()
@@ -249,10 +251,28 @@ class Ros2Node:
         def run() -> None:
             try:
                 callback()
-            except Exception:  # in EventsExecutor it would end the whole process
-                log.exception("a fault on the ROS thread")
+            except Exception as error:  # in EventsExecutor it would end the whole process
+                self._tell_fault("ros.task", error)
 
         executor.create_task(run)
+
+    def _contained(self, entry: str, callback: Callable[..., None]) -> Callable[..., None]:
+        def run(*args: Any) -> None:
+            try:
+                callback(*args)
+            except Exception as error:  # as in `call_soon`
+                self._tell_fault(entry, error)
+
+        return run
+
+    def _tell_fault(self, entry: str, error: Exception) -> None:
+        """Count, on the loop's thread, what was caught on this one."""
+        entries = self._entries
+        with suppress(RuntimeError):  # the loop is closed: there is nobody to hear it
+            if entries is not None:
+                entries.from_thread("ros.fault", entries.faults.caught, entry, error)
+                return
+        log.error("a fault on the ROS thread (%s)", entry, exc_info=error)
 
     # The graph
 
@@ -335,13 +355,14 @@ class Ros2Node:
         on_loop: TakeLot | None = None,
     ) -> RosSubscription:
         message_class = load_message(type_name)
-        if on_loop is not None and self._loop is not None:
+        if on_loop is not None and self._takes_on_loop and self._entries is not None:
             try:
                 return self._subscribe_on_loop(message_class, topic, qos, callback, on_loop)
             except UnavailableError as reason:
                 log.info("the ROS thread takes all messages: %s", reason)
-                self._loop = None
+                self._takes_on_loop = False
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
+        callback = self._contained("ros.message", callback)
         if timed and not self._is_event_driven:
             callback = _with_time(callback)
         with _as_bus_error():
@@ -365,7 +386,7 @@ class Ros2Node:
         from rclpy.impl.implementation_singleton import rclpy_implementation
         from rclpy.type_support import check_is_valid_msg_type
 
-        assert self._loop is not None
+        assert self._entries is not None
         middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
         if not middleware.startswith("rmw_fastrtps"):
             raise UnavailableError(f"it has not been tried with {middleware}")
@@ -378,7 +399,7 @@ class Ros2Node:
         try:
             losses = _Losses(handle)
             own = LoopSubscription(
-                handle, message_class, self._loop, self.call_soon, callback, on_loop, losses
+                handle, message_class, self._entries, self.call_soon, callback, on_loop, losses
             )
         except UnavailableError:
             losses.destroy()
@@ -407,6 +428,7 @@ class Ros2Node:
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
     ) -> _Service:
+        callback = self._contained("ros.request", callback)
         return _Service(self._node, service, import_service(type_name), callback)
 
 

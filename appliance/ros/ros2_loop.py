@@ -8,7 +8,6 @@ file descriptor as for any other.
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import os
 import time
@@ -16,6 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol
 
+from appliance.entries import Entries
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, TakeLot
 
@@ -104,7 +104,7 @@ class LoopSubscription:
         self,
         handle: Any,
         message_class: type[Any],
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         call_soon: Callable[[Callable[[], None]], None],
         callback: Callable[..., None],
         on_loop: TakeLot,
@@ -115,7 +115,8 @@ class LoopSubscription:
         self._handle = handle
         self._take_message = handle.take_message
         self._message_class = message_class
-        self._loop = loop
+        self._entries = entries
+        self._loop = entries.loop
         self._call_soon = call_soon
         self._callback = callback
         self._on_loop = on_loop
@@ -134,7 +135,7 @@ class LoopSubscription:
         self._is_ended = False
         with handle:
             self._doorbell = Doorbell(handle.pointer)
-        loop.call_soon_threadsafe(self._listen)
+        entries.from_thread("ros.listen", self._listen, failed=self._listen)
 
     def destroy(self) -> None:
         if self._is_ended:
@@ -146,7 +147,7 @@ class LoopSubscription:
         # If the loop's thread is taking messages at this moment, it happens when that is done.
         self._handle.destroy_when_not_in_use()
         try:
-            self._loop.call_soon_threadsafe(self._close)
+            self._entries.from_thread("ros.close", self._close)
         except RuntimeError:  # the loop is closed, and waits for nothing any more
             self._doorbell.close()
 
@@ -157,7 +158,11 @@ class LoopSubscription:
 
     def _listen(self) -> None:
         if not self._is_ended:
-            self._loop.add_reader(self._doorbell.fd, self._ring)
+            self._entries.reader("ros.ring", self._doorbell.fd, self._ring, failed=self._quiet)
+
+    def _quiet(self) -> None:
+        """What rang is not taken now, or it would ring for ever: it is when it rings again."""
+        self._owed += self._doorbell.rings()
 
     def _close(self) -> None:
         self._loop.remove_reader(self._doorbell.fd)
@@ -220,7 +225,9 @@ class LoopSubscription:
             else:
                 lost, self._lost = self._lost, 0
                 with suppress(RuntimeError):  # the loop is closed
-                    self._loop.call_soon_threadsafe(self._take_back, lost)
+                    self._entries.from_thread(
+                        "ros.take_back", self._take_back, lost, failed=self._listen
+                    )
 
     # The one that has the subscription
 

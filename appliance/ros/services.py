@@ -23,6 +23,7 @@ from typing import Literal
 
 from appliance.broker.message import Message
 from appliance.broker.session import Session
+from appliance.entries import Entries
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.calls import (
@@ -120,14 +121,14 @@ class ServiceRoutes:
         requests: Requests,
         converters: Converters,
         node: RosNode,
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         post: Post,
     ) -> None:
         self._board = board
         self._requests = requests
         self._converters = converters
         self._node = node
-        self._loop = loop
+        self._entries = entries
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
@@ -154,7 +155,7 @@ class ServiceRoutes:
                     self._board,
                     self._converters,
                     self._node,
-                    self._loop,
+                    self._entries,
                     self._post,
                 )
         self.follow()
@@ -331,7 +332,7 @@ class Provided:
         board: Switchboard,
         converters: Converters,
         node: RosNode,
-        loop: asyncio.AbstractEventLoop,
+        entries: Entries,
         post: Post,
     ) -> None:
         assert route.type is not None
@@ -340,7 +341,7 @@ class Provided:
         self._board = board
         self._converters = converters
         self._node = node
-        self._loop = loop
+        self._entries = entries
         self._post = post
         (self._ros,) = route.names
         self._base = route.base(self._ros)
@@ -415,7 +416,9 @@ class Provided:
             expires_at=self._board.now() + route.timeout,
         )
         late = f"timeout: no MQTT client answered within {route.timeout:g} s"
-        timer = self._loop.call_later(route.timeout, self._give_up, token, late)
+        timer = self._entries.later(
+            "services.timeout", route.timeout, self._give_up, token, late, served=self._ros
+        )
         self._asked[token] = _Asked(respond, timer)
         self._counters.under_way += 1
         if self._board.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
@@ -465,7 +468,7 @@ class Provided:
         code = problem.partition(":")[0]
         self._counters.errors[code] += 1
         self._counters.last_error = problem
-        now = self._loop.time()
+        now = self._entries.time()
         if now >= self._report_at:
             self._report_at = now + REPORT_INTERVAL
             count = sum(self._counters.errors.values())

@@ -147,8 +147,14 @@ class ToMqtt(Flow):
             lot = lot[-1:]
         self.counters.dropped += lost
         batch = []
+        failure: Exception | None = None
         for cdr, published_at in lot:
-            message = self._convert(cdr, published_at)
+            try:
+                message = self._convert(cdr, published_at)
+            except Exception as error:  # it alone is lost, and told behind the others
+                self.fail(f"ended in a fault: {error!r:.200}")
+                failure = error
+                continue
             if message is None:
                 continue
             if lane.waiting:
@@ -157,6 +163,8 @@ class ToMqtt(Flow):
                 batch.append((lane, message))
         if batch:
             self._publish(batch)
+        if failure is not None:
+            raise failure
 
     def _convert(self, cdr: bytes, published_at: int) -> Message | None:
         """The message for MQTT; None for one that does not go there.

@@ -27,6 +27,9 @@ _T = TypeVar("_T")
 #: A key beyond this was not given out by us, who could not count so far.
 LARGEST_KEY = 1 << 53
 
+#: Seconds since 1970 that are beyond every date that was stored; nor is it infinity, or no number.
+LATEST = 1e12
+
 
 # --- to rows: `offset` is what the store's time is ahead of the broker's, in seconds --------------
 
@@ -221,7 +224,12 @@ def _within(value: object, low: int, high: int) -> int:
 
 
 def _time(value: object, offset: float) -> float | None:
-    return None if value is None else _of(float, value) - offset
+    if value is None:
+        return None
+    moment = _of(float, value)
+    if not abs(moment) < LATEST:
+        raise _WrongRowError(f"{moment} is no time")
+    return moment - offset
 
 
 def _message(row: Row, offset: float) -> Message:

@@ -9,6 +9,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +19,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Held, Session
 from appliance.clock import NUDGE, StepWatch
+from appliance.entries import Entries, Repeated
 from appliance.mqtt.packets import Subscription
 from appliance.store import database
 from appliance.store.clock import KEY, Clocks, Stamp, boot_id, stamp_of
@@ -119,6 +121,7 @@ class SqliteStore:
         self._lock: int | None = None
         self._contents: database.Contents | None = None
         self._loop: asyncio.AbstractEventLoop
+        self._entries: Entries
         self._writer = Writer(path, durability, self._done_soon)
         self._keys = itertools.count(1)
         self._sessions: dict[Session, _Known] = {}
@@ -134,7 +137,7 @@ class SqliteStore:
         self._writing = False
         self._running = False
         self._timer: asyncio.TimerHandle | None = None
-        self._clock: asyncio.TimerHandle | None = None
+        self._clock: Repeated | None = None
         self._tell: Callable[[bool], None] = lambda kept: None
         #: Whether somebody waits for what is in the open batch.
         self._urgent = False
@@ -191,6 +194,7 @@ class SqliteStore:
         contents, self._contents = self._contents, None
         assert contents is not None
         self._loop = asyncio.get_running_loop()
+        self._entries = Entries(self._loop, broker.faults)
         self._set_clock(stamp_of(contents.rows[Table.CLOCK].get(KEY)))
         loaded = load(contents.rows, self._offset)
         self._keys = itertools.count(loaded.last_key + 1)
@@ -220,7 +224,7 @@ class SqliteStore:
             self._tell(False)
         elif contents.rescued:
             self._hand_over()
-        self._clock = self._loop.call_later(CLOCK_CHECK, self._check_clock)
+        self._clock = self._entries.every("store.clock", CLOCK_CHECK, self._check_clock)
         if loaded.sessions or loaded.retained:
             log.info(
                 "%d sessions, %d messages and %d retained messages restored from %s",
@@ -330,7 +334,13 @@ class SqliteStore:
         self._is_changed = True
         if self._timer is None and self._running and not self._writing:
             delay = RETRY if self._failing else LINGER
-            self._timer = self._loop.call_later(delay, self._write_in_time)
+            self._timer = self._entries.later(
+                "store.write", delay, self._write_in_time, failed=self._write_later
+            )
+
+    def _write_later(self) -> None:
+        self._timer = None
+        self._stage_lazily()
 
     def _write_in_time(self) -> None:
         self._timer = None
@@ -355,10 +365,27 @@ class SqliteStore:
     def _done_soon(self, batch: Batch, error: Exception | None, seconds: float) -> None:
         """On the writer's thread: the outcome is for the event loop's."""
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody wants to know
-            self._loop.call_soon_threadsafe(self._done, batch, error, seconds)
+            self._entries.from_thread(
+                "store.done", self._done, batch, error, failed=partial(self._not_done, batch)
+            )
 
-    def _done(self, batch: Batch, error: Exception | None, seconds: float) -> None:
+    def _done(self, batch: Batch, error: Exception | None) -> None:
         self._writing = False
+        try:
+            self._settle(batch, error)
+        finally:  # whatever is wrong with this batch, the next one is written
+            if self._running and not self._writing:
+                if self._urgent and not self._failing:
+                    self._hand_over()
+                elif self._open or self._failing:
+                    self._stage_lazily()
+
+    def _not_done(self, batch: Batch) -> None:
+        """Nobody has heard of the batch's end: it is written again, which changes nothing."""
+        if self._writing:
+            self._done(batch, RuntimeError("a fault in the appliance"))
+
+    def _settle(self, batch: Batch, error: Exception | None) -> None:
         if error is None:
             self.committed = batch.number
             self.commits += 1
@@ -377,13 +404,7 @@ class SqliteStore:
         outcome, self._outcome = self._outcome, None
         if outcome is not None:
             outcome.set_result(None)
-        self._tell(error is None)
-        if not self._running or self._writing:
-            return
-        if self._urgent and not self._failing:
-            self._hand_over()
-        elif self._open or self._failing:
-            self._stage_lazily()
+        self._entries.faults.run("store.committed", self._tell, error is None, otherwise=None)
 
     def _complain(self, problem: str) -> None:
         log.error(
@@ -418,7 +439,6 @@ class SqliteStore:
     def _check_clock(self) -> None:
         """Keep what the clocks say: with what is written anyway, and when the wall clock was set,
         as it is on a robot after its boot."""
-        self._clock = self._loop.call_later(CLOCK_CHECK, self._check_clock)
         self._drop_old()
         if self._steps.look(self._loop.time()) or self._stamped < self.batch - 1:
             self._put_stamp()

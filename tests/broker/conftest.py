@@ -185,6 +185,8 @@ class FakeWire:
     def close(self) -> None:
         self.closed = True
 
+    abort = close
+
 
 class Peer:
     """The client at the other end: says packets, and hears the packets that come back."""

@@ -88,6 +88,8 @@ class Wire:
     def close(self):
         self.closed = True
 
+    abort = close
+
 
 class Driver:
     """A client with a connection, as the network's clients have it."""

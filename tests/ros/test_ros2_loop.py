@@ -16,6 +16,8 @@ from waiting import until
 pytest.importorskip("rclpy")
 from test_ros2 import BYTES, STRING, domain, house, peer, route, string
 
+from appliance.broker.faults import Faults
+from appliance.entries import Entries
 from appliance.ros import ros2, ros2_loop
 from appliance.ros.bridge import Bridge
 from appliance.ros.convert import compile_converter
@@ -46,7 +48,8 @@ class Taker:
         self.subscription = None
 
     def start(self):
-        self.node.start(self._look, self.failures.append, asyncio.get_running_loop())
+        entries = Entries(asyncio.get_running_loop(), Faults())
+        self.node.start(self._look, self.failures.append, entries)
 
     def _look(self):
         if self.subscription is None:

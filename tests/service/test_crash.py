@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from appliance import config, crash, logs
+from appliance.broker.faults import Faults
 from appliance.crash import KEPT, LARGEST, OF_ONE_RUN, CrashReports
 
 SETTINGS = """\
@@ -33,8 +34,8 @@ cli.main(["run", "-c", sys.argv[1]])
 """
 
 
-def reports(folder: Path) -> list[Path]:
-    return sorted(folder.glob("crash-*.txt"))
+def reports(folder: Path, kind: str = "crash") -> list[Path]:
+    return sorted(folder.glob(f"{kind}-*.txt"))
 
 
 @pytest.fixture
@@ -188,15 +189,18 @@ def test_a_folder_that_cannot_be(folder: Path, caplog: pytest.LogCaptureFixture)
     crash.CrashReports(None, config.loads("", folder)).start()
 
 
-async def test_what_the_loop_fails_with(folder: Path) -> None:
+async def test_what_the_loop_fails_with(folder: Path, escaped: list[str]) -> None:
     found = started(folder)
     loop = asyncio.get_running_loop()
-    found.watch(loop)
+    faults = Faults()
+    faults.report = found.fault
+    found.watch(loop, faults)
     loop.call_soon(lambda: {}["missing"])
     loop.call_exception_handler({"message": "lost", "exception": ConnectionResetError()})
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     loop.set_exception_handler(None)
-    (report,) = reports(folder)
-    assert "KeyError: 'missing'" in report.read_text()
+    (report,) = reports(folder, "fault")
+    assert "KeyError: 'missing'" in report.read_text() and not reports(folder)
+    assert faults.count == 1 and str(report) in escaped.pop()
     found.stop()
