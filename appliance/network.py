@@ -8,8 +8,10 @@ import socket
 import ssl
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
 from typing import Protocol, TypeAlias
 
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.entries import Entries
@@ -99,8 +101,8 @@ class Network:
         #: Bytes in the output of all clients, as far as they are counted.
         self.output = 0
         self._ended = ended
-        #: For how many clients a large chunk waits, by its id.
-        self._shared: dict[int, int] = {}
+        #: For how many clients a large chunk waits, by its id: in all, and of each account.
+        self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
         self._turns: deque[Member] = deque()
         self._effort_begun = 0
@@ -171,25 +173,56 @@ class Network:
         self.tasks.add(task)
         self.entries.when_done("network.background_end", task, self.tasks.discard, task)
 
-    def count_output(self, size: int) -> None:
-        """So many bytes more, or less, wait to be read by a client."""
+    def count_output(self, account: Account, size: int) -> None:
+        """So many bytes more, or less, wait to be read by a client of the account."""
+        self._count_in_all(size)
+        self._count_for(account, size)
+
+    def _count_in_all(self, size: int) -> None:
         self.output += size
         self.broker.ledger.queued_bytes += size
 
-    def share(self, chunk: bytes) -> None:
-        """Count a large chunk that waits for a client: once, for however many it waits."""
-        clients = self._shared.get(id(chunk), 0)
-        if not clients:
-            self.count_output(len(chunk))
-        self._shared[id(chunk)] = clients + 1
+    def _count_for(self, account: Account, size: int) -> None:
+        account.output += size
+        account.bytes += size
 
-    def unshare(self, chunk: bytes) -> None:
-        """It waits for one client less."""
-        clients = self._shared.pop(id(chunk)) - 1
-        if clients:
-            self._shared[id(chunk)] = clients
-        else:
-            self.count_output(-len(chunk))
+    def is_much(self, account: Account) -> bool:
+        """Whether so much output waits that less is allowed to the account's clients.
+
+        Those of a user with less than most have of it are not the reason.
+        """
+        return (
+            self.output > self.much_output
+            and account.output * len(self.broker.ledger.accounts) > self.much_output
+        )
+
+    def share(self, account: Account, chunk: bytes) -> None:
+        """Count a large chunk that waits for a client of the account.
+
+        It is counted once for however many it waits, and once for each account of these.
+        """
+        for key, count in self._sharers(account, chunk):
+            clients = self._shared.get(key, 0)
+            if not clients:
+                count(len(chunk))
+            self._shared[key] = clients + 1
+
+    def unshare(self, account: Account, chunk: bytes) -> None:
+        """It waits for one client of the account less."""
+        for key, count in self._sharers(account, chunk):
+            clients = self._shared.pop(key) - 1
+            if clients:
+                self._shared[key] = clients
+            else:
+                count(-len(chunk))
+
+    def _sharers(
+        self, account: Account, chunk: bytes
+    ) -> tuple[tuple[tuple[int, int], Callable[[int], None]], ...]:
+        return (
+            ((id(chunk), 0), self._count_in_all),
+            ((id(chunk), id(account)), partial(self._count_for, account)),
+        )
 
     def closed(self, member: Member) -> None:
         """A connection ended."""

@@ -11,6 +11,7 @@ from collections import deque
 from typing import cast
 
 from appliance import farewell, tls
+from appliance.broker.accounts import Account
 from appliance.broker.client import Client
 from appliance.broker.ports import Exchange, Refusal, Secured
 from appliance.entries import contained
@@ -82,6 +83,8 @@ class ClientProtocol:
         # Input: what was received and waits, and what it waits for.
         self._held = memoryview(b"")
         self._frame = 0  # bytes of a WebSocket frame that is not complete
+        #: Who is charged for what waits here: nobody in particular until the login.
+        self._account = self._ledger.accounts.strangers
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
         self._in_turn = False
@@ -401,9 +404,12 @@ class ClientProtocol:
         ledger = self._ledger
         grown = size - self._frame
         self._frame = size
-        ledger.queued_bytes += grown
-        if grown > 0 and size > ledger.reserve and ledger.queued_bytes > ledger.memory:
-            reason = f"no memory for {size} bytes of a WebSocket frame (broker.limits.memory)"
+        ledger.take(self._account, grown)
+        if grown > 0 and size > ledger.reserve and not ledger.fits(self._account, 0):
+            reason = (
+                f"no memory for {size} bytes of a WebSocket frame "
+                "(broker.limits.memory, broker.limits.user.memory)"
+            )
             self._client.fail(ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason))
             self._broker.flush()
 
@@ -435,7 +441,7 @@ class ClientProtocol:
         self._waiting_size -= left
         self._begun = 0
         if len(chunk) > WRITE_PORTION:
-            self._network.unshare(chunk)
+            self._network.unshare(self._account, chunk)
         else:
             self._unshared -= len(chunk)
         return memoryview(chunk)[begun:] if begun else chunk
@@ -450,10 +456,9 @@ class ClientProtocol:
         counted = self._unshared
         if self._paused and self._transport is not None:
             counted += self._transport.get_write_buffer_size()
-        network.count_output(counted - self._counted)
+        network.count_output(self._account, counted - self._counted)
         self._counted = counted
-        much = network.output > network.much_output
-        limit = OUTPUT_LOW_WATER if much else OUTPUT_HIGH_WATER
+        limit = OUTPUT_LOW_WATER if network.is_much(self._account) else OUTPUT_HIGH_WATER
         size = self._output_size()
         if size > limit and self._slow is None:
             self._client.output.writable = False
@@ -539,9 +544,14 @@ class ClientProtocol:
         """Seconds of the event loop's clock."""
         return self._loop.time()
 
-    def accepted(self) -> None:
-        """The client has logged in, and may be silent now."""
+    def accepted(self, account: Account) -> None:
+        """The client has logged in as this user, and may be silent now."""
         self._timeout.cancel()
+        self._network.count_output(self._account, -self._counted)
+        self._network.count_output(account, self._counted)
+        self._ledger.take(self._account, -self._frame)
+        self._ledger.take(account, self._frame)
+        self._account = account
 
     def secured(self) -> Secured:
         """The version of TLS, and the name in the client's certificate."""
@@ -590,7 +600,7 @@ class ClientProtocol:
             self._waiting.append(chunk)
             self._waiting_size += len(chunk)
             if len(chunk) > WRITE_PORTION:
-                self._network.share(chunk)
+                self._network.share(self._account, chunk)
             else:
                 self._unshared += len(chunk)
         self._write_on()
@@ -657,7 +667,7 @@ class _Gone:
         """No time passes."""
         return 0.0
 
-    def accepted(self) -> None:
+    def accepted(self, account: Account) -> None:
         """Nobody waits for it."""
 
     def secured(self) -> Secured:

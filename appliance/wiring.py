@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from appliance.amqtt_broker import plugin_kinds
-from appliance.broker.ports import Features, Limits
+from appliance.broker.ports import Features, Limits, UserLimits
 from appliance.certs import TlsContexts
 from appliance.certs.settings import listener_name, tls_files, tls_policies
 from appliance.config import Route, Settings, TopicRoute
@@ -58,6 +58,7 @@ def broker_limits(settings: Settings) -> Limits:
         session_expiry=round(limits.session_expiry),
         topic_alias=limits.topic_alias,
         keep_alive=round(limits.keep_alive),
+        user=UserLimits(**dict(limits.user)),
     )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
+from appliance.broker.accounts import Account
 from appliance.broker.complaints import Complaints
 from appliance.broker.faults import Faults
 from appliance.broker.ledger import Ledger
@@ -81,6 +82,11 @@ class Flushing(Protocol):
 
 #: Who a message may be owed to: a session, or one of a group.
 Receiver: TypeAlias = "Session | Share"
+
+
+def _has_all(account: Account, held: int, what: str, key: str) -> ProtocolError:
+    text = f"{account} has {held} {what}, as many as there may be (broker.limits.{key})"
+    return ProtocolError(ReasonCode.QUOTA_EXCEEDED, text)
 
 
 class Broker:
@@ -153,10 +159,13 @@ class Broker:
 
         Raises:
             ProtocolError: 0x85, the client id belongs to another user's session, which is not
-                touched; 0x97, no more sessions are kept, or its will has no room.
+                touched; 0x97, its user has as many connections or sessions as it may have, or its
+                will has no room.
         """
-        if will is not None and (self.ledger.queued_bytes + will.message.size > self.ledger.memory):
-            raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, "no room for its will")
+        account = self.ledger.accounts.of(identity)
+        if will is not None and not self.ledger.fits(account, will.message.size):
+            reason = "no room for its will (broker.limits.memory, broker.limits.user.memory)"
+            raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason)
         session = self.sessions.get(identity.client_id)
         if session is not None:
             owner = session.identity
@@ -165,6 +174,9 @@ class Broker:
                     ReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
                     f"client id {quote(identity.client_id)} belongs to {session}",
                 )
+        if not account.is_inside:
+            self._make_room(account, session)
+        if session is not None:
             if session.link is not None:  # [MQTT-3.1.4-3], v3.1.1 [MQTT-3.1.4-2]
                 session.close_link(ReasonCode.SESSION_TAKEN_OVER, f"taken over by {identity}")
             if clean_start or not self._is_alive(session):  # [MQTT-3.1.2-4], 3.1.1 [MQTT-3.1.2-6]
@@ -173,14 +185,10 @@ class Broker:
         session = self.sessions.get(identity.client_id)
         present = session is not None
         if session is None:
-            if len(self.sessions) >= self.limits.sessions:
-                raise ProtocolError(
-                    ReasonCode.QUOTA_EXCEEDED,
-                    f"{len(self.sessions)} sessions are kept, as many as allowed",
-                )
             session = Session(identity.client_id, identity, self.ledger)
             self.sessions[identity.client_id] = session
         session.link = link
+        self.ledger.accounts.came(session)
         session.ends_at = None
         session.set_will(will)
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
@@ -188,9 +196,61 @@ class Broker:
         self.store.session_saved(session)
         return session, present
 
+    def _make_room(self, account: Account, session: Session | None) -> None:
+        """Let there be room for a client of the account, and for its session if it has none.
+
+        As long as there is any, everybody may have it, up to what the configuration allows a user.
+        When there is none, who has most gives some back: its newest connection, and of its
+        sessions the one whose client has been away for longest.
+
+        Raises:
+            ProtocolError: 0x97, nobody has more than this one would have.
+        """
+        accounts, limits, quotas = self.ledger.accounts, self.limits, self.ledger.quotas
+        if session is None or session.link is None:
+            if account.connections >= quotas.connections:
+                raise _has_all(account, account.connections, "connections", "user.connections")
+            if accounts.connections >= limits.connections:
+                holder = accounts.largest(lambda each: each.connections)
+                if holder.connections <= account.connections + 1:
+                    raise _has_all(account, account.connections, "connections", "connections")
+                self._take_back(holder, next(reversed(holder.present)), account, "connections")
+        if session is None:
+            if account.sessions >= quotas.sessions:
+                raise _has_all(account, account.sessions, "sessions", "user.sessions")
+            if accounts.sessions >= limits.sessions:
+                holder = accounts.largest(lambda each: each.sessions)
+                if holder.sessions <= account.sessions + 1:
+                    raise _has_all(account, account.sessions, "sessions", "sessions")
+                # With fewer sessions than connections allowed there may be no absent one.
+                oldest = next(iter(holder.absent), None) or next(reversed(holder.present))
+                self._take_back(holder, oldest, account, "sessions")
+                if self.sessions.get(oldest.client_id) is oldest:
+                    self._end(oldest)
+
+    def _take_back(self, holder: Account, session: Session, account: Account, what: str) -> None:
+        """End the connection of a session, if it has one, as another user needs the place."""
+        self.counters.taken_back += 1
+        self.complaints.tell(
+            self.now,
+            ("taken back", what, holder.username),
+            "%s makes room for %s: broker.limits.%s is reached, and %s has most of it "
+            "(broker.limits.user.%s bounds what a user may have)",
+            session,
+            account,
+            what,
+            holder,
+            what,
+        )
+        session.close_link(
+            ReasonCode.QUOTA_EXCEEDED,
+            f"others need a place, and its user has most (broker.limits.{what})",
+        )
+
     def claim(self, session: Session, identity: Identity) -> None:
         """A session that was made for a client that had not logged in yet has found its user."""
         session.identity = identity
+        self.ledger.accounts.move(session, self.ledger.accounts.of(identity))
         self.store.session_saved(session)
         session.readable.clear()
         self.router.changed()
@@ -249,6 +309,7 @@ class Broker:
         if not session.persistent:
             self._end(session)
             return
+        self.ledger.accounts.left(session)
         session.ends_at = self.now + session.expiry
         if will is not None and will.delay:
             session.will_at = self.now + will.delay
@@ -265,6 +326,7 @@ class Broker:
         """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
         if self.sessions.get(session.client_id) is session:
             del self.sessions[session.client_id]
+        self.ledger.accounts.ended(session)
         self._publish_will(session)
         session.ends_at = None
         for topic_filter in session.subscriptions:
@@ -397,9 +459,8 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
-        kept = not retain or self.retained.keep(
-            message
-        )  # no room to keep it: who is there still gets it
+        # Without room to keep it who is there still gets it.
+        kept = not retain or self.retained.keep(message, origin.account)
         published_qos = message.qos
         self.counters.effort += 1 + len(targets)
         taken = full = False
@@ -547,8 +608,8 @@ class Broker:
             session.bytes,
         )
 
-    def _retained_changed(self, message: Message) -> None:
-        self.store.retained(message)
+    def _retained_changed(self, message: Message, owner: Account) -> None:
+        self.store.retained(message, owner)
         if self.observer is not None:
             self.observer.retained(message)
 
@@ -589,7 +650,10 @@ class Broker:
                 reason = f"it has {maximum} subscriptions (broker.limits.subscriptions)"
                 return ReasonCode.QUOTA_EXCEEDED, reason
             if not session.fits(subscription_size(topic_filter)):
-                reason = "no memory for it (broker.limits.queue_bytes, broker.limits.memory)"
+                reason = (
+                    "no memory for it (broker.limits.queue_bytes, broker.limits.user.memory, "
+                    "broker.limits.memory)"
+                )
                 return ReasonCode.QUOTA_EXCEEDED, reason
         decision = self.router.decide(session.identity, Action.SUBSCRIBE, topic_filter)
         if not decision:

@@ -80,6 +80,8 @@ class Client:
         self._work: Iterator[Packet | None] | None = None
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
+        #: Who they are counted for: nobody in particular until the login.
+        self.account = broker.ledger.accounts.strangers
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
         self._method = ""  # of its enhanced authentication
@@ -139,14 +141,14 @@ class Client:
         ledger = self._ledger
         grown = self.connection.held - self._held
         self._held += grown
-        ledger.queued_bytes += grown
+        ledger.take(self.account, grown)
         ledger.input_bytes += grown
-        if grown > 0 and self._held > ledger.reserve and ledger.queued_bytes > ledger.memory:
+        if grown > 0 and self._held > ledger.reserve and not ledger.fits(self.account, 0):
             self.fail(
                 ProtocolError(
                     ReasonCode.QUOTA_EXCEEDED,
                     f"no memory for {self._held} bytes of unfinished packets and topic aliases "
-                    "(broker.limits.memory)",
+                    "(broker.limits.memory, broker.limits.user.memory)",
                 )
             )
 
@@ -543,12 +545,15 @@ class Client:
             self._connect = packet
             self.refuse(error.code, str(error))
             return
-        self.wire.accepted()
+        self.wire.accepted(session.account)
         session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         session.reconnected()
         self.session = session
+        self._ledger.take(self.account, -self._held)
+        self.account = session.account
+        self._ledger.take(self.account, self._held)
         explains = agreement.explain and self.broker.features.reason_strings
         self.output.open(session, agreement.aliases, explains=explains)
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
@@ -705,7 +710,7 @@ class Client:
         self._closed = True
         self._work = None
         self.connection.close()
-        self._ledger.queued_bytes -= self._held
+        self._ledger.take(self.account, -self._held)
         self._ledger.input_bytes -= self._held
         self._held = 0
         self.broker.clients.discard(self)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
@@ -46,7 +48,7 @@ class Kept:
     session: Session | None = None
 
 
-def restore(broker: Broker, kept: list[Kept], retained: list[Message]) -> None:
+def restore(broker: Broker, kept: list[Kept], retained: list[tuple[Message, Account]]) -> None:
     """Take up the sessions and retained messages of the last run, before anybody connects.
 
     A client that was connected when that ended counts as gone since now: so do the time that
@@ -69,6 +71,9 @@ def restore(broker: Broker, kept: list[Kept], retained: list[Message]) -> None:
         for subscription in entry.subscriptions:
             session.subscribe(subscription)
             broker.router.join(session, subscription)
+    for entry in sorted(kept, key=_left_at):
+        assert entry.session is not None
+        broker.ledger.accounts.left(entry.session)
     for entry in kept:  # what is owed names sessions and groups, all of which are there now
         _restore_owed(broker, entry)
     broker.retained.restore(retained)
@@ -76,6 +81,11 @@ def restore(broker: Broker, kept: list[Kept], retained: list[Message]) -> None:
         assert entry.session is not None
         for subscription in entry.replaying:  # from the beginning: what was sent is not known
             broker.replay_retained(entry.session, subscription, is_new=True)
+
+
+def _left_at(entry: Kept) -> float:
+    # Who was still there then has left last.
+    return math.inf if entry.ends_at is None else entry.ends_at - entry.expiry
 
 
 def _restore_owed(broker: Broker, entry: Kept) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from appliance.broker.accounts import Account, Accounts, Quotas
 from appliance.broker.faults import Faults
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits, Store
@@ -39,6 +40,8 @@ class Counters:
     #: client's turn can be ended without a look at the clock.
     effort: int = 0
     sessions_expired: int = 0
+    #: Connections and sessions that were ended as their users had most, and others none.
+    taken_back: int = 0
     clients_maximum: int = 0
 
     @property
@@ -62,6 +65,8 @@ class Ledger:
     faults: Faults = field(default_factory=Faults)
     #: Seconds of the clock that `Broker.tick` was last given.
     now: float = 0.0
+    #: Who holds how much of what all share.
+    accounts: Accounts = field(default_factory=Accounts)
     #: Bytes that the queues, subscriptions and wills of all sessions hold, and the output buffers.
     queued_bytes: int = 0
     #: Among these, what came from clients and is not done with: parts of packets, topic aliases.
@@ -71,6 +76,10 @@ class Ledger:
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     memory: int = field(init=False)
+    #: As long as no more than this is in use, in bytes, nobody has to be asked who they are.
+    plenty: int = field(init=False)
+    #: And what each user may have.
+    quotas: Quotas = field(init=False)
     #: And what a connected client may hold when all the memory is taken by others, in bytes.
     reserve: int = field(init=False)
     #: Nothing can be kept: the store's last commit failed.
@@ -90,6 +99,34 @@ class Ledger:
         # An eighth is set apart, so that those who hold much do not starve those who hold little.
         self.memory = limits.memory * 7 // 8
         self.reserve = limits.memory // 8 // limits.connections
+        self.quotas = Quotas(limits, self.memory, self.store.size)
+        self.plenty = min(self.quotas.memory.lent, self.quotas.memory.most)
+
+    def fits(self, account: Account, size: int) -> bool:
+        """Whether the account may take so many bytes of memory more."""
+        return account.is_inside or self.quotas.memory.allows(
+            account.bytes, self.queued_bytes, size
+        )
+
+    def is_reserved(self, account: Account, size: int) -> bool:
+        """Whether the account may have that of what is set apart for its connected clients.
+
+        What they have of it they take with them when they go, so it is not without an end.
+        """
+        own = self.quotas.memory.own + self.reserve * account.connections
+        return account.bytes + size <= own and self.queued_bytes + size <= self.limits.memory
+
+    def may_store(self, account: Account, size: int) -> bool:
+        """Whether a message of so many bytes more may be kept in the store for the account."""
+        store = self.store
+        if account.is_inside:
+            return store.bytes + size <= store.size
+        return self.quotas.stored.allows(account.stored, store.bytes, size)
+
+    def take(self, account: Account, size: int) -> None:
+        """The account holds so many bytes of memory more, or less."""
+        account.bytes += size
+        self.queued_bytes += size
 
     def has_expired(self, message: Message) -> bool:
         """Whether it must not be sent any more [MQTT-3.3.2-5]; counted, if so."""

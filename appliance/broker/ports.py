@@ -12,6 +12,7 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 
 if TYPE_CHECKING:
+    from appliance.broker.accounts import Account
     from appliance.broker.message import Message
     from appliance.broker.session import Delivery, Held, Session
     from appliance.mqtt.packets import Connect
@@ -181,6 +182,10 @@ class Store(Protocol):
     batch: int
     committed: int
 
+    #: Bytes of the messages that are kept, and the most that these may be.
+    bytes: int
+    size: int
+
     def listen(self, callback: Callable[[bool], None]) -> None:
         """Call back whenever a batch is done with: with True when it is kept.
 
@@ -190,9 +195,6 @@ class Store(Protocol):
 
     def hurry(self) -> None:
         """Commit soon: somebody waits."""
-
-    def has_room(self, size: int) -> bool:
-        """Whether a message of so many bytes more may be kept."""
 
     def session_saved(self, session: Session) -> None:
         """The session was made, or its owner, its expiry or its will changed."""
@@ -206,8 +208,11 @@ class Store(Protocol):
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         """The session unsubscribed."""
 
-    def retained(self, message: Message) -> None:
-        """The message is its topic's retained message now; an empty payload deletes it."""
+    def retained(self, message: Message, owner: Account) -> None:
+        """The message is its topic's retained message now; an empty payload deletes it.
+
+        `owner` is whose client has published it.
+        """
 
     def queued(self, session: Session, delivery: Delivery) -> None:
         """A QoS 1 or 2 message is owed to the session, and waits."""
@@ -292,8 +297,8 @@ class Wire(Protocol):
     def now(self) -> float:
         """Seconds of a clock that never goes back, finer than the broker's."""
 
-    def accepted(self) -> None:
-        """The client has logged in: the time limit for that is over."""
+    def accepted(self, account: Account) -> None:
+        """The client has logged in as that user: the time limit for that is over."""
 
     def secured(self) -> Secured:
         """What protects the connection, and who its certificate says that the client is."""
@@ -357,6 +362,19 @@ USUAL_PACKET_SIZE = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
+class UserLimits:
+    """What one user may have of what all share, see `accounts`; None is as others leave room."""
+
+    connections: int | None = None
+    sessions: int | None = None
+    memory: int | None = None
+    retained_messages: int | None = None
+    retained_bytes: int | None = None
+    #: Of `Store.size`.
+    stored: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Limits:
     """Bounds of everything that a client can make grow; see `broker.limits` in appliance.yaml."""
 
@@ -379,3 +397,4 @@ class Limits:
     topic_alias: int = 10
     keep_alive: int = 65535
     sessions: int = 10_000
+    user: UserLimits = UserLimits()

@@ -6,6 +6,7 @@ import heapq
 import itertools
 from collections.abc import Callable, Iterator
 
+from appliance.broker.accounts import Account
 from appliance.broker.complaints import Complaints
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Message
@@ -25,11 +26,12 @@ def retained_size(message: Message) -> int:
 class Retained:
     """The retained messages by topic; `changed` is told of each that is new, replaced or gone.
 
-    One that is gone it is told as an empty message.
+    One that is gone it is told as an empty message. A message is in the account of who published
+    it, the last one of several.
     """
 
     def __init__(
-        self, ledger: Ledger, complaints: Complaints, changed: Callable[[Message], None]
+        self, ledger: Ledger, complaints: Complaints, changed: Callable[[Message, Account], None]
     ) -> None:
         #: Bytes of all of them, see `retained_size`.
         self.bytes = 0
@@ -37,6 +39,7 @@ class Retained:
         self._complaints = complaints
         self._changed = changed
         self._messages: TopicTree[Message] = TopicTree()
+        self._owners: dict[str, Account] = {}
         #: When they expire, soonest first.
         self._expiring: list[tuple[float, int, Message]] = []
         self._order = itertools.count()
@@ -56,52 +59,96 @@ class Retained:
         """`find`, with a None now and then, so that a long search can be put off in its middle."""
         return self._messages.find_in_steps(topic_filter)
 
-    def restore(self, messages: list[Message]) -> None:
-        """Take up what the store has kept."""
-        for message in messages:
-            self._messages.set(message.topic, message)
-            self.bytes += retained_size(message)
-            self._schedule_expiry(message)
+    def owner(self, topic: str) -> Account:
+        """In whose account the topic's retained message is. Raises KeyError: there is none."""
+        return self._owners[topic]
 
-    def keep(self, message: Message) -> bool:
+    def restore(self, messages: list[tuple[Message, Account]]) -> None:
+        """Take up what the store has kept."""
+        for message, owner in messages:
+            self._put(message, owner)
+
+    def keep(self, message: Message, owner: Account) -> bool:
         """Retain the message, or with an empty one none any more; False when there is no room."""
-        ledger = self._ledger
-        if ledger.refusing and message.qos:
+        if self._ledger.refusing and message.qos:
             return False
         old = self._messages.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
             if old is None:
                 return True
-            self.bytes -= retained_size(old)
+            self._take_out(old)
             self._messages.delete(message.topic)
         else:
             message.settle()
-            grown = self.bytes + retained_size(message)
-            grown -= retained_size(old) if old is not None else 0
-            limits = ledger.limits
-            if grown > limits.retained_bytes or (
-                old is None and len(self._messages) >= limits.retained_messages
-            ):
-                ledger.counters.publish_dropped += 1
-                self._complaints.tell(
-                    ledger.now,
-                    "retained",
-                    "no room to retain %s: %d messages and %d bytes are retained "
-                    "(broker.limits.retained_messages, broker.limits.retained_bytes)",
-                    quote(message.topic),
-                    len(self._messages),
-                    self.bytes,
-                )
+            if not self._has_room(message, old, owner):
+                self._ledger.counters.publish_dropped += 1
+                self._tell_full(message, owner)
                 return False
-            self.bytes = grown
-            self._messages.set(message.topic, message)
-            self._schedule_expiry(message)
-        self._changed(message)
+            self._put(message, owner)
+        self._changed(message, owner)
         return True
 
     def delete(self, topic: str) -> None:
         """Retain nothing for the topic any more."""
-        self.keep(Message(topic, b"", retain=True))
+        self.keep(Message(topic, b"", retain=True), self._ledger.accounts.inside)
+
+    def _put(self, message: Message, owner: Account) -> None:
+        old = self._messages.get(message.topic)
+        if old is not None:
+            self._take_out(old)
+        size = retained_size(message)
+        self.bytes += size
+        self._owners[message.topic] = owner
+        self._ledger.accounts.retain(owner, 1, size)
+        self._messages.set(message.topic, message)
+        self._schedule_expiry(message)
+
+    def _take_out(self, old: Message) -> None:
+        size = retained_size(old)
+        self.bytes -= size
+        self._ledger.accounts.retain(self._owners.pop(old.topic), -1, -size)
+
+    def _has_room(self, message: Message, old: Message | None, owner: Account) -> bool:
+        """Whether it may take the old one's place, which makes room for it whosever it is."""
+        ledger = self._ledger
+        accounts, limits = ledger.accounts, ledger.limits
+        size = retained_size(message)
+        before = self._owners[message.topic] if old is not None else None
+        freed = retained_size(old) if old is not None else 0
+        own = freed if before is owner else 0
+        if owner.is_inside:  # what users have leaves it as much as all of them have
+            return (
+                owner.retained < limits.retained_messages + (before is owner)
+                and owner.retained_bytes - own + size <= limits.retained_bytes
+            )
+        if before is owner and size <= freed:
+            return True
+        of_users = 0 if before is None or before.is_inside else 1
+        quotas = ledger.quotas
+        return (
+            quotas.retained.allows(
+                owner.retained - (before is owner), accounts.retained - of_users, 1
+            )
+            and quotas.retained_bytes.allows(
+                owner.retained_bytes - own, accounts.retained_bytes - freed * of_users, size
+            )
+            and ledger.may_store(owner, max(0, message.size - (old.size if old else 0)))
+        )
+
+    def _tell_full(self, message: Message, owner: Account) -> None:
+        self._complaints.tell(
+            self._ledger.now,
+            ("retained", owner.username),
+            "no room to retain %s: %s has %d retained messages with %d bytes, of %d with %d in all "
+            "(broker.limits.user.retained_messages and .retained_bytes, "
+            "broker.limits.retained_messages and .retained_bytes, broker.store.size)",
+            quote(message.topic),
+            owner,
+            owner.retained,
+            owner.retained_bytes,
+            len(self._messages),
+            self.bytes,
+        )
 
     def _schedule_expiry(self, message: Message) -> None:
         if message.expires_at is None:

@@ -90,6 +90,7 @@ class Session:
     __slots__ = (
         "_agreed_window",
         "_last_packet_id",
+        "account",
         "batch",
         "bytes",
         "client_id",
@@ -122,6 +123,8 @@ class Session:
         self.client_id = client_id
         self.identity = identity
         self.ledger = ledger
+        #: Of its user, whose memory it takes.
+        self.account = ledger.accounts.of(identity)
         self.link: Link | None = None
         #: For a session inside the appliance that wants to know who published what it receives.
         self.link_for: Callable[[Session], Link] | None = None
@@ -215,7 +218,7 @@ class Session:
         ledger = self.ledger
         size = message.size
         if (
-            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.memory
+            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.plenty
         ) or self.fits(size):
             if (
                 link is not None
@@ -258,7 +261,7 @@ class Session:
 
     def _may_store(self, message: Message) -> bool:
         ledger = self.ledger
-        return not ledger.refusing and ledger.store.has_room(message.size)
+        return not ledger.refusing and ledger.may_store(self.account, message.size)
 
     def _enqueue(self, delivery: Delivery, *, promised: bool = False) -> bool:
         """Let it wait; False when it had to be stored and cannot be, which is counted."""
@@ -455,8 +458,10 @@ class Session:
         while packet_id in inflight:  # [MQTT-2.2.1-3]
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
-        self.bytes += message.size
-        self.ledger.queued_bytes += message.size
+        size = message.size
+        self.bytes += size
+        self.account.bytes += size
+        self.ledger.queued_bytes += size
         inflight[packet_id] = delivery
         if self.expiry:
             self._staged()
@@ -537,12 +542,10 @@ class Session:
         message.dropped()
 
     def _count(self, message: Message) -> None:
-        self.bytes += message.size
-        self.ledger.queued_bytes += message.size
+        self._take(message.size)
 
     def _uncount(self, message: Message) -> None:
-        self.bytes -= message.size
-        self.ledger.queued_bytes -= message.size
+        self._take(-message.size)
 
     def _settled(self, delivery: Delivery) -> None:
         if self.expiry:
@@ -566,6 +569,7 @@ class Session:
             self.resends.remove(packet_id)
         size = delivery[0].size
         self.bytes -= size
+        self.account.bytes -= size
         self.ledger.queued_bytes -= size
         if self.expiry:
             self.ledger.store.settled(self, delivery)
@@ -677,12 +681,17 @@ class Session:
         ledger = self.ledger
         held = self.bytes + size
         return held <= ledger.queue_bytes and (
-            ledger.queued_bytes + size <= ledger.memory
-            or (self.link is not None and held <= ledger.reserve)
+            ledger.fits(self.account, size)
+            or (
+                self.link is not None
+                and held <= ledger.reserve
+                and ledger.is_reserved(self.account, size)
+            )
         )
 
     def _take(self, size: int) -> None:
         self.bytes += size
+        self.account.bytes += size
         self.ledger.queued_bytes += size
 
     def hand_over(
@@ -726,8 +735,7 @@ class Session:
 
     def clear(self) -> None:
         """Give back all that this session holds."""
-        self.ledger.queued_bytes -= self.bytes
-        self.bytes = 0
+        self._take(-self.bytes)
         self.will = None
         self.subscriptions.clear()
         for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):

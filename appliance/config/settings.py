@@ -135,6 +135,17 @@ class Tls(_Section):
     ciphers: str | None = None
 
 
+class UserLimits(_Section):
+    """What one user may have at most, of what all clients have; None is as others leave room."""
+
+    connections: Count | None = None
+    sessions: Count | None = None
+    memory: Annotated[Size, Field(ge=1 << 10)] | None = None
+    retained_messages: Annotated[int, Field(ge=0)] | None = None
+    retained_bytes: Annotated[Size, Field(ge=0)] | None = None
+    stored: Annotated[Size, Field(ge=0)] | None = None
+
+
 class Limits(_Section):
     """What one client, and all together, may use. Sizes in bytes, times in seconds."""
 
@@ -161,6 +172,7 @@ class Limits(_Section):
     session_expiry: Annotated[Duration, Field(ge=0, lt=0xFFFF_FFFF)] = 7 * 86400.0
     keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 65535.0
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
+    user: UserLimits = _section()
 
 
 class PluginAnswers(_Section):

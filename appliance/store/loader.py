@@ -6,8 +6,9 @@ import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
+from appliance.broker.accounts import Account
 from appliance.broker.kept import Kept, Owed
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
@@ -104,6 +105,11 @@ def owed_row(
     )
 
 
+def retained_row(key: int, message: int, owner: Account) -> Row:
+    """The row of a retained message in the owner's account."""
+    return key, message, owner.username, int(owner.is_inside)
+
+
 def received_row(
     key: int, session: int, packet_id: int, message: int, held: Held, full: list[int]
 ) -> Row:
@@ -130,13 +136,21 @@ class LoadedSession:
     received: dict[int, int] = field(default_factory=dict)
 
 
+class Owned(NamedTuple):
+    """A retained message and whose client has published it: a user's, or the appliance itself."""
+
+    message: Message
+    username: str | None
+    is_inside: bool
+
+
 @dataclass(slots=True)
 class Loaded:
     """All that was kept; `useless` are rows that nothing refers to, or that mean nothing."""
 
     sessions: dict[int, LoadedSession] = field(default_factory=dict)
     messages: dict[int, Message] = field(default_factory=dict)
-    retained: dict[int, Message] = field(default_factory=dict)
+    retained: dict[int, Owned] = field(default_factory=dict)
     useless: list[tuple[Table, int]] = field(default_factory=list)
     last_key: int = 0
 
@@ -335,5 +349,11 @@ def _take_received(row: Row, loaded: Loaded) -> None:
 
 
 def _take_retained(row: Row, loaded: Loaded) -> None:
-    key, message = row
-    loaded.retained[_of(int, key)] = loaded.messages[_of(int, message)]
+    key, number, *owner = row
+    message = loaded.messages[_of(int, number)]
+    username, is_inside = owner or (None, 0)  # an older appliance has not kept whose it is
+    loaded.retained[_of(int, key)] = Owned(
+        message,
+        None if username is None else _of(str, username),
+        _within(is_inside, 0, 1) == 1,
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from appliance.broker.accounts import Account
 from appliance.broker.message import Message
 from appliance.broker.session import Delivery, Held, Session
 from appliance.mqtt.packets import Subscription
@@ -17,16 +18,15 @@ class MemoryStore:
         self.fresh = False
         self.batch = 1
         self.committed = 0
+        self.bytes = 0
+        #: The broker's own limits are all there are.
+        self.size = 1 << 62
 
     def listen(self, callback: Callable[[bool], None]) -> None:
         """There is nothing to tell."""
 
     def hurry(self) -> None:
         """Nothing is staged."""
-
-    def has_room(self, size: int) -> bool:
-        """The broker's own limits are all there are."""
-        return True
 
     def session_saved(self, session: Session) -> None:
         """The broker has it."""
@@ -40,7 +40,7 @@ class MemoryStore:
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         """The session has forgotten it."""
 
-    def retained(self, message: Message) -> None:
+    def retained(self, message: Message, owner: Account) -> None:
         """The broker has it."""
 
     def queued(self, session: Session, delivery: Delivery) -> None:

@@ -59,7 +59,7 @@ COLUMNS: dict[Table, tuple[str, ...]] = {
         *("packet_id", "sent"),
     ),
     Table.RECEIVED: ("id", "session", "packet_id", "message", "no_room"),
-    Table.RETAINED: ("id", "message"),
+    Table.RETAINED: ("id", "message", "username", "inside"),
     Table.CLOCK: ("id", "time", "wall", "counted", "boot"),
 }
 
@@ -134,6 +134,12 @@ MIGRATIONS: tuple[str, ...] = (
     """
     -- 1: the client has yet to be sent some of the retained messages that it subscribed to
     ALTER TABLE subscription ADD COLUMN replaying INTEGER NOT NULL DEFAULT 0;
+    """,
+    """
+    -- whose client has published it: NULL for an anonymous one, as for all of an older appliance
+    ALTER TABLE retained ADD COLUMN username TEXT;
+    -- 1: the appliance itself has
+    ALTER TABLE retained ADD COLUMN inside INTEGER NOT NULL DEFAULT 0;
     """,
 )
 

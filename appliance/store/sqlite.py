@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.kept import restore
 from appliance.broker.message import Message
@@ -29,6 +30,7 @@ from appliance.store.loader import (
     message_row,
     owed_row,
     received_row,
+    retained_row,
     session_row,
     subscription_row,
 )
@@ -66,12 +68,13 @@ class _Stored:
 
 
 class _Known:
-    """The rows of a session."""
+    """The rows of a session, and whose room they take."""
 
-    __slots__ = ("filters", "key", "owed", "received", "recorded", "will")
+    __slots__ = ("account", "filters", "key", "owed", "received", "recorded", "will")
 
-    def __init__(self, key: int) -> None:
+    def __init__(self, key: int, account: Account) -> None:
         self.key = key
+        self.account = account
         self.filters: dict[str, int] = {}
         #: By the delivery's identity: its row, itself, and its place in the order of sending.
         self.owed: dict[int, tuple[int, Delivery, int | None]] = {}
@@ -126,7 +129,7 @@ class SqliteStore:
         self._keys = itertools.count(1)
         self._sessions: dict[Session, _Known] = {}
         self._messages: dict[Message, _Stored] = {}
-        self._retained: dict[str, tuple[int, Message]] = {}
+        self._retained: dict[str, tuple[int, Message, Account]] = {}
         self._open = Batch(self.batch, 1)
         #: Whether something may depend on what is in the open batch.
         self._depended = False
@@ -212,8 +215,8 @@ class SqliteStore:
         for table, key in loaded.useless:
             self._open.rows[table].pop(key, None)
             self._open.deleted[table][key] = None
-        for message in loaded.messages.values():
-            if not self._messages[message].references:
+        for message, stored in list(self._messages.items()):
+            if not stored.references:
                 self._forget(message)
         self._writer.start(contents.connection)
         self._running = True
@@ -238,22 +241,24 @@ class SqliteStore:
             )
 
     def _adopt(self, broker: Broker, loaded: Loaded, rows: database.Rows) -> None:
-        restore(
-            broker,
-            [session.kept for session in loaded.sessions.values()],
-            list(loaded.retained.values()),
-        )
-        for key, message in loaded.retained.items():
+        accounts = broker.ledger.accounts
+        for key, (message, username, is_inside) in loaded.retained.items():
             before = self._retained.get(message.topic)
             if before is not None:
                 self._open.remove(Table.RETAINED, before[0])
-                self._release(before[1])
-            self._retained[message.topic] = key, message
-            self._messages[message].references += 1
+                self._release(*before[1:])
+            owner = accounts.inside if is_inside else accounts.of_user(username)
+            self._retained[message.topic] = key, message, owner
+            self._adopt_message(message, owner)
+        restore(
+            broker,
+            [session.kept for session in loaded.sessions.values()],
+            [(message, owner) for _, message, owner in self._retained.values()],
+        )
         for entry in loaded.sessions.values():
             session = entry.kept.session
             assert session is not None
-            known = self._sessions[session] = _Known(entry.key)
+            known = self._sessions[session] = _Known(entry.key, session.account)
             known.filters = entry.filters
             flying = zip(entry.inflight, session.inflight.items(), strict=True)
             for key, (packet_id, delivery) in flying:
@@ -265,16 +270,21 @@ class SqliteStore:
                 self._take(known, key, delivery, None)
             for packet_id, held in session.received.items():
                 known.received[packet_id] = entry.received[packet_id], held.message
-                self._messages[held.message].references += 1
+                self._adopt_message(held.message, known.account)
             if entry.kept.will is not None:
                 known.will = entry.kept.will.message
-                self._messages[known.will].references += 1
+                self._adopt_message(known.will, known.account)
             if entry.kept.ends_at is None:  # its time runs from now on, through further restarts
                 self._put_session(session, known)
 
     def _take(self, known: _Known, key: int, delivery: Delivery, sent: int | None) -> None:
         known.owed[id(delivery)] = key, delivery, sent
-        self._messages[delivery[0]].references += 1
+        self._adopt_message(delivery[0], known.account)
+
+    def _adopt_message(self, message: Message, account: Account) -> None:
+        stored = self._messages[message]
+        stored.references += 1
+        account.stored += stored.size
 
     async def close(self) -> None:
         """Write what is left, and end; may be called twice, and instead of `restore`."""
@@ -467,11 +477,7 @@ class SqliteStore:
 
     # --- messages ------------------------------------------------------------------------------
 
-    def has_room(self, size: int) -> bool:
-        """See `Store`."""
-        return self.bytes + size <= self.size
-
-    def _refer(self, message: Message) -> int:
+    def _refer(self, message: Message, account: Account) -> int:
         """The key of the message's row, which is made when there is none, for one who refers."""
         stored = self._messages.get(message)
         if stored is None:
@@ -483,6 +489,7 @@ class SqliteStore:
         elif stored.expires_at is not message.expires_at:  # a will that is published
             self._put_message(message, stored)
         stored.references += 1
+        account.stored += stored.size
         return stored.key
 
     def _put_message(self, message: Message, stored: _Stored) -> None:
@@ -490,10 +497,11 @@ class SqliteStore:
         row = message_row(stored.key, message, self._offset, stored.stored_at)
         self._open.put(Table.MESSAGE, stored.key, row)
 
-    def _release(self, message: Message) -> None:
+    def _release(self, message: Message, account: Account) -> None:
         """One less refers to it."""
         stored = self._messages[message]
         stored.references -= 1
+        account.stored -= stored.size
         if not stored.references:
             self._forget(message)
 
@@ -514,13 +522,13 @@ class SqliteStore:
         known = self._sessions.get(session)
         is_new = known is None
         if known is None:
-            known = self._sessions[session] = _Known(next(self._keys))
+            known = self._sessions[session] = _Known(next(self._keys), session.account)
         will = session.will.message if session.will is not None else None
         if will is not known.will:
             if will is not None:
-                self._refer(will)
+                self._refer(will, known.account)
             if known.will is not None:
-                self._release(known.will)
+                self._release(known.will, known.account)
             known.will = will
         self._put_session(session, known)
         if not session.expiry:
@@ -555,12 +563,12 @@ class SqliteStore:
             self._open.remove(Table.SUBSCRIPTION, key)
         for key, delivery, _ in known.owed.values():
             self._open.remove(Table.OWED, key)
-            self._release(delivery[0])
+            self._release(delivery[0], known.account)
         for key in known.recorded.values():
             self._open.remove(Table.OWED, key)
         for key, message in known.received.values():
             self._open.remove(Table.RECEIVED, key)
-            self._release(message)
+            self._release(message, known.account)
         for rows in (known.filters, known.owed, known.recorded, known.received):
             rows.clear()
 
@@ -571,7 +579,7 @@ class SqliteStore:
             return
         self._drop(known)
         if known.will is not None:
-            self._release(known.will)
+            self._release(known.will, known.account)
         self._open.remove(Table.SESSION, known.key)
         self._stage()
 
@@ -596,7 +604,7 @@ class SqliteStore:
             self._open.remove(Table.SUBSCRIPTION, key)
             self._stage()
 
-    def retained(self, message: Message) -> None:
+    def retained(self, message: Message, owner: Account) -> None:
         """See `Store`; the broker's own topics are made anew by every run, and not kept."""
         topic = message.topic
         if topic.startswith("$"):
@@ -604,12 +612,13 @@ class SqliteStore:
         before = self._retained.pop(topic, None)
         if message.payload:
             key = before[0] if before is not None else next(self._keys)
-            self._open.put(Table.RETAINED, key, (key, self._refer(message)))
-            self._retained[topic] = key, message
+            row = retained_row(key, self._refer(message, owner), owner)
+            self._open.put(Table.RETAINED, key, row)
+            self._retained[topic] = key, message, owner
         elif before is not None:
             self._open.remove(Table.RETAINED, before[0])
         if before is not None:
-            self._release(before[1])
+            self._release(*before[1:])
         if message.qos:
             self._stage()
         else:
@@ -630,7 +639,7 @@ class SqliteStore:
         entry = known.owed.get(id(delivery))
         if entry is None:
             key = next(self._keys)
-            message = self._refer(delivery[0])
+            message = self._refer(delivery[0], known.account)
         else:
             key = entry[0]
             message = self._messages[delivery[0]].key
@@ -646,7 +655,7 @@ class SqliteStore:
         entry = known.owed.pop(id(delivery), None) if known is not None else None
         if entry is not None:
             self._open.remove(Table.OWED, entry[0])
-            self._release(delivery[0])
+            self._release(delivery[0], session.account)
             self._stage_lazily()
 
     def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
@@ -658,7 +667,7 @@ class SqliteStore:
             known.recorded[packet_id] = key
             row = owed_row(key, known.key, None, delivery, packet_id, sent)
             self._open.put(Table.OWED, key, row)
-            self._release(delivery[0])
+            self._release(delivery[0], known.account)
             self._stage()
 
     def completed(self, session: Session, packet_id: int) -> None:
@@ -676,7 +685,7 @@ class SqliteStore:
             return
         key = next(self._keys)
         known.received[packet_id] = key, held.message
-        message = self._refer(held.message)
+        message = self._refer(held.message, known.account)
         full = [
             self._sessions[each].key
             for each in held.full
@@ -692,5 +701,5 @@ class SqliteStore:
         entry = known.received.pop(packet_id, None) if known is not None else None
         if entry is not None:
             self._open.remove(Table.RECEIVED, entry[0])
-            self._release(entry[1])
+            self._release(entry[1], session.account)
             self._stage()

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits
+from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits, UserLimits
 from appliance.broker.retained import retained_size
 from appliance.broker.session import Delivery, Held, Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
@@ -35,6 +36,11 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 from appliance.mqtt.topics import matches
 from appliance.store import MemoryStore
+
+#: For tests of what all have together, with one user.
+ALONE = UserLimits(
+    memory=1 << 60, retained_messages=1 << 60, retained_bytes=1 << 60, stored=1 << 60
+)
 
 
 class FakeAccess:
@@ -108,7 +114,7 @@ class FakeStore(MemoryStore):
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         del self.subscriptions[session.client_id, topic_filter]
 
-    def retained(self, message: Message) -> None:
+    def retained(self, message: Message, owner: Account) -> None:
         self._stage()
         self.kept[message.topic] = message.payload
         if not message.payload:
@@ -169,7 +175,7 @@ class FakeWire:
     def now(self) -> float:
         return 0.0
 
-    def accepted(self) -> None:
+    def accepted(self, account: Account) -> None:
         assert not self.closed
 
     def is_behind(self) -> bool:
@@ -427,6 +433,41 @@ def check_accounts(broker: Broker) -> None:
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
     assert broker.retained.bytes == sum(retained_size(message) for message in retained)
+    check_users(broker, retained)
+
+
+def check_users(broker: Broker, retained: list[Message]) -> None:
+    """And each user's part of them is what that user holds."""
+    accounts = broker.ledger.accounts
+    sessions, queued, kept = Counter[Account](), Counter[Account](), Counter[Account]()
+    for session in broker.sessions.values():
+        account = accounts.of(session.identity)
+        assert session.account is account
+        queued[account] += session.bytes
+        if not account.is_inside:
+            assert (session in account.present) is (session.link is not None), session
+            assert (session in account.absent) is (session.link is None), session
+            sessions[account] += 1
+    for client in broker.clients:
+        assert isinstance(client, Client)
+        queued[client.account] += client._held
+    for message in retained:
+        owner = broker.retained.owner(message.topic)
+        kept[owner] += 1
+        queued[owner] += 0
+    users = {account for account in queued if not account.is_inside}
+    for account in users | {accounts.inside}:
+        if account is not accounts.strangers:
+            assert account.bytes == queued[account], account
+        assert account.retained == kept[account], account
+        if not account.is_inside:
+            assert account.sessions == sessions[account], account
+    assert accounts.sessions == sum(account.sessions for account in users)
+    assert accounts.connections == sum(account.connections for account in users)
+    assert accounts.retained == sum(account.retained for account in users)
+    assert accounts.retained_bytes == sum(account.retained_bytes for account in users)
+    owned = accounts.retained_bytes + accounts.inside.retained_bytes
+    assert owned == broker.retained.bytes
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import FakeAccess, FakeStore, Join, Peer, lasting, waiting_bytes
+from .conftest import ALONE, FakeAccess, FakeStore, Join, Peer, lasting, waiting_bytes
 
 EXPIRY = Property.SESSION_EXPIRY_INTERVAL
 MESSAGE_EXPIRY = Property.MESSAGE_EXPIRY_INTERVAL
@@ -419,7 +419,7 @@ def test_more_retained_messages_than_the_window_all_arrive(join: Join, version, 
     assert all(m.qos == qos for m in messages)
 
 
-@pytest.mark.parametrize("limits", [Limits(retained_messages=2)])
+@pytest.mark.parametrize("limits", [Limits(retained_messages=2, user=ALONE)])
 def test_the_number_of_retained_messages_is_bounded(join: Join, broker: Broker):
     publisher = join("publisher")
     subscriber = join("subscriber")
@@ -435,7 +435,7 @@ def test_the_number_of_retained_messages_is_bounded(join: Join, broker: Broker):
     assert broker.counters.publish_dropped == 1
 
 
-@pytest.mark.parametrize("limits", [Limits(retained_messages=1)])
+@pytest.mark.parametrize("limits", [Limits(retained_messages=1, user=ALONE)])
 def test_who_is_there_gets_a_message_that_cannot_be_retained(join: Join, broker: Broker):
     publisher = join("publisher")
     subscriber = join("subscriber")
@@ -449,7 +449,7 @@ def test_who_is_there_gets_a_message_that_cannot_be_retained(join: Join, broker:
     assert len(broker.retained) == 1
 
 
-@pytest.mark.parametrize("limits", [Limits(retained_bytes=4000)])
+@pytest.mark.parametrize("limits", [Limits(retained_bytes=4000, user=ALONE)])
 def test_the_bytes_of_retained_messages_are_bounded(join: Join, broker: Broker):
     publisher = join("publisher")
     assert publisher.publish("a", bytes(3000), 1, retain=True) < 0x80
@@ -1057,7 +1057,7 @@ def test_the_queue_is_bounded_in_bytes(join: Join, broker: Broker):
     assert len(session.queue) == 2, "properties are bytes as well"
 
 
-@pytest.mark.parametrize("limits", [Limits(memory=12_000)])
+@pytest.mark.parametrize("limits", [Limits(memory=12_000, user=ALONE)])
 def test_all_queues_together_are_bounded(join: Join, broker: Broker):
     for name in "abcd":
         peer = join(name, **lasting(5))

@@ -28,7 +28,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import FakeAccess, Join, Peer, lasting, waiting_bytes
+from .conftest import ALONE, FakeAccess, Join, Peer, lasting, waiting_bytes
 
 SMALL = {"queue_messages": 3, "inflight": 1}
 
@@ -144,7 +144,7 @@ def test_subscriptions_take_memory(join: Join):
     assert peer.subscribe(f"9/{deep}") == 0
 
 
-@pytest.mark.parametrize("limits", [Limits(memory=100_000)])
+@pytest.mark.parametrize("limits", [Limits(memory=100_000, user=ALONE)])
 def test_wills_take_memory(broker: Broker):
     codes = []
     for number in range(4):
@@ -154,7 +154,7 @@ def test_wills_take_memory(broker: Broker):
     assert codes == [0, 0, 0x97, 0x97]
 
 
-@pytest.mark.parametrize("limits", [Limits(retained_bytes=200_000)])
+@pytest.mark.parametrize("limits", [Limits(retained_bytes=200_000, user=ALONE)])
 def test_levels_of_retained_topics_take_memory(join: Join):
     peer = join()
     deep = "/".join("x" for _ in range(150))
@@ -224,7 +224,8 @@ def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access
     publisher = join("publisher")
     for number in range(REPLAYED_A_TURN + 5):
         publisher.publish(f"r/{number}", b"", 0)
-        broker.retained.keep(Message(f"r/{number}", b"x", retain=True))
+        message = Message(f"r/{number}", b"x", retain=True)
+        broker.retained.keep(message, broker.ledger.accounts.inside)
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
     assert subscriber.payloads() == [] and subscriber.wire.laters == 1
@@ -306,7 +307,7 @@ def test_who_goes_in_the_middle_of_a_long_packet_is_answered_nothing(
     assert take_turns(broker, peer) == [0]
 
 
-@pytest.mark.parametrize("limits", [Limits(memory=200_000)])
+@pytest.mark.parametrize("limits", [Limits(memory=200_000, user=ALONE)])
 def test_what_has_come_in_is_counted(join: Join, broker: Broker):
     """Unfinished packets and topic aliases; who has too much of them is told, and goes"""
     peers = [join(f"p{n}") for n in range(3)]
@@ -358,7 +359,9 @@ def test_retained_messages_expire_by_themselves(join: Join, broker: Broker):
     publisher.publish("r/0", b"", retain=True)
 
 
-@pytest.mark.parametrize("limits", [Limits(memory=100_000, connections=5, queue_messages=100)])
+@pytest.mark.parametrize(
+    "limits", [Limits(memory=100_000, connections=5, queue_messages=100, user=ALONE)]
+)
 def test_who_holds_little_is_not_starved_by_who_holds_much(join: Join):
     greedy, modest = join("greedy"), join("modest")
     greedy.subscribe("g", 1)

@@ -76,7 +76,7 @@ class Wire:
     def now(self):
         return time.monotonic()
 
-    def accepted(self):
+    def accepted(self, account):
         pass
 
     def later(self):

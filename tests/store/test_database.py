@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 import pytest_asyncio
-from broker.conftest import check_accounts, lasting
+from broker.conftest import ALONE, check_accounts, lasting
 from durability.harm import HARMS
 
+from appliance.broker.ports import Limits
 from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock
@@ -156,7 +157,7 @@ async def test_a_newer_database_is_left_alone(
     await house.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
     before = house.path.read_bytes()
-    with pytest.raises(StoreError, match=r"newer appliance \(version 3 .* knows 0\)"):
+    with pytest.raises(StoreError, match=r"newer appliance \(version 4 .* knows 0\)"):
         SqliteStore(house.path).open()
     assert house.path.read_bytes() == before
 
@@ -237,7 +238,7 @@ async def test_rows_without_sense_are_left_out(house: House, tmp_path: Path) -> 
 
 
 async def test_what_is_too_much_for_it_is_refused(tmp_path: Path) -> None:
-    house = House(tmp_path, size=1 << 20).start()
+    house = House(tmp_path, Limits(user=ALONE), size=1 << 20).start()
     client = await house.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 1)]))
     client.lose()
