@@ -23,7 +23,14 @@ for it run unchanged. Its listeners, sessions and broadcast loop are not used: w
 
 from __future__ import annotations
 
-from .broker import ApplianceBroker, Files, PluginSettingsError, configuration, plugin_kinds
+from .broker import (
+    ApplianceBroker,
+    Files,
+    PluginSettingsError,
+    check_plugin_settings,
+    configuration,
+    plugin_kinds,
+)
 from .logins import Answers
 
 __all__ = [
@@ -31,6 +38,7 @@ __all__ = [
     "ApplianceBroker",
     "Files",
     "PluginSettingsError",
+    "check_plugin_settings",
     "configuration",
     "plugin_kinds",
 ]

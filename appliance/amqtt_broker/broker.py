@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import difflib
 import logging
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any, Protocol, cast, get_type_hints
 
@@ -18,6 +20,9 @@ from amqtt.mqtt.protocol.broker_handler import BrokerProtocolHandler
 from amqtt.plugins.base import BaseAuthPlugin, BaseTopicPlugin
 from amqtt.session import Session as AmqttSession
 from amqtt.utils import import_string
+from dacite import Config as DaciteConfig
+from dacite import from_dict
+from dacite.exceptions import DaciteFieldError, MissingValueError
 from transitions import MachineError
 
 from appliance.broker.broker import Broker
@@ -98,6 +103,39 @@ def configuration(
     for bind, tls in listeners:
         config.listeners[bind] = ListenerConfig(bind=bind, ssl=tls, max_connections=connections)
     return config
+
+
+def check_plugin_settings(path: str, settings: Mapping[str, Any]) -> None:
+    """Whether a plugin takes these settings. Nothing is started, and no value is told.
+
+    Raises:
+        PluginSettingsError: there is no such plugin, or its settings are others.
+    """
+    try:
+        kind = import_string(path)
+    except ImportError as error:
+        raise PluginSettingsError(str(error)) from error
+    wanted = getattr(kind, "Config", None)
+    if not isinstance(wanted, type) or not is_dataclass(wanted):
+        if settings:
+            raise PluginSettingsError(f"takes no settings; there are {', '.join(settings)}")
+        return
+    known = [each.name for each in fields(wanted) if each.init]
+    for key in settings:
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            advice = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+            raise PluginSettingsError(f"unknown setting {key!r}; {advice}")
+    try:
+        from_dict(wanted, _typed(path, settings), DaciteConfig(strict=True))
+    except DaciteFieldError as error:
+        what = (
+            "is needed" if isinstance(error, MissingValueError) else "has a value of a wrong type"
+        )
+        raise PluginSettingsError(f"{error.field_path} {what}") from None
+    except Exception as error:  # a plugin may look at its settings itself
+        told = f"does not take its settings ({type(error).__name__})"
+        raise PluginSettingsError(told) from None
 
 
 def _typed(path: str, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -66,6 +66,23 @@ class _Stop:
         return all(one[name] == other[name] for name in one if name != "header")
 
 
+def check_rules(
+    rules: CommandRules, converter: Converter
+) -> tuple[FieldLimits | None, _Stop | None]:
+    """The limits and the stop message of a route for messages of one type.
+
+    Raises ConversionError for what the type has not, or cannot be.
+    """
+    limits = FieldLimits(rules, converter) if rules.clamp or rules.allow else None
+    stop = None
+    if rules.on_silence is not None:
+        try:
+            stop = _Stop(converter, rules.on_silence.publish)
+        except ConversionError as error:
+            raise ConversionError("on_silence.publish", str(error)) from None
+    return limits, stop
+
+
 class Commands(ToRos):
     """A flow to ROS with rules."""
 
@@ -119,14 +136,7 @@ class Commands(ToRos):
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         rules = self.rules
         converter = self._converters.get(type_name)
-        limits = FieldLimits(rules, converter) if rules.clamp or rules.allow else None
-        stop = None
-        if rules.on_silence is not None:
-            try:
-                stop = _Stop(converter, rules.on_silence.publish)
-            except ConversionError as error:
-                raise ConversionError("on_silence.publish", str(error)) from None
-        self._limits, self._stop = limits, stop
+        self._limits, self._stop = check_rules(rules, converter)
         # Another publisher has not been found by anybody: as at the route's beginning, a stop
         # message that it sends now may be lost, and is sent again.
         self._looks = 0

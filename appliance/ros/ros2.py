@@ -615,6 +615,17 @@ def _with_support(found: type[Any]) -> type[Any]:
     return found
 
 
+def interfaces() -> dict[str, list[str]]:
+    """The types of each package of interfaces that is installed: `std_msgs/msg/String`."""
+    found: dict[str, list[str]] = {}
+    for folder in fastdds.shares():
+        index = folder / "ament_index" / "resource_index" / "rosidl_interfaces"
+        for entry in index.iterdir() if index.is_dir() else ():
+            names = {line.partition(".")[0] for line in entry.read_text().splitlines() if line}
+            found.setdefault(entry.name, [f"{entry.name}/{name}" for name in sorted(names)])
+    return found
+
+
 def import_service(name: str) -> Any:
     """The class of a service `std_srvs/srv/Trigger`, and of those that an action is made of,
     `pkg/action/Name_SendGoal` and `pkg/action/Name_GetResult`. Raises UnknownTypeError.

@@ -58,6 +58,11 @@ class CommandRules:
     allow: tuple[tuple[str, tuple[bool | int | float | str, ...]], ...] = ()
 
     @property
+    def needs_type(self) -> bool:
+        """Whether there is something in it that holds for messages of some type only."""
+        return bool(self.clamp or self.allow or self.on_silence)
+
+    @property
     def oldest(self) -> float:
         """The age from which a message is not published any more."""
         if self.expire is not None:

@@ -1,4 +1,4 @@
-"""`appliance check`: reads everything that `run` would use, says what it finds, changes nothing."""
+"""What settings name: listeners, users, rules, certificates, store, plugins and the bridge."""
 
 from __future__ import annotations
 
@@ -7,34 +7,26 @@ import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from cryptography import x509
 
 from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
+from appliance.check.bridge import bridge
+from appliance.check.finding import Finding
+from appliance.check.plugins import plugin_settings
+from appliance.check.rights import rights
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
-from appliance.ros import discovery, installation, ros1, ros2
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What was looked at and what is to be said about it; an error keeps `run` from working."""
-
-    level: Literal["ok", "warning", "error"]
-    subject: str
-    text: str
 
 
 def check(settings: Settings) -> Iterator[Finding]:
     """Everything there is to say about what these settings name, the good news included."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _store, _audit, _plugins, _bridge]
+    parts = [_listeners, _access, _store, _audit, _plugins, bridge]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:
@@ -84,7 +76,7 @@ def _access(settings: Settings) -> Iterator[Finding]:
     except AccessFileError as error:
         yield from (Finding("error", "users", str(problem)) for problem in error.problems)
     try:
-        rules = Acl.load(broker.acl, settings.robot).rules
+        rules = Acl.load(broker.acl, settings.robot)
     except AccessFileError as error:
         yield from (Finding("error", "acl", str(problem)) for problem in error.problems)
     if users:
@@ -93,10 +85,12 @@ def _access(settings: Settings) -> Iterator[Finding]:
         text = "no users; add one with: appliance user add NAME"
         yield Finding("warning", str(broker.users), text)
     if rules is not None:
-        yield Finding("ok", str(broker.acl), f"rules: {len(rules)}")
+        yield Finding("ok", str(broker.acl), f"rules: {len(rules.rules)}")
+    if rules is not None:
+        yield from rights(settings, rules, users)
     others = broker.plugins or broker.tls.username_from != "none"  # they may know more
     if rules is not None and users is not None and not others:
-        for name in sorted({rule.user for rule in rules if rule.user} - set(users)):
+        for name in sorted({rule.user for rule in rules.rules if rule.user} - set(users)):
             yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
 
 
@@ -188,33 +182,6 @@ def _plugins(settings: Settings) -> Iterator[Finding]:
         except ImportError:
             found = False
         if found:
-            yield Finding("ok", f"plugin {name}", "found")
+            yield plugin_settings(name, settings.broker.plugins[name])
         else:
             yield Finding("error", f"plugin {name}", f"there is no Python module {module}")
-
-
-def _bridge(settings: Settings) -> Iterator[Finding]:
-    bridge = settings.bridge
-    if bridge.bus == "none":
-        yield Finding("ok", "bridge", "off: a broker alone")
-        return
-    is_ros1 = bridge.bus == "ros1"
-    is_available, reason = (ros1.available if is_ros1 else ros2.available)()
-    if not is_available:
-        yield Finding("warning", "bridge", f"{reason}; the broker runs without")
-    else:
-        called = (*bridge.services, *bridge.actions, *bridge.parameters)
-        routes = sum(not route.is_exclusion for route in (*bridge.topics, *called))
-        found = ros1.found() if is_ros1 else installation.find()
-        yield Finding("ok", "bridge", f"{found}; routes: {routes}")
-    if is_ros1:
-        yield Finding("warning", "bridge", discovery.OPEN_ROS1)
-    elif bridge.discovery == "localhost" or (
-        bridge.discovery == "environment" and discovery.is_local(os.environ)
-    ):
-        yield Finding("ok", "bridge.discovery", "ROS nodes of this computer only")
-    elif discovery.is_secured(os.environ):
-        yield Finding("ok", "bridge.discovery", "ROS nodes that have keys, by SROS 2")
-    else:
-        text = f"{discovery.OPEN}; {discovery.OPEN_ADVICE}"
-        yield Finding("warning", "bridge.discovery", text)
