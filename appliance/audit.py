@@ -323,12 +323,13 @@ def note(path: Path | None, what: str, **details: Any) -> None:
     """Add one change to the audit log of an appliance that may be running, from a command.
 
     Only to a file that is there: one that another user made would be none that the appliance could
-    write. OSError: it cannot be written.
+    write. A link is not followed. OSError: it cannot be written.
     """
     if path is None:
         return
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NONBLOCK)
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+        descriptor = os.open(path, flags)
     except FileNotFoundError:
         return
     line = {"time": _now(), "event": "changed", "what": what, **details, "by": _who_types()}

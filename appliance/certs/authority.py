@@ -26,6 +26,8 @@ from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from appliance.owners import acting_as_caller
+
 from . import readme, registry
 from .addresses import DNS_NAME, Address
 from .files import (
@@ -407,12 +409,13 @@ def _opened(directory: Path, ca_key: Path | None) -> Iterator[_Authority]:
     certificate_file = directory / "ca.crt"
     key_file = ca_key or directory / "ca.key"
     certificate = load_certificates(certificate_file)[0]
-    if not key_file.exists():
-        raise CertificateError(
-            f"there is no {key_file}: only with the authority's key are certificates made and "
-            "revoked; put it back for as long, or say where it is (--ca-key FILE)"
-        )
-    key = load_key(key_file)
+    with acting_as_caller() if ca_key is not None else contextlib.nullcontext():
+        if not key_file.exists():
+            raise CertificateError(
+                f"there is no {key_file}: only with the authority's key are certificates made and "
+                "revoked; put it back for as long, or say where it is (--ca-key FILE)"
+            )
+        key = load_key(key_file)
     if certificate.public_key() != key.public_key():
         raise CertificateError(
             f"{key_file} is not the key of {certificate_file}; put back the right one, or make a "

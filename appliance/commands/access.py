@@ -106,24 +106,29 @@ def user_list(config: ConfigOption = None) -> None:
 def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
     """The users file; what is wrong with it, or with writing it, is a CommandError."""
     from appliance.access import AccessFileError, Passwords
+    from appliance.owners import OwnerError, acting_for
 
     path = settings.broker.users
     try:
-        users = Passwords(path) if new and not path.exists() else Passwords.load(path)
-        yield users
-    except AccessFileError as error:
+        with acting_for(settings.file, path):
+            users = Passwords(path) if new and not path.exists() else Passwords.load(path)
+            yield users
+    except (AccessFileError, OwnerError) as error:
         raise CommandError(str(error)) from None
 
 
 def _note(settings: Settings, what: str, user: str) -> None:
     """Have a change in the audit log, if there is one; it is done whether that works or not."""
     from appliance.audit import note
+    from appliance.owners import OwnerError, acting_for
 
     path = settings.broker.audit.path
     try:
-        note(path, what, user=user)
-    except OSError as error:
-        message = f"appliance: {path}: this is not in the audit log ({error.strerror})"
+        with acting_for(settings.file, path):
+            note(path, what, user=user)
+    except (OSError, OwnerError) as error:
+        reason = getattr(error, "strerror", None) or error
+        message = f"appliance: {path}: this is not in the audit log ({reason})"
         typer.secho(message, fg="yellow", err=True)
 
 

@@ -94,7 +94,9 @@ def cert_sign(
 def _read_request(file: str, limit: int) -> bytes:
     if file == "-":
         return sys.stdin.buffer.read(limit + 1)
-    with Path(file).open("rb") as opened:
+    from appliance.owners import acting_as_caller
+
+    with acting_as_caller(), Path(file).open("rb") as opened:
         return opened.read(limit + 1)
 
 
@@ -178,9 +180,11 @@ def cert_crl(ca_key: CaKeyOption = None, config: ConfigOption = None) -> None:
 @contextmanager
 def _directory(config: Path | None) -> Iterator[Path]:
     """Where the authority is; what is wrong with it, or with what is asked, is a CommandError."""
-    tls = load(config).broker.tls
+    settings = load(config)
+    tls = settings.broker.tls
     directory = tls.ca.parent
     from appliance.certs import CertificateError
+    from appliance.owners import OwnerError, acting_for
 
     try:
         if tls.ca.name != "ca.crt" or tls.crl not in (None, directory / "ca.crl"):
@@ -188,6 +192,7 @@ def _directory(config: Path | None) -> Iterator[Path]:
                 "broker.tls.ca or broker.tls.crl is not a file of this appliance's own authority "
                 "(ca.crt, ca.crl): clients get their certificates where these files come from"
             )
-        yield directory
-    except CertificateError as error:
+        with acting_for(settings.file, directory / "ca.crt"):
+            yield directory
+    except (CertificateError, OwnerError) as error:
         raise CommandError(str(error)) from None

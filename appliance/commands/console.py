@@ -53,8 +53,11 @@ def new_password(whose: str, file: str | None, generate: bool) -> str:
     """A password that is to be: made, read from a file or asked for, never on the command line."""
     if generate and file:
         raise typer.BadParameter("--generate and --password-file exclude each other")
+    from appliance.owners import acting_as_caller
+
     if generate:
-        from appliance.init import generate_password
+        with acting_as_caller():  # Python may be where only root can read
+            from appliance.init import generate_password
 
         return generate_password()
     if file:
@@ -68,8 +71,13 @@ def new_password(whose: str, file: str | None, generate: bool) -> str:
 
 def read_password(file: str) -> str:
     """The first line of the file; - is standard input."""
+    from appliance.owners import acting_as_caller
+
     try:
-        with nullcontext(sys.stdin) if file == "-" else Path(file).open(encoding="utf-8") as opened:
+        with (
+            acting_as_caller(),
+            nullcontext(sys.stdin) if file == "-" else Path(file).open(encoding="utf-8") as opened,
+        ):
             line = opened.readline(LONGEST_PASSWORD + 1)
     except UnicodeDecodeError:
         raise CommandError(f"{file}: this is no password: it is not UTF-8 text") from None

@@ -30,18 +30,21 @@ def init(
     from appliance.certs import CertificateError
     from appliance.config import ConfigError
     from appliance.init import Credentials, InitError, Step, initialise
+    from appliance.owners import OwnerError, acting_for
 
     try:
-        for step in initialise(directory, robot=robot, user=user, demo=demo):
-            if isinstance(step, Step):
-                typer.echo(f"{'made' if step.made else 'kept'}  {shown(step.path)}: {step.text}")
-            elif isinstance(step, Credentials):
-                typer.secho(
-                    f"\nuser {step.user}, password {step.password}\n"
-                    "This is the only time that it is shown.\n",
-                    bold=True,
-                )
-    except (AccessFileError, CertificateError, ConfigError, InitError) as error:
+        with acting_for(directory / "appliance.yaml"):
+            for step in initialise(directory, robot=robot, user=user, demo=demo):
+                if isinstance(step, Step):
+                    verb = "made" if step.made else "kept"
+                    typer.echo(f"{verb}  {shown(step.path)}: {step.text}")
+                elif isinstance(step, Credentials):
+                    typer.secho(
+                        f"\nuser {step.user}, password {step.password}\n"
+                        "This is the only time that it is shown.\n",
+                        bold=True,
+                    )
+    except (AccessFileError, CertificateError, ConfigError, InitError, OwnerError) as error:
         raise CommandError(str(error)) from None
 
 

@@ -17,7 +17,7 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
     """What outlives a restart: sessions, what waits for them, retained messages."""
     if context.invoked_subcommand is not None:
         return
-    path = _store_path(config)
+    path, _ = _store_path(config)
     from datetime import datetime
 
     from rich.console import Console
@@ -60,7 +60,7 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
 @store_app.command("export")
 def store_export(config: ConfigOption = None) -> None:
     """Print all of it as JSON, one session or retained message a line."""
-    path = _store_path(config)
+    path, _ = _store_path(config)
     from appliance.logs import json_text
     from appliance.store import StoreError
     from appliance.store.inspection import export
@@ -87,10 +87,11 @@ def store_prune(
     """Delete sessions, or what has waited too long for them, while the appliance is stopped."""
     if older_than is None and not client:
         raise typer.BadParameter("say what: --older-than, --client, or both")
-    path = _store_path(config)
+    path, file = _store_path(config)
     import sqlite3
 
     from appliance.config import parse_duration
+    from appliance.owners import OwnerError, acting_for
     from appliance.store import StoreError
     from appliance.store.inspection import prune
 
@@ -99,14 +100,17 @@ def store_prune(
     except ValueError as error:
         raise typer.BadParameter(f"--older-than {error}") from None
     try:
-        sessions, messages = prune(path, age, client or [])
-    except (StoreError, sqlite3.Error) as error:
+        with acting_for(file, path):
+            sessions, messages = prune(path, age, client or [])
+    except (OwnerError, StoreError, sqlite3.Error) as error:
         raise CommandError(str(error)) from None
     typer.echo(f"{sessions} sessions and {messages} messages deleted")
 
 
-def _store_path(config: Path | None) -> Path:
-    store = load(config).broker.store
+def _store_path(config: Path | None) -> tuple[Path, Path | None]:
+    """The database, and the file that says so."""
+    settings = load(config)
+    store = settings.broker.store
     if store.durability == "off":
         raise CommandError("nothing is stored: broker.store.durability is off")
-    return store.path
+    return store.path, settings.file

@@ -1,0 +1,94 @@
+"""Whose files they are: root changes what is another user's as that user, and not as root.
+
+What appliance.yaml names, and what lies in the service's folders, its user can replace by a link to
+anything, and a command that root gives would write there. As that user it can do no more than that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import encodings.utf_8_sig  # noqa: F401 - Python may be where only root can read, and loads it late
+import os
+import pwd
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+_ROOT = 0
+
+
+class OwnerError(Exception):
+    """Root does not touch this; the message says why and what to do."""
+
+
+def owner_of(path: Path) -> int:
+    """The user id of who decides what is found under that path; root's when nobody else does.
+
+    Raises:
+        OwnerError: that is anybody, or any of a group.
+    """
+    path = path.absolute()
+    for folder in reversed(path.parents):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            found = folder.stat()
+            if found.st_uid != _ROOT:
+                return found.st_uid
+            by_group = found.st_mode & stat.S_IWGRP and found.st_gid != _ROOT
+            if (by_group or found.st_mode & stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX:
+                raise OwnerError(
+                    f"others than root can replace what is in {folder} (mode "
+                    f"{stat.S_IMODE(found.st_mode):04o}), so root does not write there: use the "
+                    f"appliance's user, or close it with: chmod go-w {folder}"
+                )
+    with contextlib.suppress(OSError):
+        return path.lstat().st_uid
+    return _ROOT
+
+
+@contextlib.contextmanager
+def acting_for(*paths: Path | None) -> Iterator[None]:
+    """Be the first other user who decides about one of these paths, if this is root; else nothing.
+
+    Raises:
+        OwnerError: see `owner_of`.
+    """
+    uid = os.geteuid()
+    if uid == _ROOT:
+        owners = (owner_of(path) for path in paths if path is not None)
+        uid = next((owner for owner in owners if owner != _ROOT), _ROOT)
+    try:
+        user = pwd.getpwuid(uid)
+    except KeyError:  # of a container, or of a disk from elsewhere
+        group, groups = uid, []
+    else:
+        group, groups = user.pw_gid, os.getgrouplist(user.pw_name, user.pw_gid)
+    with _being(uid, group, groups):
+        yield
+
+
+@contextlib.contextmanager
+def acting_as_caller() -> Iterator[None]:
+    """Inside of `acting_for`, be who gave the command: for files that stand on its command line."""
+    with _being(os.getuid(), os.getgid(), [os.getgid()]):
+        yield
+
+
+@contextlib.contextmanager
+def _being(uid: int, group: int, groups: list[int]) -> Iterator[None]:
+    before = os.geteuid(), os.getegid(), os.getgroups()
+    if uid == before[0]:
+        yield
+        return
+    _become(uid, group, groups)
+    try:
+        yield
+    finally:
+        _become(*before)
+
+
+def _become(uid: int, group: int, groups: list[int]) -> None:
+    if os.geteuid() != _ROOT:
+        os.seteuid(_ROOT)  # only root changes groups
+    os.setgroups(groups)
+    os.setegid(group)
+    os.seteuid(uid)
