@@ -89,8 +89,9 @@ class Caller:
         try:
             self._connection.subscribe([topic_filter], 1, retained=False)
         except RefusedError as error:
+            advice = _as_ros_name(topic_filter)
             raise RefusedError(
-                f"{error}. The ACL line that allows it: pattern read {rule}/#"
+                f"{error}. {advice or f'The ACL line that allows it: pattern read {rule}/#'}"
             ) from None
         self._listening.add(topic_filter)
 
@@ -105,13 +106,14 @@ class Caller:
         try:
             code: ReasonCode = self._connection.publish(to, payload, 1, False, properties)
         except RefusedError as error:
+            advice = _as_ros_name(topic)
             raise RefusedError(
-                f"{error}. The ACL line that allows it: topic write {topic}/#"
+                f"{error}. {advice or f'The ACL line that allows it: topic write {topic}/#'}"
             ) from None
         if code.value == NO_MATCHING_SUBSCRIBERS:
             raise ClientError(
                 f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
-                "`appliance routes` shows what is"
+                f"`appliance routes` shows what is. {_as_ros_name(topic)}".rstrip()
             )
 
     def _perhaps(self) -> str:
@@ -162,8 +164,9 @@ class Caller:
         try:
             self._connection.subscribe(topics, 1, retained=False)
         except RefusedError as error:
+            advice = _as_ros_name(f"{action}/_goal")
             raise RefusedError(
-                f"{error}. The ACL line that allows it: topic read {action}/#"
+                f"{error}. {advice or f'The ACL line that allows it: topic read {action}/#'}"
             ) from None
         id_ = orjson.loads(self.call(f"{action}/_goal", payload, ANSWER_TIMEOUT))["goal_id"]
         accepted(id_)
@@ -226,6 +229,14 @@ class Caller:
                 seen = len(self._received)
                 self._connection.run(lambda: False, time.monotonic() + QUIET, STEP)
         return {m.topic: shown(m) for m in self._received if m.payload}
+
+
+def _as_ros_name(topic: str) -> str:
+    """What was meant when a call's topic has nothing above what it calls: no robot; else ""."""
+    name = topic.partition("/")[0]
+    if "/_" not in topic or not topic.removeprefix(name).startswith("/_"):
+        return ""
+    return f"A ROS name begins with a slash; did you mean /{name}?"
 
 
 def content_type(message: paho.MQTTMessage) -> str | None:

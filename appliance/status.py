@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -144,8 +144,20 @@ class Status:
             "received_a_second": round(self._received.rates[0], 1),
             "sent": counters.publish_sent,
             "sent_a_second": round(self._sent.rates[0], 1),
+            **self._ros_rates(),
             "dropped": counters.publish_dropped,
             "refused": counters.publish_refused,
+        }
+
+    def _ros_rates(self) -> dict[str, float]:
+        """What the bridge carries; the other figures are of the network's clients."""
+        topics = self._parts.bridge.topics() if self._parts.bridge is not None else []
+        rates = {"to_mqtt": 0.0, "to_ros": 0.0}
+        for topic in topics:
+            rates[topic.direction] += topic.rate
+        return {
+            "from_ros_a_second": round(rates["to_mqtt"], 1),
+            "to_ros_a_second": round(rates["to_ros"], 1),
         }
 
     def _store(self) -> dict[str, Any] | None:
@@ -190,7 +202,11 @@ class Status:
             if (problem := problem_of(route))
         ]
         sick += [
-            {"route": call.settings.mqtt, "problem": call.counters.last_error, "lost": 0}
+            {
+                "route": topic_shown(call.settings.names, call.settings.mqtt),
+                "problem": call.counters.last_error,
+                "lost": 0,
+            }
             for call in calls
             if call.counters.last_error and not call.names
         ]
@@ -241,7 +257,19 @@ def _endings(settings: Settings) -> list[certs.Ending]:
 def name_of(route: RouteStatus) -> str:
     """A route in the words of `appliance routes`."""
     arrow = "→" if route.direction == "to_mqtt" else "←"
-    return f"{', '.join(route.settings.names)} {arrow} {route.settings.mqtt}"
+    settings = route.settings
+    names = ", ".join(settings.names)
+    return f"{names} {arrow} {topic_shown(settings.names, settings.mqtt)}"
+
+
+def topic_shown(names: Iterable[str], template: str) -> str:
+    """The MQTT topics of a route of these names, patterns as they are written."""
+    wanted = [name for name in names if not name.startswith("!")]
+    topics = [
+        template.replace("{ros}", name).replace("{node}", name.rpartition("/")[0])
+        for name in wanted
+    ]
+    return ", ".join(dict.fromkeys(topics))
 
 
 def problem_of(route: RouteStatus) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from datetime import datetime, timezone
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from raw_client import RawClient
 from appliance import cli, config
 from appliance.config import reading
 from appliance.mqtt.packets import Publish
+from appliance.status import Status, topic_shown
 
 
 def run(*arguments: str) -> int:
@@ -111,3 +113,31 @@ def test_the_control_of_a_broken_file(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(reading, "SEARCH_PATH", (tmp_path / "none.yaml", file))
     assert config.load_control().file == file
     assert config.load_control(tmp_path / "no/none.yaml").file == tmp_path / "no/none.yaml"
+
+
+@pytest.mark.parametrize(
+    ("names", "template", "shown"),
+    [
+        (["/odom"], "r2{ros}", "r2/odom"),
+        (["/odom"], "elsewhere/odom", "elsewhere/odom"),
+        (["/camera/**", "!/camera/raw"], "r2{ros}", "r2/camera/**"),
+        (["/a", "/b"], "r2{ros}", "r2/a, r2/b"),
+        (["/controller/*", "/controller/p"], "r2{node}/_param", "r2/controller/_param"),
+    ],
+)
+def test_a_route_is_shown_with_its_topic(names: list[str], template: str, shown: str) -> None:
+    assert topic_shown(names, template) == shown
+
+
+def test_what_ros_routes_carry_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    topics = [
+        SimpleNamespace(direction="to_mqtt", rate=10.0),
+        SimpleNamespace(direction="to_mqtt", rate=2.5),
+        SimpleNamespace(direction="to_ros", rate=20.0),
+    ]
+    bridge = SimpleNamespace(topics=lambda: topics)
+    asked = SimpleNamespace(_parts=SimpleNamespace(bridge=bridge))
+    rates = Status._ros_rates(asked)  # type: ignore[arg-type]
+    assert rates == {"from_ros_a_second": 12.5, "to_ros_a_second": 20.0}
+    asked._parts.bridge = None
+    assert set(Status._ros_rates(asked).values()) == {0.0}  # type: ignore[arg-type]

@@ -70,6 +70,11 @@ def _lines(told: dict[str, Any]) -> Iterator[tuple[str, str]]:
         f"{messages['received_a_second']:g} a second in, {messages['sent_a_second']:g} out; "
         f"{messages['received']} and {messages['sent']} so far"
     )
+    if told["ros"]["bus"] != "none":
+        text += (
+            f"; {messages['from_ros_a_second']:g} a second from ROS, "
+            f"{messages['to_ros_a_second']:g} to ROS"
+        )
     for what in ("dropped", "refused"):
         text += f", {messages[what]} {what}" if messages[what] else ""
     yield "messages", text

@@ -384,13 +384,19 @@ class Action:
         ]
         for offer in self._offers:
             self._board.offer(offer)
-        log.info("%s can be called at %s/_goal", ros, self.base)
+        self._is_told = False
 
     def see(self, is_there: bool) -> None:
         """Whether the action is on the bus now."""
         if self.is_there and not is_there:
             self.forget()
             self._has_forgotten = True
+        if not self._is_told or self.is_there != is_there:
+            self._is_told = True
+            if is_there:
+                log.info("%s can be called at %s/_goal", self.ros, self.base)
+            else:
+                log.info("%s: no node offers it; it is called at %s/_goal", self.ros, self.base)
         self.is_there = is_there
 
     def keys(self) -> Iterable[Key]:

@@ -25,6 +25,7 @@ infinities. And `binary` is a picture as it is: the bytes of the field `data`.
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -311,4 +312,9 @@ def _parse(type_: Primitive | String | WideString, text: str) -> object:
     match = (_FLOAT if type_.is_float else _INTEGER).match(text)
     if match is None:
         return text
-    return float(match.group(1)) if type_.is_float else int(match.group(1))
+    if not type_.is_float:
+        return int(match.group(1))
+    value = float(match.group(1))
+    if math.isinf(value) and "inf" not in text.lower():  # it overflowed on the way
+        raise ConversionError("data", f"{text.strip()[:40]} does not fit in {type_.name}")
+    return value

@@ -138,6 +138,8 @@ class ServiceRoutes:
         self._refused: list[Skip] = []
         #: The type that a service last had.
         self._types: dict[str, str] = {}
+        #: Those of which the log says that they can be called.
+        self._callable: set[str] = set()
 
     def replace(self, routes: Sequence[ServiceSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
@@ -173,6 +175,7 @@ class ServiceRoutes:
         for name, route in wanted.items():
             if name not in self._offered:
                 self._offer(name, route)
+        self._tell()
         self._types = {
             name: found
             for name, found in self._types.items()
@@ -207,7 +210,17 @@ class ServiceRoutes:
         )
         self._offered[name] = route, offer
         self._board.offer(offer)
-        log.info("%s can be called at %s", name, topic)
+        if name not in self._requests.services:
+            log.info("%s: no node offers it yet; it will be called at %s", name, topic)
+
+    def _tell(self) -> None:
+        """Say which can be called, and which can no more: a route alone offers nothing."""
+        there = {name for name in self._offered if name in self._requests.services}
+        for name in sorted(there - self._callable):
+            log.info("%s can be called at %s", name, self._offered[name][1].topic)
+        for name in sorted(self._callable - there):
+            log.info("%s cannot be called any more", name)
+        self._callable = there
 
     def _type(self, name: str, route: ServiceSettings) -> str | None:
         fixed = route.type if route.type is not None and "*" not in route.type else None

@@ -117,6 +117,13 @@ def test_rights_that_are_missing_are_named_as_the_rule_that_gives_them(run):
     assert code == 1 and "topic read r2d2/turtle/walk/#" in errors
 
 
+def test_a_name_without_its_slash_is_no_missing_right(run):
+    for command in ("call", "goal"):
+        code, _, errors = run(command, "reset", user="carol")
+        assert code == 1 and "did you mean /reset?" in errors, errors
+        assert "ACL line" not in errors
+
+
 def test_a_goal_to_its_end(run):
     code, output, errors = run("goal", "/turtle/walk", '{"order": 4}')
     first, *between, last = output.splitlines()

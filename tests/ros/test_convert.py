@@ -570,6 +570,8 @@ def test_text_as_people_type_it() -> None:
         (FLOAT64, b"1_0.0", 'data: expected a number, got "1_0.0"'),
         (FLOAT64, b"", 'data: expected a number, got ""'),
         (FLOAT32, b"1e39", "data: 1e+39 does not fit in float32"),
+        (FLOAT32, b"1e400", "data: 1e400 does not fit in float32"),
+        (PRIMITIVES["float64"], b"-1e400 ", "data: -1e400 does not fit in float64"),
         (FLOAT64, b"\xff", "data: not UTF-8"),
         (String(), b"\xff", "data: not UTF-8"),
         (String(), b"\x00", "data: a ROS string cannot hold the character U+0000"),

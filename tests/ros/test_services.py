@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import logging
 
 import pytest
 from waiting import until
@@ -589,3 +590,18 @@ async def test_a_service_of_another_type_than_the_route_says(house):
     code, text = await client.error(CALL)
     assert code == "unavailable"
     assert text == f"/switch is a {SET_BOOL} on the bus, not a {TRIGGER}"
+
+
+async def test_the_log_calls_nothing_callable_that_nobody_offers(house, caplog):
+    caplog.set_level(logging.INFO)
+    house.start(service("/switch"))
+    assert "can be called" not in caplog.text
+    assert "/switch: no node offers it yet; it will be called at r2d2/switch/_call" in caplog.text
+    switch = Switch(house)
+    house.node.spin()
+    await until(lambda: "/switch can be called at r2d2/switch/_call" in caplog.text)
+    switch.service.remove()
+    await until(lambda: "/switch cannot be called any more" in caplog.text)
+    house.node.spin()
+    await asyncio.sleep(0)
+    assert caplog.text.count("can be called") == 1
