@@ -52,9 +52,9 @@ class BrokenStore(FakeStore):
         self._check("session_removed", session.client_id)
         super().session_removed(session)
 
-    def retained(self, message):
+    def retained(self, message, owner):
         self._check("retained", message.topic)
-        super().retained(message)
+        super().retained(message, owner)
 
     def sent(self, session, delivery, packet_id):
         self._check("sent", session.client_id)
@@ -287,7 +287,7 @@ def test_an_expiry_beyond_what_a_packet_can_say(broker, ahead, qos):
         {Property.MESSAGE_EXPIRY_INTERVAL: 0xFFFF_FFFF},
         1000.0 + 0xFFFF_FFFF + ahead,
     )
-    broker.retained.restore([message])
+    broker.retained.restore([(message, broker.ledger.accounts.inside)])
     peer = join(broker, "late")
     peer.send(Subscribe(1, [Subscription("t", 1)]))
     publish = peer.received()[-1]
