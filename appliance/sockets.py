@@ -1,16 +1,22 @@
-"""Listening sockets, of TCP and of Unix, and how many files the process may have open."""
+"""Sockets, of TCP and of Unix: listening ones, what the system knows of others, and how many."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import logging
+import math
 import os
 import resource
 import socket
 import stat
+import struct
+import termios
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from appliance.broker.ports import Contact
 
 log = logging.getLogger(__name__)
 
@@ -123,3 +129,52 @@ def allow_files(needed: int) -> None:
             needed,
             most,
         )
+
+
+#: Where `tcpi_last_data_recv`, `tcpi_last_ack_recv` (milliseconds) and `tcpi_rtt` (microseconds)
+#: are in Linux's `struct tcp_info`, and the first bytes of it, with all of them.
+_LAST_DATA, _LAST_ACK, _ROUND_TRIP = 52, 56, 68
+_TCP_INFO_SIZE = 104
+
+#: Seconds of silence after which a probe is sent, and between two of them: the least there is.
+_PROBE_AFTER = 1
+
+
+def contact(connection: socket.socket) -> Contact:
+    """What the system knows of the computer at the other end; a Unix socket's is this one."""
+    try:
+        (unread,) = struct.unpack(
+            "i", fcntl.ioctl(connection.fileno(), termios.FIONREAD, b"\0" * 4)
+        )
+        if connection.family == socket.AF_UNIX:
+            return Contact(has_unread=unread > 0)
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
+        data, ack, round_trip = (
+            struct.unpack_from("=I", info, at)[0] for at in (_LAST_DATA, _LAST_ACK, _ROUND_TRIP)
+        )
+    except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
+        return Contact(silence=math.inf)
+    return Contact(round_trip / 1e6, min(data, ack) / 1e3, unread > 0)
+
+
+class Probe:
+    """Keep-alive probes of TCP, which the other end's system answers by itself, from now on."""
+
+    _SHORT = (("TCP_KEEPIDLE", _PROBE_AFTER), ("TCP_KEEPINTVL", _PROBE_AFTER))
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._before: list[tuple[int, int]] = []
+        if connection.family == socket.AF_UNIX:
+            return
+        with contextlib.suppress(OSError, AttributeError):
+            for name, seconds in self._SHORT:
+                option = getattr(socket, name)
+                self._before.append((option, connection.getsockopt(socket.IPPROTO_TCP, option)))
+                connection.setsockopt(socket.IPPROTO_TCP, option, seconds)
+
+    def end(self) -> None:
+        """No more of them than before."""
+        with contextlib.suppress(OSError):
+            for option, value in self._before:
+                self._connection.setsockopt(socket.IPPROTO_TCP, option, value)

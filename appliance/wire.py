@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import socket
 import ssl
 from collections import deque
+from dataclasses import replace
 from typing import cast
 
 from appliance import farewell, tls
 from appliance.broker.accounts import Account
 from appliance.broker.client import Client
-from appliance.broker.ports import Exchange, Refusal, Secured
+from appliance.broker.ports import HERE, Contact, Exchange, Refusal, Secured
 from appliance.entries import contained
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.network import PUBLISH_BURST, Network
+from appliance.sockets import Probe, contact
 from appliance.websocket import WebSocket
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
@@ -56,6 +59,9 @@ SLOW_AFTER = 1.0
 
 #: Seconds that a client gets to read the last bytes before its connection is cut.
 CLOSE_TIMEOUT = 10.0
+
+#: Seconds that a client's computer is asked for a sign of life.
+PROBED = 3.0
 
 #: Seconds that one gets whose certificate was revoked.
 REVOKED_TIMEOUT = 1.0
@@ -104,9 +110,11 @@ class ClientProtocol:
         self._begun = 0  # bytes of the first chunk that the transport was given
         self._unshared = 0  # bytes of the chunks that wait for this client only
         self._paused = False
+        self._withheld: asyncio.TimerHandle | None = None  # paused until then, on purpose
         self._counted = 0  # bytes in the ledger
         self._slow: asyncio.TimerHandle | None = None
         self._is_system_limited = False
+        self._probe: Probe | None = None
         self._has_told_behind = False  # and the client wants to know when it has caught up
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
@@ -221,6 +229,9 @@ class ClientProtocol:
         while self._waiting:
             self._take_waiting(self._waiting_size)
         self._paused = False
+        if self._withheld is not None:
+            self._withheld.cancel()
+            self._withheld = None
         self._count_output()
         if self._slow is not None:
             self._slow.cancel()
@@ -484,6 +495,8 @@ class ClientProtocol:
     @contained("connection.resume")
     def resume_writing(self) -> None:
         """It has caught up."""
+        if self._withheld is not None:
+            return
         self._paused = False
         if self._transport is None:
             return
@@ -622,6 +635,40 @@ class ClientProtocol:
         if connection.family != socket.AF_UNIX and hasattr(socket, "TCP_NOTSENT_LOWAT"):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT)
 
+    def contact(self) -> Contact:
+        """How the computer at the other end answers."""
+        if self._transport is None:
+            return HERE
+        known = contact(self._transport.get_extra_info("socket"))
+        waits = bool(self._held) or self._sends_on
+        return replace(known, has_unread=True) if waits else known
+
+    def probe(self) -> None:
+        """Have it answer within two seconds, if it can."""
+        if self._transport is not None and self._probe is None:
+            self._probe = Probe(self._transport.get_extra_info("socket"))
+            self._entries.later("connection.probe", PROBED, self._end_probe, served=self)
+
+    def _end_probe(self) -> None:
+        probe, self._probe = self._probe, None
+        if probe is not None and self._transport is not None:
+            probe.end()
+
+    def withhold(self, seconds: float) -> None:
+        """Write nothing for so long; with 0, no longer."""
+        if self._withheld is not None:
+            self._withheld.cancel()
+            self._withheld = None
+        if self._transport is None or self._transport.is_closing():
+            return
+        if seconds:
+            self._paused = True
+            self._withheld = self._entries.later(
+                "connection.withhold", seconds, self.withhold, 0.0, served=self, failed=self.abort
+            )
+        elif self._paused and self._transport.get_write_buffer_size() <= OUTPUT_LOW_WATER:
+            self.resume_writing()
+
     def close(self) -> None:
         """Write out what waits, then close."""
         if self._transport is None or self._closing:
@@ -683,6 +730,16 @@ class _Gone:
     def is_behind(self) -> bool:
         """Nothing waits for anybody."""
         return False
+
+    def contact(self) -> Contact:
+        """Nobody is at the other end."""
+        return Contact(silence=math.inf)
+
+    def probe(self) -> None:
+        """Nobody would answer."""
+
+    def withhold(self, seconds: float) -> None:
+        """Nothing is written anyway."""
 
     def close(self) -> None:
         """It is closed."""

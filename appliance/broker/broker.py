@@ -27,6 +27,7 @@ from appliance.broker.ports import (
     Journal,
     Limits,
     Link,
+    Objection,
     Observer,
     Store,
 )
@@ -116,6 +117,8 @@ class Broker:
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
         self.guards = self.router.guards
+        #: What one of them has against the message that was just published, if anything.
+        self.objection: Objection | None = None
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
         self.journal: Journal | None = None
@@ -189,6 +192,7 @@ class Broker:
             self.sessions[identity.client_id] = session
         session.link = link
         self.ledger.accounts.came(session)
+        session.connected_at = self.now
         session.ends_at = None
         session.set_will(will)
         session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
@@ -296,6 +300,7 @@ class Broker:
         if session.link is not link:
             return
         session.link = None
+        session.ended_well = not publish_will
         session.forget_transient()
         self._hand_over(session)
         if expiry is not None:
@@ -513,6 +518,14 @@ class Broker:
         self.faults.caught("broker.delivery", error, session)
         return False
 
+    def inspect(self, message: Message, session: Session) -> Objection | None:
+        """What a part of the appliance has against a QoS 2 message, before it is taken."""
+        for guard in self.guards.get(message.topic, ()):
+            objection = guard.inspect(message, session)
+            if objection is not None:
+                return objection
+        return None
+
     def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
 
@@ -521,19 +534,19 @@ class Broker:
         does not keep it from the others.
         """
         full: set[Receiver] = set()
-        receivers = 0
+        is_taken = False
         for session, qos, _, _ in route.targets:
-            if qos:
-                receivers += 1
-                if not session.has_room(message):
-                    full.add(session)
+            if qos and not session.has_room(message):
+                full.add(session)
+            else:  # as QoS 0 it goes to who is there: a client, or ROS
+                is_taken |= bool(qos) or session.link is not None
         for share, members in route.shares:
             asked = [session for session, qos, _, _ in members if qos]
-            if asked:
-                receivers += 1
-                if not any(session.has_room(message) for session in asked):
-                    full.add(share)
-        return frozenset(full), bool(receivers) and len(full) == receivers
+            if asked and not any(session.has_room(message) for session in asked):
+                full.add(share)
+            is_taken |= bool(asked) and share not in full
+            is_taken |= any(not qos and session.link is not None for session, qos, _, _ in members)
+        return frozenset(full), bool(full) and not is_taken
 
     def must_store(self, route: Route, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""

@@ -194,6 +194,8 @@ class Client:
             return
         code = self.broker.publish_to(targets, route, message, session)
         if qos:
+            if self.broker.objection is not None and self._object(packet_id, message):
+                return
             self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
 
     def _on_publish(self, packet: Publish) -> None:
@@ -223,8 +225,16 @@ class Client:
             self._on_publish_qos2(session, packet_id, message, route)
         else:
             code = broker.publish_to(route.targets, route, message, session)
-            if packet.qos:
+            if packet.qos and not self._object(packet_id, message):
                 self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
+
+    def _object(self, packet_id: int, message: Message) -> bool:
+        """Acknowledge a message with what a part of the appliance has against it, if anything."""
+        objection, self.broker.objection = self.broker.objection, None
+        if objection is None or objection.message is not message:
+            return False
+        self.output.object(0x40, packet_id, objection)
+        return True
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
@@ -271,6 +281,12 @@ class Client:
                 f"more than {self.broker.limits.inflight} unfinished QoS 2 messages",
             )
         else:
+            objection = self.broker.inspect(message, session)
+            if objection is not None and self._version == 5:
+                self._counters.publish_refused += 1
+                self._note_refused(packet_id)
+                self.output.object(0x50, packet_id, objection)
+                return
             full, everybody = self.broker.without_room(route, message)
             refuses = self._version == 5 and self.broker.limits.queue_full == "refuse"
             if everybody and refuses:
@@ -285,10 +301,13 @@ class Client:
         else:
             self.output.acknowledge(0x50, packet_id, code)
 
-    def _refuse_qos2(self, packet_id: int, code: ReasonCode, reason: str) -> None:
+    def _note_refused(self, packet_id: int) -> None:
         self._refused[packet_id] = None
         if len(self._refused) > self.broker.limits.inflight:
             del self._refused[next(iter(self._refused))]
+
+    def _refuse_qos2(self, packet_id: int, code: ReasonCode, reason: str) -> None:
+        self._note_refused(packet_id)
         self.output.acknowledge(0x50, packet_id, code, reason)
 
     def _on_acknowledgement(self, kind: int, packet_id: int, code: int) -> None:
@@ -554,6 +573,7 @@ class Client:
         self._ledger.take(self.account, -self._held)
         self.account = session.account
         self._ledger.take(self.account, self._held)
+        self.output.may_explain = agreement.explain
         explains = agreement.explain and self.broker.features.reason_strings
         self.output.open(session, agreement.aliases, explains=explains)
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]

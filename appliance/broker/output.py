@@ -7,7 +7,7 @@ from typing import Protocol, cast
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Wire
+from appliance.broker.ports import Contact, Objection, Wire
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubrec, Suback
@@ -62,6 +62,8 @@ class Output:
         self.maximum_packet_size = 0
         #: Whether what is published has to be looked at: for its size, or for what it passes.
         self._looks = False
+        #: Whether it wants to be told why; and whether it is, of what rules and limits decide.
+        self.may_explain = False
         self.explains = False
         #: The batch of the store that what it is answered depends on, and what waits for which.
         self.batch = 0
@@ -236,6 +238,18 @@ class Output:
         if self._client is not None:
             self._client.later()
 
+    def contact(self) -> Contact:
+        """How the client's computer answers."""
+        return self.wire.contact()
+
+    def probe(self) -> None:
+        """Have the client's computer answer, if it can."""
+        self.wire.probe()
+
+    def withhold(self, seconds: float) -> None:
+        """Let nothing out for so long."""
+        self.wire.withhold(seconds)
+
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why; its will is due."""
         if self._client is not None:
@@ -263,6 +277,17 @@ class Output:
             self._broker.unflushed.append(self)
         out.append(packet)
         self._counters.control_sent += 1
+
+    def object(self, first: int, packet_id: int, objection: Objection) -> None:
+        """Acknowledge with what ROS has against a message: its publisher alone can mend that.
+
+        To 3.1.1 it is acknowledged as any other.
+        """
+        if self.version == 5 and self.may_explain:
+            words: Properties = {Property.REASON_STRING: objection.reason}
+            self.send(_REFUSALS[first](packet_id, objection.code, words))
+        else:
+            self.acknowledge(first, packet_id, objection.code)
 
     def send(self, packet: Packet) -> bool:
         """Send any packet; False when it is larger than the client takes, also without words."""

@@ -89,6 +89,23 @@ class Access(Protocol):
         """Decide at once, without I/O; `topic` is a filter when `action` is SUBSCRIBE."""
 
 
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """How a client's computer answers, whatever the client says; times in seconds.
+
+    `silence` is how long nothing has come from it, not even an acknowledgement of the network's;
+    infinity where that cannot be known. `has_unread`: bytes have come that were not looked at yet.
+    """
+
+    round_trip: float = 0.0
+    silence: float = 0.0
+    has_unread: bool = False
+
+
+#: What is on this computer is there as long as its connection is.
+HERE = Contact()
+
+
 class Link(Protocol):
     """The way to the client of a session: a network connection, or the bridge."""
 
@@ -121,6 +138,15 @@ class Link(Protocol):
 
     def later(self) -> None:
         """Call `Session.pump` once more when the other clients have had their turn."""
+
+    def contact(self) -> Contact:
+        """How the client's computer answers."""
+
+    def probe(self) -> None:
+        """Have the client's computer answer, within two seconds, if it can: `contact` tells."""
+
+    def withhold(self, seconds: float) -> None:
+        """Let nothing out for so long, acknowledgements included; with 0, no longer."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """Tell the client why, where the protocol can, and end the connection."""
@@ -159,6 +185,16 @@ class InsideLink:
 
     def later(self) -> None:
         """It has no retained messages to go on with."""
+
+    def contact(self) -> Contact:
+        """It is here."""
+        return HERE
+
+    def probe(self) -> None:
+        """It is here."""
+
+    def withhold(self, seconds: float) -> None:
+        """Nothing is acknowledged."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """There is no connection to close."""
@@ -236,11 +272,23 @@ class Store(Protocol):
         """It does not any more."""
 
 
+@dataclass(frozen=True, slots=True)
+class Objection:
+    """What a part of the appliance has against a message, for who has published it."""
+
+    message: Message
+    code: ReasonCode
+    reason: str
+
+
 class Guard(Protocol):
     """A part of the appliance that has a say in who publishes to its topic."""
 
     def decide(self, session: Session) -> Decision:
         """Whether the session may; it holds until `Broker.guards_changed`."""
+
+    def inspect(self, message: Message, session: Session) -> Objection | None:
+        """What is wrong with a QoS 2 message, which can be refused before its PUBREL only."""
 
     def refused(self, session: Session) -> None:
         """A message of the session was refused, by this guard, another or the access rules."""
@@ -312,6 +360,15 @@ class Wire(Protocol):
     def is_behind(self) -> bool:
         """Whether some of it waits here, as the network takes no more; when it does,
         `Output.caught_up` is called, or `Output.resume_writing`."""
+
+    def contact(self) -> Contact:
+        """How the computer at the other end answers."""
+
+    def probe(self) -> None:
+        """Have it answer within two seconds, if it can."""
+
+    def withhold(self, seconds: float) -> None:
+        """Write nothing for so long; with 0, no longer."""
 
     def close(self) -> None:
         """Write what was written so far, then close."""

@@ -94,6 +94,8 @@ class Session:
         "batch",
         "bytes",
         "client_id",
+        "connected_at",
+        "ended_well",
         "ends_at",
         "epoch",
         "expiry",
@@ -129,6 +131,10 @@ class Session:
         #: For a session inside the appliance that wants to know who published what it receives.
         self.link_for: Callable[[Session], Link] | None = None
         self.expiry = 0
+        #: When its connection began, in seconds of the broker's clock.
+        self.connected_at = ledger.now
+        #: Whether its last connection ended with a DISCONNECT that its will is not for.
+        self.ended_well = False
         self.ends_at: float | None = None
         self.will: PendingWill | None = None
         self.will_at: float | None = None
@@ -168,6 +174,11 @@ class Session:
 
     def __str__(self) -> str:
         return str(self.identity) if self.identity else f"'{self.client_id}'"
+
+    @property
+    def age(self) -> float:
+        """Seconds since its connection began."""
+        return self.ledger.now - self.connected_at
 
     @property
     def persistent(self) -> bool:

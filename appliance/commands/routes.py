@@ -57,6 +57,7 @@ def routes(
     if bridged:
         rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
         _print_table([(*HEAD, *FIGURES), *rows])
+        _print_errors(bridged)
         if any(entry.get("lost") for entry in bridged):
             from appliance.ros.fastdds import LOST_IN_ROS
 
@@ -83,6 +84,14 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
         str(entry["errors"]),
         f"{latency['p50']:g} / {latency['p99']:g}" if latency else "",
     )
+
+
+def _print_errors(bridged: list[dict[str, Any]]) -> None:
+    """What was wrong with the last message of each route that was not carried."""
+    told = [entry for entry in bridged if entry.get("last_error")]
+    for entry in sorted(told, key=lambda entry: (entry["ros"], entry["direction"])):
+        way = ARROWS.get(entry["direction"], entry["direction"])
+        typer.echo(f"{entry['ros']} {way}  last error: {entry['last_error']}")
 
 
 def _print_skipped(skipped: list[dict[str, str]], shown: list[dict[str, str]]) -> None:

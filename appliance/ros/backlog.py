@@ -1,8 +1,10 @@
-"""What clients had queued while they had no connection, told from what they say now."""
+"""Which calls clients had queued while they had no connection, told from what they say now.
+
+For commands that move a robot there is more at stake, and more is asked: see `arrivals`.
+"""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 
 from appliance.broker.message import Message
@@ -15,9 +17,6 @@ BURST_MESSAGES = 3
 
 #: Seconds after which a backlog is over, however fast its client goes on.
 LONGEST = 60.0
-
-#: Clients whose return is waited for.
-EXPECTED = 1000
 
 
 @dataclass(slots=True)
@@ -40,16 +39,12 @@ class Backlog:
 
     def __init__(self) -> None:
         self._behind: dict[Session, _Behind] = {}
-        self._expected: OrderedDict[str, None] = OrderedDict()
 
     def has(self, message: Message, origin: Session | None, oldest: float, now: float) -> bool:
         """Whether the message is older than `oldest`, in seconds, or comes behind such a one."""
         is_old = message.age > oldest
         if origin is None:
             return is_old
-        if self._expected and origin.client_id in self._expected:
-            del self._expected[origin.client_id]
-            is_old = True
         behind = self._behind.get(origin)
         if behind is None:
             if is_old:
@@ -63,12 +58,6 @@ class Backlog:
             del self._behind[origin]
             return False
         return True
-
-    def expect(self, client_id: str) -> None:
-        """The client left in the midst of it: what it says first when it is back is from then."""
-        self._expected[client_id] = None
-        if len(self._expected) > EXPECTED:
-            self._expected.popitem(last=False)
 
     def departed(self, session: Session) -> None:
         """Its connection has ended: what it sends on the next one tells its own age."""

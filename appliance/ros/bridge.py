@@ -27,12 +27,13 @@ from appliance.broker.session import Session
 from appliance.entries import Entries, Repeated
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros.commands import Commands, Surroundings
+from appliance.ros.commands import Commands
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.graph import CallRoutes, Calls
+from appliance.ros.lease import Leases
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payloads import CONTENT_TYPE, ZSTD_MAGIC
@@ -40,7 +41,7 @@ from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 from appliance.ros.to_mqtt import ToMqtt
-from appliance.ros.to_ros import ToRos
+from appliance.ros.to_ros import Surroundings, ToRos
 
 __all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 
@@ -121,6 +122,7 @@ class Bridge:
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
+        self._around = Surroundings(entries, self._post, broker, Leases())
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None
         self._metered = 0
@@ -217,10 +219,8 @@ class Bridge:
         self._receive_for(self._routes)
 
     def _new_to_ros(self, route: Route, ros: str) -> ToRos:
-        if route.settings.rules is None:
-            return ToRos(route, ros, self._converters, self._tell)
-        around = Surroundings(self._entries, self._post, self._broker)
-        return Commands(route, ros, self._converters, self._tell, around)
+        kind = ToRos if route.settings.rules is None else Commands
+        return kind(route, ros, self._converters, self._tell, self._around)
 
     def _subscribe(self) -> None:
         """Subscribe to what the flows to ROS receive, and to nothing else."""
@@ -362,10 +362,13 @@ class Bridge:
         begun = thread_time() if is_long else 0.0
         for receiver in self._receivers.get(message.topic, ()):
             try:
-                receiver.receive(message, retain, origin)
+                objection = receiver.receive(message, retain, origin)
             except Exception as error:
                 self._faults.caught("bridge.receive", error, receiver)
                 receiver.counters.errors += 1
+                objection = receiver.objection(message, "could not be carried: see the log")
+            if objection is not None and message.qos == 1:
+                self._broker.objection = objection
         if is_long:
             self._broker.counters.effort += int((thread_time() - begun) * 1e6)
 

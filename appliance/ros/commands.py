@@ -9,21 +9,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Decision
+from appliance.broker.ports import Objection
 from appliance.broker.session import Session
-from appliance.entries import Entries
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.backlog import Backlog
+from appliance.ros.arrivals import AHEAD, SENT_AT, Arrivals, Verdict, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.rules import CommandRules, FieldLimits
-from appliance.ros.to_ros import ToRos
+from appliance.ros.to_ros import AgainstRulesError, Surroundings, ToRos
 
 #: Seconds until a stop message that ROS would not take is published again.
 RETRY = 0.05
@@ -32,16 +31,28 @@ RETRY = 0.05
 #: the two ends have found each other by then.
 LOOKS_TO_MATCH = 2
 
-_FREE = Decision(True, "nobody commands it")
+#: Seconds that the computer of a client that has fallen silent has to answer: two probes, of which
+#: the first may come a second after the silence began. And between two looks whether it has.
+ANSWERED = 2.5
+LOOK_AGAIN = 0.1
+
+#: What the system's clocks for that differ by, in seconds.
+COARSE = 0.02
+
+#: Seconds until it is looked again whether what a client has sent has been read.
+READ_SOON = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What commands need beside a flow: the loop, a way to it from any thread, and the broker."""
+@dataclass(slots=True)
+class _Waiting:
+    """A first command, converted, that waits whether there is a queue behind it."""
 
-    entries: Entries
-    post: Callable[..., None]
-    broker: Broker
+    message: Message
+    cdr: bytes
+    #: What of it is counted, in bytes.
+    size: int
+    due: float
+    timer: asyncio.TimerHandle
 
 
 class _Stop:
@@ -94,17 +105,14 @@ class Commands(ToRos):
         tell: Tell,
         around: Surroundings,
     ) -> None:
-        super().__init__(route, ros, converters, tell)
+        super().__init__(route, ros, converters, tell, around)
         assert route.settings.rules is not None
         self.rules: CommandRules = route.settings.rules
-        self._around = around
         #: Both replaced as one by the ROS thread.
         self._limits: FieldLimits | None = None
         self._stop: _Stop | None = None
         #: Looks that have found a subscription, since there is this publisher.
         self._looks = 0
-        #: Who may command alone, None while nobody does.
-        self._holder: Session | None = None
         #: Who sent the last command, and when.
         self._source: Session | None = None
         self._heard_at = -math.inf
@@ -114,13 +122,16 @@ class Commands(ToRos):
         #: infinity when they have fallen silent since.
         self._drivers: dict[Session, tuple[bytes, float]] = {}
         self._has_stopped = False
-        self._backlog = Backlog()
+        self._arrivals = Arrivals()
+        #: First commands of clients, see `Arrivals`.
+        self._waiting: dict[Session, _Waiting] = {}
+        #: Who fell silent while it drove, and when its computer was asked for an answer.
+        self._asked: dict[Session, float] = {}
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
         #: Whether the topic had a retained message before there was anybody on ROS to have it.
         self._is_awaited = False
         self._timer: asyncio.TimerHandle | None = None
-        self._is_left = True
         self._told: dict[str, float] = {}
 
     # The ROS thread
@@ -145,78 +156,176 @@ class Commands(ToRos):
     # The loop's thread
 
     def enter(self, before: ToRos | None) -> None:
-        broker = self._around.broker
-        self._is_left = False
-        broker.departures.append(self._departed)
-        # Also when anybody may command: the topic is then known as one that no answer goes to.
-        broker.guards.setdefault(self.mqtt, []).append(self)
-        broker.guards_changed()
+        super().enter(before)
+        self._around.broker.departures.append(self._departed)
         if isinstance(before, Commands):
             # What the network has of their commands, or a client that is away, is as old here.
-            self._drivers, self._backlog = before._drivers, before._backlog
+            self._drivers, self._arrivals = before._drivers, before._arrivals
             self._arm()
-        if self.rules.on_silence is not None:
-            # Of the time before, of another run even, nothing is known. Who drove then and is away
-            # may come back with what it had queued.
-            for session in broker.sessions.values():
-                if session.identity is not None and session.link is None:
-                    self._backlog.expect(session.client_id)
 
     def leave(self) -> None:
         if self._is_left:
             return
-        self._is_left = True
+        super().leave()
+        for origin in list(self._waiting):
+            self._forget(origin, "the route ends")
         if self._is_driven:
             self._publish_stop("the route ends")
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        broker = self._around.broker
-        broker.departures.remove(self._departed)
-        guards = broker.guards[self.mqtt]
-        guards.remove(self)
-        if not guards:
-            del broker.guards[self.mqtt]
-        broker.guards_changed()
-        self._holder = self._source = None
+        self._around.broker.departures.remove(self._departed)
+        if self.rules.exclusive:
+            self._lease.holder = None
+        self._source = None
 
-    def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
-        if self._is_left or not self._is_in_time(message, retain, origin):
-            return
-        out = self._out
+    def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
+        if self._is_left or (retain and not self.rules.take_retained):
+            return None
+        now = self._around.entries.time()
+        verdict = Verdict.CARRY_OUT
+        try:
+            why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)
+            is_proven = sent_at(message.properties) is not None
+        except ValueError as error:
+            return self._object(message, f"was refused: {error}")
+        if origin is not None and why:
+            self._forget(origin, why)
+            if origin.link is not None:
+                self._arrivals.is_old(origin, now)
+        elif origin is not None and not is_proven and self.rules.oldest < math.inf:
+            verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now)
+        if why:
+            return self._expire(message, why, origin)
         is_kept = retain or (message.retain and self.rules.take_retained)
-        if is_kept and (out is None or self._looks < LOOKS_TO_MATCH):
+        if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
             self._is_awaited = True
-            return
-        if out is None:
-            self.fail(f"was refused: {self._why_not()}")
-            return
-        cdr = self._publish(*out, message, origin)
-        if cdr is not None:
-            self._commanded(cdr, origin)
+            return None
+        cdr = self._convert(message, origin)
+        if origin is not None:
+            self._forget(origin, "another followed at once")  # which would be overtaken by it
+            if isinstance(cdr, Objection) or (
+                verdict is not Verdict.CARRY_OUT and self._stops(cdr)
+            ):
+                # Who says stop is heard at once, whatever comes with it.
+                self._arrivals.waited(origin)
+                verdict = Verdict.CARRY_OUT
+            elif verdict is Verdict.REFUSE:
+                return self._expire(message, "others came with it at once, as of a queue", origin)
+            elif verdict is Verdict.WAIT:
+                return self._let_wait(message, cdr, origin)
+        return cdr if isinstance(cdr, Objection) else self._carry_out(message, cdr, origin)
 
-    def _is_in_time(self, message: Message, retain: bool, origin: Session | None) -> bool:
-        rules = self.rules
-        if retain and not rules.take_retained:
-            return False
+    def inspect(self, message: Message, session: Session) -> Objection | None:
+        try:
+            why = self._old_by_itself(message)
+        except ValueError as error:
+            return self._object(message, f"was refused: {error}")
+        return self._expire(message, why, session) if why else super().inspect(message, session)
+
+    def _carry_out(self, message: Message, cdr: bytes, origin: Session | None) -> Objection | None:
+        objection = self._publish(cdr, message)
+        if objection is None:
+            self._commanded(cdr, origin)
+        return objection
+
+    # Old commands: see `Arrivals`
+
+    def _old_by_itself(self, message: Message) -> str:
+        """Why the message is too old, as it says; empty when it is not. ValueError: nonsense."""
         expires_at = message.expires_at
         if expires_at is not None and expires_at <= self._around.broker.now:
-            return self._count_expired("its message expiry is over", origin)
-        # Without a Message Expiry Interval nobody knows how old a retained message is. A will was
-        # handed over when its client connected.
-        is_will = origin is not None and origin.link is None
-        if is_will:
-            is_old = rules.oldest < math.inf
-        else:
-            is_old = self._backlog.has(message, origin, rules.oldest, self._around.entries.time())
-        if is_old or (retain and rules.expire is not None and expires_at is None):
-            return self._count_expired("it was sent some time before", origin)
-        return True
+            return "its message expiry is over"
+        oldest = self.rules.oldest
+        if oldest == math.inf:
+            return ""
+        made_at = sent_at(message.properties)
+        if made_at is None:
+            return ""
+        age = time.time() - made_at
+        if age < -AHEAD:
+            ahead = f"its {SENT_AT} is {-age:.1f} s in the future"
+            raise ValueError(f"{ahead}: set the clocks of the robot and its client")
+        return f"it was sent {age:.1f} s before, by its {SENT_AT}" if age > oldest else ""
 
-    def _count_expired(self, why: str, origin: Session | None) -> bool:
+    def _old_by_its_way(self, message: Message, retain: bool, origin: Session | None) -> str:
+        """Why a message that does not say so is too old; empty when that is not known."""
+        rules = self.rules
+        oldest = rules.oldest
+        if oldest == math.inf or sent_at(message.properties) is not None:
+            return ""
+        # A will was handed over when its client connected. Without a Message Expiry Interval
+        # nobody knows how old a retained message is.
+        is_will = origin is not None and origin.link is None
+        is_unknown = retain and rules.expire is not None and message.expires_at is None
+        is_old = is_will or is_unknown or message.age > oldest
+        return "it was sent some time before" if is_old else ""
+
+    def _expire(self, message: Message, why: str, origin: Session | None) -> Objection:
+        self._count_expired(why, origin)
+        return self.objection(message, f"is too old: {why}")
+
+    def _count_expired(self, why: str, origin: Session | None) -> None:
         self.counters.expired += 1
+        self.counters.last_error = f"a command was too old: {why}"
         self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
-        return False
+
+    def _let_wait(self, message: Message, cdr: bytes, origin: Session) -> Objection | None:
+        """Keep a first command until it is known whether others are behind it."""
+        entries, ledger = self._around.entries, self._around.broker.ledger
+        size = message.size + len(cdr)
+        if not ledger.fits(origin.account, size):
+            self._arrivals.waited(origin)
+            return self._object(message, "was refused: there is no memory for it to wait in")
+        ledger.take(origin.account, size)
+        due = entries.time() + self._arrivals.waiting_time(origin, self.rules.oldest)
+        timer = self._wait_until(due, origin)
+        self._waiting[origin] = _Waiting(message, cdr, size, due, timer)
+        return None
+
+    def _wait_until(self, when: float, origin: Session) -> asyncio.TimerHandle:
+        return self._around.entries.at(
+            "commands.wait",
+            when,
+            self._has_waited,
+            origin,
+            served=origin,
+            failed=lambda: self._forget(origin, "it could not be carried out"),
+        )
+
+    def _wait_no_longer(self, origin: Session) -> _Waiting | None:
+        waiting = self._waiting.pop(origin, None)
+        if waiting is not None:
+            waiting.timer.cancel()
+            self._around.broker.ledger.take(origin.account, -waiting.size)
+        return waiting
+
+    def _forget(self, origin: Session, why: str) -> None:
+        """What waits is not carried out, if something does."""
+        if self._wait_no_longer(origin) is not None:
+            self._count_expired(why, origin)
+
+    def _has_waited(self, origin: Session) -> None:
+        """Nothing has followed the first command, unless it has come and was not read yet."""
+        now = self._around.entries.time()
+        waiting = self._waiting[origin]
+        if origin.link is not None and origin.link.contact().has_unread:
+            if now < waiting.due + self.rules.oldest:
+                waiting.timer = self._wait_until(now + READ_SOON, origin)
+            else:
+                self._forget(origin, "what came with it was read late")
+            return
+        self._arrivals.waited(origin)
+        self._carry_out_waiting(origin)
+
+    def _carry_out_waiting(self, origin: Session) -> None:
+        waiting = self._wait_no_longer(origin)
+        if waiting is None:
+            return
+        if self.decide(origin):
+            self._carry_out(waiting.message, waiting.cdr, origin)
+        else:
+            self.counters.refused += 1
 
     def _read(
         self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
@@ -228,7 +337,7 @@ class Commands(ToRos):
             limited, has_changed = self._limits.apply(cdr)
         except ConversionError as error:
             self.counters.refused += 1
-            raise ConversionError("", f"it is against the route's rules: {error}") from None
+            raise AgainstRulesError("", f"it is against the route's rules: {error}") from None
         if has_changed:
             self.counters.clamped += 1
             self._mention("clamped", "%s: numbers in a command of %s were clamped", origin)
@@ -236,10 +345,12 @@ class Commands(ToRos):
 
     def _commanded(self, cdr: bytes, origin: Session | None) -> None:
         now = self._around.entries.time()
+        lease = self._lease
         self._heard_at = now
         self._source = origin
         self._is_driven = self._stop is not None and cdr != self._stop.example
         if origin is not None and origin.link is not None:
+            self._asked.pop(origin, None)
             if self._is_driven:
                 self._drivers[origin] = cdr, now
             else:
@@ -247,43 +358,37 @@ class Commands(ToRos):
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
         self._is_awaited = False
-        if self.rules.exclusive and self._holder is None and origin is not None and origin.link:
-            self._holder = origin
+        if self.rules.exclusive and lease.holder is None and origin is not None and origin.link:
+            lease.holder = origin
             self._around.broker.guards_changed()
             self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)
-        if self._timer is None and (self._is_driven or self._holder is not None):
+        if origin is lease.holder:
+            lease.heard_at = now
+        if self._timer is None and (self._is_driven or lease.holder is not None):
             self._arm()
 
     # Leases
 
     @property
     def commanding(self) -> str | None:
-        holder = self._holder
+        holder = self._lease.holder if self.rules.exclusive else None
         return None if holder is None else holder.client_id
 
-    def decide(self, session: Session) -> Decision:
-        """Whether the session may publish a command now: a Guard of the broker's."""
-        holder = self._holder
-        # What the bridge itself publishes there is what it heard on ROS.
-        if holder is None or session is holder or session.link_for is not None:
-            return _FREE
-        return Decision(False, f"{holder} commands {self.ros}, and the route is exclusive")
-
-    def refused(self, session: Session) -> None:
-        """A message of the session was refused, by this guard or another."""
-        if not self.decide(session):
-            self.counters.refused += 1
-
     def _release(self, why: str) -> None:
-        holder, self._holder = self._holder, None
+        holder, self._lease.holder = self._lease.holder, None
         self._around.broker.guards_changed()
         self._tell(logging.INFO, "%s: %s %s and commands no more", self, holder, why)
 
     # Silence
 
     def _departed(self, session: Session) -> None:
-        self._backlog.departed(session)
-        if session is self._holder:
+        if session.ended_well:
+            # Nothing was behind it: `mosquitto_pub` and the like.
+            self._carry_out_waiting(session)
+        self._forget(session, "its connection was lost")
+        self._arrivals.departed(session)
+        self._asked.pop(session, None)
+        if self.rules.exclusive and session is self._lease.holder:
             self._release("has left")
         if session is self._source:
             self._source = None
@@ -292,23 +397,28 @@ class Commands(ToRos):
         driven = self._drivers.pop(session, None)
         if driven is not None and not self._is_stop(driven[0]):
             # Its library may have queued what it commanded since, and marks none of it as old.
-            self._backlog.expect(session.client_id)
+            self._arrivals.expect(session.client_id)
+
+    def _stops(self, cdr: bytes) -> bool:
+        """Whether it is the route's stop message, or says the same."""
+        return self._stop is not None and (cdr == self._stop.example or self._stop.is_like(cdr))
 
     def _is_stop(self, cdr: bytes) -> bool:
-        if self.rules.on_silence is None:
-            return True
-        return self._stop is not None and self._stop.is_like(cdr)
+        """Whether who said it last does not drive."""
+        return self.rules.on_silence is None or self._stops(cdr)
 
     def _arm(self) -> None:
         rules = self.rules
         due = math.inf
         if self._is_driven and rules.on_silence is not None:
             due = self._heard_at + rules.on_silence.after
-        if self._holder is not None:
-            due = min(due, self._heard_at + rules.lease)
+        if rules.exclusive and self._lease.holder is not None:
+            due = min(due, self._lease.heard_at + rules.lease)
         if rules.on_silence is not None and rules.on_silence.disconnect:
             heard_at = min((at for _, at in self._drivers.values()), default=math.inf)
             due = min(due, heard_at + rules.on_silence.after)
+        if self._asked:
+            due = min(due, self._around.entries.time() + LOOK_AGAIN)
         if due < math.inf:
             entries = self._around.entries
             self._timer = entries.at(
@@ -321,9 +431,15 @@ class Commands(ToRos):
 
     def _check(self) -> None:
         self._timer = None
-        silence = self._around.entries.time() - self._heard_at
+        now = self._around.entries.time()
+        silence = now - self._heard_at
         on_silence = self.rules.on_silence
-        is_over = self._holder is not None and silence >= self.rules.lease
+        lease = self._lease
+        is_over = (
+            self.rules.exclusive
+            and lease.holder is not None
+            and now - lease.heard_at >= self.rules.lease
+        )
         if is_over:
             self._release(f"was silent for {self.rules.lease:g} s")
         if self._is_driven and on_silence is not None:
@@ -334,25 +450,43 @@ class Commands(ToRos):
                 after = min(silence, on_silence.after)
                 self._publish_stop(f"{who} fell silent for {after:g} s")
         if on_silence is not None and on_silence.disconnect:
-            self._disconnect_silent(min(silence, on_silence.after) if is_over else on_silence.after)
+            self._ask_silent(min(silence, on_silence.after) if is_over else on_silence.after)
+            self._disconnect_silent()
         if self._timer is None:
             self._arm()
 
-    def _disconnect_silent(self, after: float) -> None:
-        """Disconnect who drove and has said nothing for so long, also when others drive on."""
-        latest = self._around.entries.time() - after
-        silent = [(who, cdr) for who, (cdr, at) in self._drivers.items() if at <= latest]
-        for session, cdr in silent:
-            self._drivers[session] = cdr, math.inf
-            if self._is_stop(cdr):
+    def _ask_silent(self, after: float) -> None:
+        """Who drove and has said nothing for so long, also when others drive on: is it there?"""
+        now = self._around.entries.time()
+        for session, (cdr, at) in self._drivers.items():
+            if at > now - after:
                 continue
-            # The network may have it, and a heap of its commands on their way: they are old when
-            # they come, and nothing in them says so. On a new connection there are none of them.
-            session.close_link(
-                ReasonCode.ADMINISTRATIVE_ACTION,
-                f"it drove {self.ros} and fell silent (on_silence.disconnect)",
-            )
-        if silent:
+            self._drivers[session] = cdr, math.inf
+            if not self._is_stop(cdr) and session.link is not None:
+                self._asked[session] = now
+                session.link.probe()
+
+    def _disconnect_silent(self) -> None:
+        """Disconnect whose computer does not answer: the network may have a heap of commands.
+
+        They are old when they come, and nothing in them says so; on a new connection there are
+        none of them. Where the computer answers, nothing is on its way.
+        """
+        now = self._around.entries.time()
+        has_closed = False
+        for session, asked in list(self._asked.items()):
+            link = session.link
+            if link is None or link.contact().silence + COARSE < now - asked:
+                del self._asked[session]
+            elif now - asked >= ANSWERED:
+                del self._asked[session]
+                has_closed = True
+                session.close_link(
+                    ReasonCode.ADMINISTRATIVE_ACTION,
+                    f"it drove {self.ros} and fell silent, and its computer does not answer "
+                    "(on_silence.disconnect)",
+                )
+        if has_closed:
             self._around.broker.flush()
 
     def _begin(self) -> None:

@@ -229,6 +229,9 @@ class RosNode(Protocol):
         Raises BusError, UnknownTypeError.
         """
 
+    def resolve(self, topic: str) -> str:
+        """The topic's name on the bus, which remappings may make another."""
+
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
 
@@ -387,6 +390,8 @@ class FakeNode:
         self.name = name
         self.types = types
         self.running = False
+        #: What topics are called on the bus, where that is something else.
+        self.remapped: dict[str, str] = {}
         self.takes_on_loop = False
         self.remote_publishers: list[FakePeer] = []
         self.remote_subscribers: list[FakePeer] = []
@@ -507,6 +512,9 @@ class FakeNode:
 
     def now(self) -> int:
         return time.time_ns()
+
+    def resolve(self, topic: str) -> str:
+        return self.remapped.get(topic, topic)
 
     def nodes(self) -> list[str]:
         ends = [*self.remote_publishers, *self.remote_subscribers]

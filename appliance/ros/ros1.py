@@ -501,6 +501,9 @@ class Ros1Node:
             return action
         return describe(type_name, self._definition(type_name).text)
 
+    def resolve(self, topic: str) -> str:
+        return self._resolve(topic)
+
     def _resolve(self, name: str) -> str:
         return str(self._rospy.resolve_name(name)) if self._arguments else name
 

@@ -329,6 +329,9 @@ class Ros2Node:
         with handle:
             return handle.get_count_publishers(topic), handle.get_count_subscribers(topic)
 
+    def resolve(self, topic: str) -> str:
+        return str(self._node.resolve_topic_name(topic)) if self._arguments else topic
+
     def publishers(self, topic: str) -> list[Endpoint]:
         return self._others(self._node.get_publishers_info_by_topic(topic))
 

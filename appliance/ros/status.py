@@ -23,7 +23,8 @@ class TopicStatus:
     """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
 
     `rate` is in messages a second, `size` the mean payload in bytes, `latency_ms` from the
-    publisher on ROS to the broker, None while none was measured. Counts are since the topic came;
+    publisher on ROS to the broker, None while none was measured. `last_error` is what was wrong
+    with the last message that was not carried. Counts are since the topic came;
     for what is counted see `Counters`.
     """
 
@@ -42,6 +43,7 @@ class TopicStatus:
     errors: int
     expired: int
     refused: int
+    last_error: str | None
     latency_ms: LatencyStatus | None
 
 
@@ -93,6 +95,7 @@ def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
         counters.errors,
         counters.expired,
         counters.refused,
+        counters.last_error,
         latency_status(counters.latency),
     )
 

@@ -3,19 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import Decision, Objection
 from appliance.broker.session import Session
+from appliance.entries import Entries
 from appliance.mqtt.codec import Property, quote
+from appliance.mqtt.reason import ReasonCode
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.flows import Echo, Flow, Route, Tell
+from appliance.ros.lease import Lease, Leases
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
 from appliance.ros.payloads import CONTENT_TYPE, check, claim, unpacker
 from appliance.ros.qos import publisher_qos
 
+#: Characters of a reason that a client is told.
+REASON_LENGTH = 500
+
+
+class AgainstRulesError(ConversionError):
+    """A message that could be converted, and that the route's rules do not let through."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a flow to ROS needs: the loop, a way to it from any thread, the broker, and who commands
+    which ROS topic alone."""
+
+    entries: Entries
+    post: Callable[..., None]
+    broker: Broker
+    leases: Leases
+
 
 class ToRos(Flow):
-    """From MQTT to ROS: a publisher. `receive` and `fail` are for the loop's thread."""
+    """From MQTT to ROS: a publisher. `receive`, `fail` and what a Guard has are for the loop's
+    thread."""
 
     direction = "to_ros"
     absence = "no node subscribes to it, which would tell its type; the route can name it"
@@ -26,9 +51,15 @@ class ToRos(Flow):
         ros: str,
         converters: Converters,
         tell: Tell,
+        around: Surroundings,
     ) -> None:
         super().__init__(route, ros, converters, tell)
+        self._around = around
+        self._is_left = True
         self.echo: Echo | None = None
+        #: The topic's name on ROS, where a remapping gives it another.
+        self._name = ros
+        self._lease = Lease(ros)
         #: Replaced as one, because the loop's thread reads it.
         self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
 
@@ -52,6 +83,10 @@ class ToRos(Flow):
         check(converter, settings.encoding, to_ros=True)
         unpack = unpacker(converter, settings.encoding, settings.compression, settings.largest)
         publisher = node.create_publisher(self.ros, type_name, qos)
+        name = node.resolve(self.ros)
+        if name != self._name:
+            self._name = name
+            self._around.post(self._share_lease)
         before, self._out = self._out, (unpack, publisher)
         if before is not None:
             before[1].destroy()
@@ -75,45 +110,101 @@ class ToRos(Flow):
 
     def enter(self, before: ToRos | None) -> None:
         """Messages are going to be received from now on; until now `before` has had them."""
+        self._is_left = False
+        self._share_lease()
+        broker = self._around.broker
+        # Also when anybody may command: the topic is then known as one that no answer goes to.
+        broker.guards.setdefault(self.mqtt, []).append(self)
+        broker.guards_changed()
 
     def leave(self) -> None:
-        """None will be received any more."""
+        """None will be received any more; may be called twice."""
+        if self._is_left:
+            return
+        self._is_left = True
+        broker = self._around.broker
+        guards = broker.guards[self.mqtt]
+        guards.remove(self)
+        if not guards:
+            del broker.guards[self.mqtt]
+        broker.guards_changed()
 
-    def receive(self, message: Message, retain: bool, origin: Session | None) -> None:
-        """A message from MQTT, of that session; `retain` when it is from before the route.
+    def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
+        """A message from MQTT, of that session; returns what is wrong with it, which is told.
 
-        It may then be an old command, and does not reach ROS.
+        With `retain` it is from before the route: it may be an old command, and does not reach ROS.
         """
         if retain:
-            return
+            return None
+        cdr = self._convert(message, origin)
+        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message)
+
+    def _convert(self, message: Message, origin: Session | None) -> bytes | Objection:
+        """The message's CDR, or what is wrong with it, which is told."""
         out = self._out
         if out is None:
-            self.fail(f"was refused: {self._why_not()}")
-            return
-        self._publish(*out, message, origin)
-
-    def _publish(
-        self,
-        convert: Callable[[bytes], bytes],
-        publisher: RosPublisher,
-        message: Message,
-        origin: Session | None,
-    ) -> bytes | None:
-        """Publish the message on ROS; its CDR, or None when that failed, which is told."""
+            return self._object(message, f"was refused: {self._why_not()}")
         try:
-            cdr = self._read(convert, message, origin)
+            return self._read(out[0], message, origin)
+        except AgainstRulesError as error:
+            return self._object(message, f"was refused: {error}")
+        except ConversionError as error:
+            problem = f"cannot be converted: {error}"
+            return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
+
+    def _publish(self, cdr: bytes, message: Message) -> Objection | None:
+        """Publish on ROS what the message was converted to; returns why that failed."""
+        out = self._out
+        if out is None:
+            return self._object(message, f"was refused: {self._why_not()}")
+        try:
             if self.echo is not None:
                 self.echo.sent(cdr)
-            publisher.publish(cdr)
-        except ConversionError as error:
-            self.fail(f"cannot be converted: {error}")
+            out[1].publish(cdr)
         except BusError as error:
-            self.fail(f"could not be published: {error}")
-        else:
-            self.counters.messages += 1
-            self.counters.bytes += len(message.payload)
-            return cdr
+            return self._object(message, f"could not be published: {error}")
+        self.counters.messages += 1
+        self.counters.bytes += len(message.payload)
         return None
+
+    def _object(
+        self,
+        message: Message,
+        problem: str,
+        code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+    ) -> Objection:
+        self.fail(problem)
+        return self.objection(message, problem, code)
+
+    def objection(
+        self,
+        message: Message,
+        problem: str,
+        code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+    ) -> Objection:
+        """What the client is told: the code, and why."""
+        return Objection(message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
+
+    # Who may publish: a Guard of the broker's
+
+    def decide(self, session: Session) -> Decision:
+        """Whether the session may publish a command now."""
+        return self._lease.decide(session)
+
+    def inspect(self, message: Message, session: Session) -> Objection | None:
+        """Whether a message of QoS 2 can be converted."""
+        cdr = self._convert(message, session)
+        return cdr if isinstance(cdr, Objection) else None
+
+    def refused(self, session: Session) -> None:
+        """A message of the session was refused, by this guard or another."""
+        if not self.decide(session):
+            self.counters.refused += 1
+
+    def _share_lease(self) -> None:
+        """What else goes to the topic, by whatever route and name, has the same lease."""
+        self._lease = self._around.leases.of(self._name)
+        self._around.broker.guards_changed()
 
     def _read(
         self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None

@@ -11,7 +11,16 @@ from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Exchange, Identity, Limits, UserLimits
+from appliance.broker.ports import (
+    HERE,
+    Action,
+    Contact,
+    Decision,
+    Exchange,
+    Identity,
+    Limits,
+    UserLimits,
+)
 from appliance.broker.retained import retained_size
 from appliance.broker.session import Delivery, Held, Session, subscription_size
 from appliance.mqtt.codec import Properties, Property, decode_varint
@@ -183,6 +192,15 @@ class FakeWire:
 
     def later(self) -> None:
         self.laters += 1
+
+    def contact(self) -> Contact:
+        return HERE
+
+    def probe(self) -> None:
+        pass
+
+    def withhold(self, seconds: float) -> None:
+        pass
 
     def write(self, chunks: list[bytes]) -> None:
         assert not self.closed, "written to after the close"

@@ -801,3 +801,24 @@ def test_the_memory_of_a_client_is_free_at_once(broker: Broker, end: str):
         assert wire() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_messages=2, inflight=2)])
+@pytest.mark.parametrize("topic_filter", ["a", "$share/g/a"])
+def test_an_absent_client_without_room_is_no_reason_to_refuse_what_others_take(
+    join: Join, broker: Broker, topic_filter
+):
+    """As QoS 0 it goes to who is there: a client, or ROS."""
+    absent = join("absent", **lasting(5))
+    absent.subscribe("a", 2)
+    absent.lose()
+    publisher = join("publisher")
+    codes = [publisher.publish("a", b"%d" % number, 2) for number in range(4)]
+    assert codes == [0, 0, 0x97, 0x97]
+    taker = join("taker")
+    taker.subscribe(topic_filter, 0)
+    for number in range(4):
+        assert publisher.publish("a", b"%d" % number, 2) == 0
+    assert [m.payload for m in taker.drain()] == [b"0", b"1", b"2", b"3"]
+    taker.lose()
+    assert publisher.publish("a", b"4", 2) == 0x97

@@ -259,3 +259,13 @@ def test_the_command_says_what_ros_lost_and_what_to_do(tmp_path, monkeypatch, ca
     with pytest.raises(SystemExit):
         cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
     assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_the_command_says_what_was_wrong_last(tmp_path, monkeypatch, capsys):
+    (tmp_path / "appliance.yaml").write_text("")
+    told = [carried(direction="to_ros", errors=2, last_error="cannot be converted: not JSON")]
+    monkeypatch.setattr(control, "ask", lambda path, what: [] if what == "skipped" else told)
+    with pytest.raises(SystemExit):
+        cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2:] == ["/image ←  last error: cannot be converted: not JSON"]

@@ -1,0 +1,217 @@
+"""How old a command is: what is known of it, from which evidence, and what is decided.
+
+A command that is carried out late moves a robot that nobody steers any more. MQTT messages do not
+say when they were made, and client libraries queue what is published without a connection and send
+it later as if it were new. So a command's age is taken from these, in this order:
+
+| what is seen                                           | what that proves, and what is decided |
+|--------------------------------------------------------|---------------------------------------|
+| user property `sent-at`, of clocks that agree          | its age: carried out at once, or old  |
+| Message Expiry that is over, DUP, a PUBREL that comes  | it is old: refused, and what comes    |
+| late, a will                                           | behind it is a queue                  |
+| a command less than `oldest` after one that was new    | it is younger: carried out at once    |
+| the first since CONNECT, or since a longer silence,    | nothing: it waits for as long as the  |
+| and none behind it                                     | next of a queue takes, or until a     |
+|                                                        | DISCONNECT, and is carried out        |
+| the same, and others behind it at once                 | a queue: none is carried out, neither |
+|                                                        | the first nor the newest              |
+| they go on at the pace of somebody who steers          | a queue would come faster: carried    |
+|                                                        | out from the third on                 |
+
+A Message Expiry Interval that is left proves nothing: it counts down in servers only, not in a
+client's queue. A message that stops the robot is never old, see `Commands`.
+
+The pace of somebody who steers is two gaps in a row that are no burst. A queue of QoS 1 may come
+one by one, each behind the acknowledgement of the one before, and a busy or distant client then
+has a pace as well. So what the client is sent is withheld for a moment, acknowledgements included:
+who still goes on does not wait for these, and has no such queue.
+
+Not to be known without `sent-at`: the age of a single command; of a queue that a slow network or
+a starved client spreads over gaps as long as those of steering; and a delay that grows little by
+little.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from enum import Enum
+
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, Property, quote
+
+#: The user property that says when a command was made.
+SENT_AT = "sent-at"
+
+#: Seconds that a client's clock may be ahead of ours; a command may be older by as much.
+AHEAD = 0.25
+
+#: Seconds that the first command waits for another behind it, beside two round trips: Nagle's
+#: algorithm and delayed acknowledgements keep the second of a queue back for 40 ms.
+WAIT = 0.1
+
+#: Seconds between two messages of QoS 0 or 1 from which on it is no burst.
+BURST = 0.008
+
+#: The same for QoS 2, whose acknowledgements cannot be withheld: messages take two round trips
+#: each, which come on top.
+BURST_QOS_2 = 0.03
+
+#: Such gaps in a row until a client counts as one that steers.
+STEADY = 2
+
+#: Seconds that a client's acknowledgements are withheld, to see whether it goes on without them:
+#: more than there are between two of its commands. And from one such try to the next.
+WITHHELD = 0.15
+TRY_AGAIN = 1.0
+
+#: Seconds after which a queue is over, however fast its client goes on.
+LONGEST = 60.0
+
+#: Clients of which is known that they left while they drove.
+EXPECTED = 1000
+
+
+class Verdict(Enum):
+    """What to do with a command."""
+
+    CARRY_OUT = "carry out"
+    #: Until `Arrivals.waiting_time` is over, unless another comes.
+    WAIT = "wait"
+    REFUSE = "refuse"
+
+
+@dataclass(slots=True)
+class _Pace:
+    """How the commands of one client come, since its connection or its last silence began."""
+
+    last: float
+    #: When a queue is taken to be over.
+    end: float
+    #: Gaps in a row that are no burst.
+    steady: int = 0
+    is_waiting: bool = False
+    is_queue: bool = False
+    is_known: bool = False
+    withheld_until: float = -math.inf
+
+
+class Arrivals:
+    """The commands of all clients to one topic, as they come; times in seconds."""
+
+    def __init__(self) -> None:
+        self._paces: dict[Session, _Pace] = {}
+        self._expected: OrderedDict[str, None] = OrderedDict()
+
+    def judge(self, origin: Session, qos: int, oldest: float, now: float) -> Verdict:
+        """What to do with a command of unknown age that has come now."""
+        pace = self._paces.get(origin)
+        if pace is None or now - pace.last > oldest:
+            return self._begin(origin, oldest, now)
+        gap = now - pace.last
+        pace.last = now
+        if pace.is_known:
+            return Verdict.CARRY_OUT
+        is_steady = gap >= (BURST_QOS_2 + 2 * _round_trip(origin) if qos == 2 else BURST)
+        pace.steady = pace.steady + 1 if is_steady else 0
+        if qos == 1 and pace.steady and now > pace.withheld_until:
+            # It may have waited for what it was sent meanwhile.
+            pace.steady = 1
+            self._withhold(pace, origin, now)
+        if pace.steady >= STEADY or now >= pace.end:
+            pace.is_known = True
+            pace.is_waiting = pace.is_queue = False
+            if origin.link is not None:
+                origin.link.withhold(0.0)
+            return Verdict.CARRY_OUT
+        if pace.is_waiting or pace.is_queue or gap < self.waiting_time(origin, oldest):
+            pace.is_queue, pace.is_waiting = True, False
+            return Verdict.REFUSE
+        pace.is_waiting = True
+        return Verdict.WAIT
+
+    def _begin(self, origin: Session, oldest: float, now: float) -> Verdict:
+        pace = self._paces[origin] = _Pace(now, now + LONGEST)
+        if self._expected and origin.client_id in self._expected:
+            del self._expected[origin.client_id]
+            # Of who left in the midst of driving even a single one is from then, most likely.
+            pace.is_queue = origin.age <= oldest
+        pace.is_waiting = not pace.is_queue
+        return Verdict.WAIT if pace.is_waiting else Verdict.REFUSE
+
+    def _withhold(self, pace: _Pace, origin: Session, now: float) -> None:
+        if origin.link is not None and now > pace.withheld_until + TRY_AGAIN:
+            pace.withheld_until = now + WITHHELD
+            origin.link.withhold(WITHHELD)
+
+    def waiting_time(self, origin: Session, oldest: float) -> float:
+        """Seconds that a first command waits: until then the next of a queue would have come."""
+        return min(WAIT + 2 * _round_trip(origin), oldest)
+
+    def is_old(self, origin: Session, now: float) -> None:
+        """A command has come that is known to be old: the next ones were queued behind it."""
+        self._paces[origin] = _Pace(now, now + LONGEST, is_queue=True)
+
+    def waited(self, origin: Session) -> None:
+        """The command that waits has none behind it."""
+        pace = self._paces.get(origin)
+        if pace is not None:
+            pace.is_waiting = False
+
+    def expect(self, client_id: str) -> None:
+        """The client left in the midst of driving, and may have queued what it commanded since."""
+        self._expected[client_id] = None
+        if len(self._expected) > EXPECTED:
+            self._expected.popitem(last=False)
+
+    def departed(self, session: Session) -> None:
+        """Its connection has ended: the next one is a beginning."""
+        self._paces.pop(session, None)
+
+
+def _round_trip(origin: Session) -> float:
+    return 0.0 if origin.link is None else origin.link.contact().round_trip
+
+
+def sent_at(properties: Properties | None) -> float | None:
+    """When its client made the message, in seconds since 1970; None when it does not say.
+
+    That is RFC 3339, or a number. ValueError: it is neither, or there are two of them.
+    """
+    pairs = (properties or {}).get(Property.USER_PROPERTY)
+    said = [
+        str(pair[1])
+        for pair in (pairs if isinstance(pairs, list) else ())
+        if isinstance(pair, tuple) and pair[0] == SENT_AT
+    ]
+    if not said:
+        return None
+    if len(said) > 1:
+        raise ValueError(f"it says {SENT_AT} {len(said)} times")
+    problem = f"its {SENT_AT} is {quote(said[0][:40])}, no RFC 3339 and no seconds since 1970"
+    try:
+        return _seconds(said[0])
+    except (ValueError, OverflowError):
+        raise ValueError(problem) from None
+
+
+def _seconds(text: str) -> float:
+    if not text.isascii() or len(text) > 40 or "_" in text:
+        raise ValueError
+    if text.replace(".", "", 1).isdigit():
+        return float(text)
+    # Python 3.10 takes three or six digits of a fraction only, and no Z.
+    head, point, rest = text.upper().partition(".")
+    if point:
+        digits = len(rest) - len(rest.lstrip("0123456789"))
+        if not digits:
+            raise ValueError
+        head, rest = f"{head}.{rest[:digits][:6]:0<6}", rest[digits:]
+    elif head.endswith("Z"):
+        head, rest = head[:-1], "Z"
+    moment = datetime.fromisoformat(head + rest.replace("Z", "+00:00"))
+    if moment.tzinfo is None or "T" not in text.upper().replace(" ", "T"):
+        raise ValueError
+    return moment.astimezone(timezone.utc).timestamp()
