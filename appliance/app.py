@@ -48,6 +48,7 @@ from appliance.crash import CrashReports
 from appliance.entries import Entries, shield
 from appliance.listeners import Listeners
 from appliance.notify import Notifier
+from appliance.pulse import Pulse
 from appliance.reload import Parts, Reload, ReloadError
 from appliance.ros import discovery
 from appliance.ros.bridge import Bridge
@@ -364,7 +365,8 @@ class App:
         self._entries.signal("signal.reload", signal.SIGHUP, self._on_hangup)
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
         assert self._status is not None
-        self._notifier.start(loop, self._status.line)
+        pulse = Pulse(self.broker, self._listeners.network, self._inside, loop.time)
+        self._notifier.start(self._entries, self._status.line, pulse.is_there)
         try:
             await self._stopping.wait()
             log.info("stopping")

@@ -250,4 +250,5 @@ class _Shield:
                 self._faults.caught(self._entry, error)
                 return None
 
+        setattr(self, name, tell)  # it is not asked for again
         return tell

@@ -50,7 +50,17 @@ class Certificates(Protocol):
         """The user that it names; None when that is not asked for. ValueError: it names none."""
 
 
-class Member(Protocol):
+class Turning(Protocol):
+    """Who waits for a turn."""
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """Count what escaped while it was served, and end it; never raises."""
+
+
+class Member(Turning, Protocol):
     """One of the connections."""
 
     #: What all connections of one computer share; empty for a Unix socket.
@@ -58,12 +68,6 @@ class Member(Protocol):
 
     def check_certificate(self) -> None:
         """Close the connection when the client's certificate is not, or no longer, accepted."""
-
-    def take_turn(self) -> None:
-        """The others have had their turn."""
-
-    def fault(self, entry: str, error: Exception) -> None:
-        """Count what escaped while it was served, and end it; never raises."""
 
     def close(self) -> None:
         """Write out what waits, then close."""
@@ -104,7 +108,7 @@ class Network:
         #: For how many clients a large chunk waits, by its id: in all, and of each account.
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
-        self._turns: deque[Member] = deque()
+        self._turns: deque[Turning] = deque()
         self._effort_begun = 0
         self._counting = False
         self._farewells: set[Farewell] = set()
@@ -138,7 +142,7 @@ class Network:
     def _new_round(self) -> None:
         self._counting = False
 
-    def queue_turn(self, member: Member) -> None:
+    def queue_turn(self, member: Turning) -> None:
         """Call `take_turn` when it is the member's."""
         self._turns.append(member)
         if len(self._turns) == 1:

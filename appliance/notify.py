@@ -6,7 +6,6 @@ here ever fails: without systemd nobody is told, and what systemd does not take 
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import socket
@@ -14,6 +13,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
+
+from appliance.entries import Entries, Repeated
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ class Notifier:
         """`address` is a path, or a name behind `@` of an abstract socket; None tells nobody."""
         self.watchdog = watchdog if address else None
         self._socket = _connect(address) if address else None
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: Repeated | None = None
         self._status = ""
         self._owes_ready = False
 
@@ -59,7 +60,9 @@ class Notifier:
         watchdog = int(microseconds) / 1e6 if microseconds.isdecimal() and for_us else 0.0
         return cls(address or None, watchdog or None)
 
-    def start(self, loop: asyncio.AbstractEventLoop, status: Callable[[], str]) -> None:
+    def start(
+        self, entries: Entries, status: Callable[[], str], is_alive: Callable[[], bool]
+    ) -> None:
         """Tell that the service is ready; from now on, that it is alive, and what `status` says."""
         self._status = status()
         self._tell_ready(f"STATUS={self._status}")
@@ -67,22 +70,21 @@ class Notifier:
             return
         # Half of it is what systemd asks for; one that is late, or lost, is not to be the end.
         interval = min(STATUS_INTERVAL, self.watchdog / 4 if self.watchdog else STATUS_INTERVAL)
-        looked = loop.time()
+        looked = entries.time()
 
         def beat() -> None:
             nonlocal looked
-            self._timer = loop.call_later(interval, beat)
-            if self.watchdog:
+            if self.watchdog and is_alive():
                 self._tell("WATCHDOG=1", wait=False)
             if self._owes_ready:
                 self._tell_ready(wait=False)
-            if loop.time() >= looked + STATUS_INTERVAL:
-                looked = loop.time()
+            if entries.time() >= looked + STATUS_INTERVAL:
+                looked = entries.time()
                 text = status()  # last: should it fail, the service still lives
                 if text != self._status and self._tell(f"STATUS={text}", wait=False):
                     self._status = text
 
-        self._timer = loop.call_later(0, beat)
+        self._timer = entries.every("notify", interval, beat, 0)
 
     @contextmanager
     def reloading(self) -> Iterator[None]:

@@ -96,6 +96,7 @@ class Status:
             "ros": ros,
             "routes": routes,
             "reload": self._reload(),
+            "errors": self._errors(),
         }
         # In a thread: a revocation list may be long.
         found = await asyncio.to_thread(_endings, settings)
@@ -213,6 +214,15 @@ class Status:
         bridged = len(bridge.topics()) + len(bridge.calls.bridged())
         return {"count": len(topics) + len(calls), "bridged": bridged, "sick": sick}
 
+    def _errors(self) -> dict[str, Any]:
+        faults = self._parts.broker.faults
+        return {
+            "count": faults.count,
+            "by_entry": dict(faults.by_entry),
+            "last": faults.last,
+            "report": faults.reported,
+        }
+
     def _reload(self) -> dict[str, Any] | None:
         last = self._parts.reload.outcome
         if last is None:
@@ -241,6 +251,14 @@ class Status:
             yield f"there is no bridge to ROS: {problem}"
         if self._parts.crash is not None:
             yield f"the last run crashed, see {self._parts.crash}"
+        errors = told["errors"]
+        if errors["count"]:
+            report = errors["report"]
+            yield (
+                f"faults of the appliance since its start: {errors['count']}, each ended what it "
+                f"arose with and nothing else; the last: {errors['last']}"
+                + (f"; please send us the report {report}" if report else "")
+            )
         if told["reload"] is not None and not told["reload"]["done"]:
             yield f"the last reload took nothing over: {told['reload']['text']}"
 

@@ -99,16 +99,15 @@ class Checks(Generic[T]):
 
     def _ended(self, future: asyncio.Future[T], ran: asyncio.Future[T]) -> None:
         self._running -= 1
+        if not future.done():
+            if ran.cancelled():
+                future.cancel()
+            elif (error := ran.exception()) is not None:
+                future.set_exception(error)
+            else:
+                future.set_result(ran.result())
         if not self._closed:
-            self._start_next()
-        if future.done():
-            return
-        if ran.cancelled():
-            future.cancel()
-        elif (error := ran.exception()) is not None:
-            future.set_exception(error)
-        else:
-            future.set_result(ran.result())
+            self._start_next()  # last: should it fail, the one that is over has its answer
 
 
 def _stand_back() -> None:

@@ -29,6 +29,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Identity, InsideLink, Refusal
 from appliance.broker.session import Session
+from appliance.entries import Entries, Repeated, shield
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -197,7 +198,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._certificate_user = certificate_user
         self._views = Sessions(broker)
         self._inside: Session | None = None
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: Repeated | None = None
         try:
             super().__init__(config)
         except (PluginError, PluginLoadError) as error:
@@ -241,8 +242,11 @@ class ApplianceBroker(amqtt.broker.Broker):
         if self.plugins_manager.plugins:
             self.broker.access = self._access
             if self._events.about_clients:
-                self.broker.observer = self._events
-            self._tick()
+                faults = self.broker.faults
+                self.broker.observer = shield("plugins.observer", faults, self._events)
+            interval = self._answers.of_topic(allowed=True)
+            entries = Entries(asyncio.get_running_loop(), self.broker.faults)
+            self._timer = entries.every("plugins.tick", interval, self._tick, 0)
         try:
             await self._events.life_cycle(BrokerEvents.PRE_START)
             await self._start_listeners()
@@ -295,7 +299,6 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     def _tick(self) -> None:
         """Forget what has ended, and let topic plugins change their mind."""
-        self._timer = self._loop.call_later(self._answers.of_topic(allowed=True), self._tick)
         self._views.purge()
         if self.plugins_manager._topic_plugins:
             self._access.changed()

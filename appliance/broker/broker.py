@@ -104,6 +104,8 @@ class Broker:
         self.limits = limits or Limits()
         self.features = features or Features()
         self.complaints = Complaints()
+        #: When `tick` was last through.
+        self.ticked_at = -math.inf
         #: What escaped somewhere, and was caught where it entered.
         self.faults = Faults(self.complaints)
         self.ledger = Ledger(self.limits, store, faults=self.faults)
@@ -761,6 +763,7 @@ class Broker:
                 left -= 1
             if not left:
                 self.flush()
+                self.ticked_at = now
                 return now
         while left and self._deadlines and self._deadlines[0][0] <= now:
             left -= 1
@@ -773,6 +776,7 @@ class Broker:
             except Exception as error:
                 faults.caught("clock.session", error, session)
         self.flush()
+        self.ticked_at = now
         return self._deadlines[0][0] if self._deadlines else math.inf
 
     def _fall_due(self, session: Session, now: float) -> None:

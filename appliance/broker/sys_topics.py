@@ -89,6 +89,7 @@ class SysTopics:
             "retained messages/count": len(broker.retained),
             "store/messages/count": stored,
             "heap/current": self._heap(),
+            "errors": broker.faults.count,
             "store/messages/bytes": broker.retained.bytes + broker.ledger.queued_bytes,
         }
         return {name: str(value) for name, value in values.items()} | self._load()

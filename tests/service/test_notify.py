@@ -16,11 +16,17 @@ import pytest
 from raw_client import RawClient
 from waiting import eventually
 
+from appliance.broker.faults import Faults
 from appliance.control import ask
+from appliance.entries import Entries
 from appliance.notify import Notifier
 from service.supervisor import NotifySocket, Supervised
 
 WATCHDOG = 1.0
+
+
+def entries(loop: asyncio.AbstractEventLoop | None = None) -> Entries:
+    return Entries(loop or asyncio.get_running_loop(), Faults())
 
 
 @pytest.fixture(params=["abstract", "path"])
@@ -107,7 +113,7 @@ def test_a_watchdog_for_another_process_is_not_ours() -> None:
 )
 async def test_nobody_listens(address: str) -> None:
     notifier = Notifier.from_environment({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "many"})
-    notifier.start(asyncio.get_running_loop(), lambda: "fine")
+    notifier.start(entries(), lambda: "fine", lambda: True)
     with notifier.reloading():
         notifier.stopping()
     notifier.close()
@@ -122,7 +128,7 @@ async def test_no_status_spoils_what_systemd_is_told(tmp_path: Path) -> None:
         listening.settimeout(5)
         notifier = Notifier(str(tmp_path / "notify"))
         status = "no ROS:\rMAINPID=1\nWATCHDOG=trigger\0 \ud800" + "€" * 5000
-        notifier.start(asyncio.get_running_loop(), lambda: status)
+        notifier.start(entries(), lambda: status, lambda: True)
         said = listening.recv(65536)
         notifier.close()
     assert len(said) < 4096 and b"\0" not in said
@@ -136,7 +142,7 @@ async def test_systemd_does_not_read(tmp_path: Path) -> None:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     listening.bind(str(tmp_path / "notify"))
     notifier = Notifier(str(tmp_path / "notify"), 0.002)
-    notifier.start(asyncio.get_running_loop(), lambda: "fine")
+    notifier.start(entries(), lambda: "fine", lambda: True)
     began = time.monotonic()
     await asyncio.sleep(0.3)
     assert time.monotonic() - began < 0.8
@@ -158,7 +164,7 @@ async def test_what_systemd_did_not_take_is_told_again(
                 while True:
                     other.sendto(b"X=1", str(tmp_path / "notify"))
         notifier = Notifier(str(tmp_path / "notify"), 0.1)
-        notifier.start(asyncio.get_running_loop(), lambda: "fine")
+        notifier.start(entries(), lambda: "fine", lambda: True)
         heard = []
         for _ in range(100):
             with contextlib.suppress(BlockingIOError):
@@ -172,26 +178,35 @@ async def test_what_systemd_did_not_take_is_told_again(
 
 
 async def test_a_status_that_fails_does_not_end_the_signs_of_life(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, escaped: list[str]
 ) -> None:
     monkeypatch.setattr("appliance.notify.STATUS_INTERVAL", 0.02)
-    failed = []
-    loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda loop, context: failed.append(context))
+    own = entries()
     texts = iter(["fine"])
     with NotifySocket() as notify:
         notifier = Notifier(notify.address, 0.1)
-        notifier.start(loop, lambda: next(texts))
+        notifier.start(own, lambda: next(texts), lambda: True)
         await asyncio.sleep(0.3)
         notifier.close()
-        assert len(failed) > 2 and len(notify.all("WATCHDOG")) > 5
+        assert own.faults.count > 2 and len(notify.all("WATCHDOG")) > 5
+    escaped.clear()
+
+
+async def test_without_a_sign_of_life_systemd_is_told_none() -> None:
+    lives = iter([True, True, False])
+    with NotifySocket() as notify:
+        notifier = Notifier(notify.address, 0.1)
+        notifier.start(entries(), lambda: "fine", lambda: next(lives, False))
+        await asyncio.sleep(0.3)
+        notifier.close()
+        assert len(notify.all("WATCHDOG")) == 2
 
 
 def test_a_status_is_one_line() -> None:
     with NotifySocket() as notify:
         notifier = Notifier(notify.address)
         loop = asyncio.new_event_loop()
-        notifier.start(loop, lambda: "fine\nWATCHDOG=trigger")
+        notifier.start(entries(loop), lambda: "fine\nWATCHDOG=trigger", lambda: True)
         eventually(lambda: notify.messages, "READY=1")
         assert notify.messages[0][1] == {"READY": "1", "STATUS": "fine WATCHDOG=trigger"}
         notifier.close()
