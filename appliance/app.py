@@ -9,9 +9,10 @@ import gc
 import logging
 import os
 import signal
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import asdict
 from datetime import timedelta
+from functools import partial
 from importlib.metadata import version
 
 import psutil
@@ -86,6 +87,10 @@ START_ERRORS = (
 #: or does soon.
 CERTIFICATE_CHECK = 300.0
 CERTIFICATE_WARNING = 86400.0
+
+
+#: Seconds until what runs beside everything else begins again, when it failed.
+BESIDE_AGAIN = 5.0
 
 
 class App:
@@ -219,7 +224,7 @@ class App:
             )
         )
         if tls is not None:
-            self._beside(self._keep_certificates(tls))
+            self._beside(partial(self._keep_certificates, tls))
         if settings.file is not None:
             await self._open_to_commands()
         state = f"{settings.robot}/_appliance/state"
@@ -235,9 +240,18 @@ class App:
         self._stack.push_async_callback(store.close)
         return store
 
-    def _beside(self, work: Coroutine[object, object, None]) -> None:
-        """Run this beside everything else, until the stop."""
-        task = self._entries.task("app.beside", work)
+    def _beside(self, work: Callable[[], Coroutine[object, object, None]]) -> None:
+        """Run this beside everything else, until the stop; when it fails it begins again."""
+
+        async def go_on() -> None:
+            while True:
+                try:
+                    await work()
+                except Exception as error:
+                    self.broker.faults.caught("app.beside", error)
+                await asyncio.sleep(BESIDE_AGAIN)
+
+        task = self._entries.task("app.task", go_on())
 
         async def end() -> None:
             task.cancel()
@@ -439,7 +453,7 @@ class App:
             log.error("`appliance status`, `reload` and `routes` are not answered: %s", error)
         self._stack.push_async_callback(control.stop)
         if settings.reload_on_change:
-            self._beside(watch(self._reload.files, self._try_reload))
+            self._beside(partial(watch, self._reload.files, self._try_reload))
 
     def request_stop(self) -> None:
         """Let `run` end."""

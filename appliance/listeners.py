@@ -252,7 +252,11 @@ class Listeners:
             self._stall.cancel()
             self._stall = None
         for door in self._doors:
-            self.broker.faults.run("listener.open", door.open, otherwise=None)
+            try:
+                door.open()
+            except Exception as error:
+                self.broker.faults.caught("listener.open", error, door)
+                door.pause()
 
     async def check_certificates(self) -> None:
         """End the connections whose client's certificate is not, or no longer, accepted."""
@@ -312,7 +316,7 @@ class _Door:
         if not self._is_open and self._socket.fileno() >= 0:
             self._is_open = True
             self._entries.reader(
-                "listener.accept", self._socket, self._accept, served=self, failed=self._pause
+                "listener.accept", self._socket, self._accept, served=self, failed=self.pause
             )
 
     def _shut(self) -> None:
@@ -320,10 +324,12 @@ class _Door:
             self._is_open = False
             self._entries.loop.remove_reader(self._socket)
 
-    def _pause(self) -> None:
+    def pause(self) -> None:
         """Accept nothing for a while."""
         self._shut()
-        self._entries.later("listener.reopen", ACCEPT_PAUSE, self.open, served=self)
+        self._entries.later(
+            "listener.reopen", ACCEPT_PAUSE, self.open, served=self, failed=self.pause
+        )
 
     def _accept(self) -> None:
         for _ in range(ACCEPTED_A_TURN):
@@ -338,7 +344,7 @@ class _Door:
             except OSError as error:
                 # Out of file descriptors, most likely: it passes, and asking on would spin.
                 log.error("no connection can be accepted: %s", error)
-                self._pause()
+                self.pause()
                 return
             try:
                 self._listeners.admit(connection, peer, self.settings)
