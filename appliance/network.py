@@ -17,6 +17,7 @@ from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.entries import Entries
 from appliance.farewell import Farewell
 from appliance.mqtt.packets import Connect
+from appliance.turns import Turn
 
 #: Messages that are few: after more than these it is checked whether who sends them has to wait.
 FEW_MESSAGES = 64
@@ -25,8 +26,8 @@ FEW_MESSAGES = 64
 LARGEST_PORTION = 256 * 1024
 
 #: What all clients that send much may cause in one round of the event loop, see
-#: `Counters.effort`: some five milliseconds.
-EFFORT_A_ROUND = 5000
+#: `Counters.effort`: some six milliseconds.
+EFFORT_A_ROUND = 1500
 
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
@@ -50,17 +51,7 @@ class Certificates(Protocol):
         """The user that it names; None when that is not asked for. ValueError: it names none."""
 
 
-class Turning(Protocol):
-    """Who waits for a turn."""
-
-    def take_turn(self) -> None:
-        """The others have had their turn."""
-
-    def fault(self, entry: str, error: Exception) -> None:
-        """Count what escaped while it was served, and end it; never raises."""
-
-
-class Member(Turning, Protocol):
+class Member(Turn, Protocol):
     """One of the connections."""
 
     #: What all connections of one computer share; empty for a Unix socket.
@@ -108,7 +99,7 @@ class Network:
         #: For how many clients a large chunk waits, by its id: in all, and of each account.
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
-        self._turns: deque[Turning] = deque()
+        self._turns: deque[Turn] = deque()
         self._effort_begun = 0
         self._counting = False
         self._farewells: set[Farewell] = set()
@@ -142,7 +133,11 @@ class Network:
     def _new_round(self) -> None:
         self._counting = False
 
-    def queue_turn(self, member: Turning) -> None:
+    def count(self, effort: int) -> None:
+        """So much was done, see `Counters.effort`."""
+        self.broker.counters.effort += effort
+
+    def queue_turn(self, member: Turn) -> None:
         """Call `take_turn` when it is the member's."""
         self._turns.append(member)
         if len(self._turns) == 1:

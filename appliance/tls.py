@@ -15,7 +15,8 @@ import ssl
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
-from appliance.entries import Entries, Faulty, contained
+from appliance.entries import Faulty, contained
+from appliance.turns import Turns
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -26,6 +27,14 @@ RECORD_SIZE: Final = 16 * 1024
 #: Bytes that OpenSSL is handed at once. Its buffers to and from the network never shrink: for each
 #: connection they would keep the size of its largest message.
 PIECE = 2 * RECORD_SIZE
+
+#: Records that are read of one connection, then it is the turn of others: a chunk from the network
+#: may hold ten thousand, of a byte each. And the effort of one, where they are many.
+RECORDS_A_TURN = 256
+RECORD_EFFORT = 1
+
+#: Bytes of a chunk that are not worth a look at whether others have to be served first.
+LITTLE = 4096
 
 #: Seconds that a client gets to read the last bytes before its connection is cut.
 CLOSE_TIMEOUT = 10.0
@@ -39,6 +48,8 @@ _TLS_INFO: dict[str, Callable[[ssl.SSLObject], object]] = {
     "compression": lambda tls: tls.compression(),
 }
 
+_NOTHING: Final = memoryview(b"")
+
 #: Who hears of a connection after its end.
 _NOBODY: Final = asyncio.Protocol()
 
@@ -48,10 +59,12 @@ async def accept(
     context: ssl.SSLContext,
     protocol: asyncio.Protocol,
     timeout: float,
-    entries: Entries,
+    turns: Turns,
     part: Callable[[socket.socket], None] = socket.socket.close,
 ) -> None:
     """Shake hands as the server on an accepted connection; from then on it is the protocol's.
+
+    Of many records in one chunk only some are read at a time, in `turns` with other connections.
 
     When this fails the connection is closed, and the protocol has not heard of it. `part` closes
     one on which an alert was written, which says why: in TLS 1.3 the client may be sending already.
@@ -61,7 +74,7 @@ async def accept(
         ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
         OSError: the client is gone.
     """
-    error = await TlsTransport(protocol, context, entries, part).shake_hands(connection, timeout)
+    error = await TlsTransport(protocol, context, turns, part).shake_hands(connection, timeout)
     if error is not None:
         try:
             raise error
@@ -74,8 +87,9 @@ async def accept(
 class TlsTransport:
     """A TLS connection: to its TCP connection the protocol, to the client's protocol the transport.
 
-    What arrives in one chunk is handed on in one chunk, and before the end of the connection or a
-    broken record behind it takes effect. There are no half-closed connections, as in asyncio.
+    What arrives in one chunk is handed on in one chunk, unless it has too many records, and before
+    the end of the connection or a broken record behind it takes effect. There are no half-closed
+    connections, as in asyncio.
 
     It is an `asyncio.Transport` and an `asyncio.Protocol` without being derived from them, which
     makes it faster when compiled.
@@ -85,17 +99,22 @@ class TlsTransport:
         self,
         protocol: asyncio.Protocol,
         context: ssl.SSLContext,
-        entries: Entries,
+        turns: Turns,
         part: Callable[[socket.socket], None] = socket.socket.close,
     ) -> None:
-        self._entries = entries
-        self._loop = entries.loop
+        self._entries = turns.entries
+        self._loop = self._entries.loop
         #: The end of the handshake, and why it failed if it did.
         self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
         self._protocol = protocol
         self._part = part
         #: The connection under the TCP transport, when an alert is the last thing written to it.
         self._connection: socket.socket | None = None
+        self._turns = turns
+        #: What arrived and OpenSSL was not given, and whether that or OpenSSL has more to read.
+        self._rest = _NOTHING
+        self._waits = False
+        self._queued = False
         self._incoming = ssl.MemoryBIO()
         self._outgoing = ssl.MemoryBIO()
         self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
@@ -105,6 +124,7 @@ class TlsTransport:
         self._reading = True
         self._writable = True
         self._ended = False  # nothing more is to be read
+        self._hung_up = False  # nothing more arrives
         self._cut = True  # OpenSSL may have the beginning of a record
         self._error: Exception | None = None
         self._deadline: asyncio.TimerHandle | None = None
@@ -145,27 +165,39 @@ class TlsTransport:
             if not self._open:
                 if not self._connected:
                     self._handshake_received(data)
-                return
-            parts: list[bytes] = []
-            if len(data) <= PIECE:
-                self._incoming.write(data)
-                self._read(parts)
+            elif self._waits or (len(data) > LITTLE and self._turns.is_busy()):
+                self._rest = memoryview(bytes(self._rest) + data if self._rest else data)
+                self._wait()
             else:
-                view = memoryview(data)
-                for start in range(0, len(view), PIECE):
-                    self._incoming.write(view[start : start + PIECE])
-                    self._read(parts)
-                    if self._ended:
-                        break
-            if parts:
-                self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
-            if self._ended or self._outgoing.pending:
-                self._react()
+                self._take(data)
         except Exception as error:
             self.fault("tls.chunk", error)
 
+    def _take(self, data: Data) -> None:
+        """Hand on what the records in there say, and in those that OpenSSL has."""
+        parts: list[bytes] = []
+        if len(data) <= PIECE:
+            self._incoming.write(data)
+            self._read(parts)
+        else:
+            view = memoryview(data)
+            while view and not (self._waits or self._ended):
+                self._incoming.write(view[:PIECE])
+                view = view[PIECE:]
+                self._read(parts)
+            self._rest = view or _NOTHING  # an empty part would keep the whole
+        if len(parts) > 1:
+            self._turns.count(RECORD_EFFORT * len(parts))
+        if parts:
+            self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
+        if self._waits and not self._ended:
+            self._wait()
+        elif self._ended or self._outgoing.pending:
+            self._react()
+
     def _read(self, parts: list[bytes]) -> None:
-        """Append the plaintext of complete records; `_ended` when none can follow them."""
+        """Append the plaintext of complete records; `_ended` when none can follow them, `_waits`
+        when these are enough for one turn."""
         try:
             # Room for no more than there can be: OpenSSL's caller has it set apart beforehand.
             size = RECORD_SIZE if self._cut else self._incoming.pending
@@ -174,12 +206,41 @@ class TlsTransport:
                 if not self._incoming.pending:  # not to be told so by an exception
                     self._cut = False
                     return
+                if len(parts) >= RECORDS_A_TURN:
+                    self._waits = True
+                    return
             self._ended = True  # by a close_notify
         except ssl.SSLWantReadError:
             self._cut = True
         except ssl.SSLError as error:
             self._ended = True
             self._error = error.with_traceback(None)
+
+    def _wait(self) -> None:
+        """Read nothing more until the others have had their turn."""
+        self._waits = True
+        if not self._open:
+            return
+        self._tcp.pause_reading()
+        if self._reading and not self._queued:
+            self._queued = True
+            self._turns.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._queued = False
+        if not (self._open and self._reading):
+            return
+        rest, self._rest = self._rest, _NOTHING
+        self._waits = False
+        self._take(rest)
+        if self._waits or not self._open:
+            return
+        if self._hung_up:
+            self._ended = True
+            self._react()
+        elif self._reading:
+            self._tcp.resume_reading()
 
     def _react(self) -> None:
         """Send what reading has caused, such as an alert, and close a connection that has ended."""
@@ -224,10 +285,17 @@ class TlsTransport:
         self._flush()
 
     @contained("tls.eof")
-    def eof_received(self) -> None:
-        """The client has closed the TCP connection; some do so without close_notify."""
+    def eof_received(self) -> bool:
+        """The client has closed the TCP connection; some do so without close_notify.
+
+        While there is more to read the connection stays as it is, which asyncio is told by True.
+        """
+        self._hung_up = True
+        if self._waits and self._open:
+            return True
         self._ended = True
         self._react()
+        return False
 
     @contained("tls.lost")
     def connection_lost(self, exc: Exception | None) -> None:
@@ -316,7 +384,11 @@ class TlsTransport:
     def resume_reading(self) -> None:
         """Hand on what arrives, be it the end."""
         self._reading = True
-        self._tcp.resume_reading()
+        if self._waits and not self._ended:
+            self._wait()
+            return
+        if not self._hung_up:
+            self._tcp.resume_reading()
         if self._ended:
             self._entries.soon("tls.react", self._react, failed=self.abort)
 

@@ -14,7 +14,8 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
-from appliance.entries import Entries, contained
+from appliance.entries import contained
+from appliance.turns import Turns
 
 #: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
 PATH = "/mqtt"
@@ -26,10 +27,15 @@ HEAD_LIMIT = 16 * 1024
 #: What the names of the headers begin with that a WebSocket is asked for with.
 _OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
 
-#: Seconds that frames are taken apart before it is the turn of other clients, and the bytes of them
-#: that this is asked for at a time: at worst, as frames may be empty, two milliseconds.
-TURN = 0.001
-PORTION = 4096
+#: Bytes of frames that are taken apart before it is looked at whether others have to be served: at
+#: worst, as frames may be empty, a millisecond's work. And the effort of a frame.
+PORTION = 2048
+FRAME_EFFORT = 2
+
+#: Frames of one connection in its turn.
+FRAMES_A_TURN = 256
+
+_NOTHING = memoryview(b"")
 
 # The library tells of every connection; what is of interest is told here, with the address.
 _library_log = logging.getLogger(f"{__name__}.frames")
@@ -86,16 +92,17 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     password to it by itself.
     """
 
-    def __init__(self, protocol: Upper, entries: Entries) -> None:
+    def __init__(self, protocol: Upper, turns: Turns) -> None:
         super().__init__()
         self._protocol = protocol
-        self._entries = entries
-        self._loop = entries.loop
+        self._turns = turns
+        self._queued = False
+        self._frames_left = FRAMES_A_TURN
         self._frames = _Frames(logger=_library_log)
         #: The HTTP request, until it is complete.
         self._head = bytearray()
         #: Received, and not yet taken apart.
-        self._held = memoryview(b"")
+        self._held = _NOTHING
         self._reading = True
         self._writing = True
         #: The answer to the last ping, while it cannot be written.
@@ -117,32 +124,41 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Hand on what the frames hold, whole or in part."""
         self._held = memoryview(bytes(self._held) + data if self._held else data)
-        self._take()
+        if len(self._held) > PORTION and (self._queued or self._turns.is_busy()):
+            self._take_later()
+        else:
+            self._take()
 
     def _take(self) -> None:
         """Take apart what is there, until others have their turn; reading is paused then."""
-        until = self._loop.time() + TURN
+        self._frames_left = FRAMES_A_TURN
         while self._held and self._reading and not self._transport.is_closing():
-            data, self._held = bytes(self._held[:PORTION]), self._held[PORTION:]
+            data = bytes(self._held[:PORTION])
+            self._held = self._held[PORTION:] or _NOTHING  # an empty part would keep the whole
             if self._frames.state is State.CONNECTING:
                 data = self._receive_head(data)
             if data:
                 self._receive_frames(data)
-            if self._held and self._loop.time() > until:
-                self._transport.pause_reading()
+            if self._held and self._frames_left <= 0:
                 self._take_later()
                 break
 
     def _take_later(self) -> None:
-        self._entries.soon("websocket.turn", self._take_on, failed=self._protocol.abort)
+        """Let the others have their turn first."""
+        self._transport.pause_reading()
+        if not self._queued:
+            self._queued = True
+            self._turns.queue_turn(self)
 
-    def _take_on(self) -> None:
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._queued = False
         self._take()
         if not self._reading or self._transport.is_closing():
             return
         if self._frames.close_rcvd is not None:
             self._transport.close()
-        elif not self._held:
+        elif not (self._held or self._queued):
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:
@@ -204,7 +220,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         frames.receive_data(data)
         payload: list[bytes] = []
         is_text = False
-        for frame in frames.events_received():
+        events = frames.events_received()
+        self._frames_left -= len(events)
+        if len(events) > 1:
+            self._turns.count(FRAME_EFFORT * len(events))
+        for frame in events:
             assert not isinstance(frame, Request | Response)
             if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]
                 is_text = True

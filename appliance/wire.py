@@ -15,7 +15,7 @@ from typing import cast
 from appliance import farewell, tls
 from appliance.broker.accounts import Account
 from appliance.broker.client import Client
-from appliance.broker.ports import HERE, Contact, Exchange, Refusal, Secured
+from appliance.broker.ports import HERE, Contact, Exchange, Identity, Refusal, Secured
 from appliance.entries import contained
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
@@ -67,6 +67,9 @@ PROBED = 3.0
 REVOKED_TIMEOUT = 1.0
 
 
+_NOTHING = memoryview(b"")
+
+
 class ClientProtocol:
     """One connection: bytes to the `Client`, and as its `Wire` bytes from it.
 
@@ -87,7 +90,7 @@ class ClientProtocol:
         self._client = Client(self._broker, self)
         self._closing = False
         # Input: what was received and waits, and what it waits for.
-        self._held = memoryview(b"")
+        self._held = _NOTHING
         self._frame = 0  # bytes of a WebSocket frame that is not complete
         #: Who is charged for what waits here: nobody in particular until the login.
         self._account = self._ledger.accounts.strangers
@@ -99,6 +102,7 @@ class ClientProtocol:
         self._resting: asyncio.TimerHandle | None = None
         self._choked = False
         self._logging_in = False
+        self._who: Identity | Refusal | None = None  # what came of it, not told yet
         # How fast it publishes.
         self._little = min(LITTLE, network.portion)
         self._countdown = network.check_every  # of messages, to the next check
@@ -140,7 +144,8 @@ class ClientProtocol:
         """Take over an accepted connection, with TLS through its handshake."""
         # Not left to asyncio's own server for one reason: when a handshake fails, that would
         # say nothing, and who it was and why is what the log is asked for.
-        protocol = cast(asyncio.Protocol, WebSocket(self, self._entries) if websocket else self)
+        network = self._network
+        protocol = cast(asyncio.Protocol, WebSocket(self, network) if websocket else self)
         try:
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -149,8 +154,8 @@ class ClientProtocol:
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
-                timeout, part = self._network.connect_timeout, self._network.part
-                await tls.accept(connection, context, protocol, timeout, self._entries, part)
+                timeout = network.connect_timeout
+                await tls.accept(connection, context, protocol, timeout, network, network.part)
         except (OSError, asyncio.TimeoutError) as error:
             self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
@@ -238,8 +243,9 @@ class ClientProtocol:
         self._ledger.now = self._loop.time()
         if not self._closing:
             self._closing = True
+            held, self._held = bytes(self._held), _NOTHING
             try:
-                self._client.receive(bytes(self._held))
+                self._client.receive(held)
             except Exception as error:
                 self._broker.fault("connection.last_chunk", error, self._client)
         self._transport = None
@@ -381,11 +387,16 @@ class ClientProtocol:
             return
         if self._transport is None or self._transport.is_closing():
             return
-        if self._sends_on:
+        if self._who is not None:
+            who, self._who = self._who, None
+            self._answer_connect(who)
+            self._read_on()
+        elif self._sends_on:
             self._send_on()
         elif self._held:
             portion = bytes(self._held[: self._network.portion])
-            self._held = self._held[self._network.portion :]
+            # An empty part would keep the whole.
+            self._held = self._held[self._network.portion :] or _NOTHING
             self._in_turn = True
             self.data_received(portion)  # which never raises
             self._in_turn = False
@@ -527,16 +538,21 @@ class ClientProtocol:
 
     async def _log_in(self, connect: Connect) -> None:
         try:
-            who = await self._network.authenticate(connect, self.address, self._tls)
+            self._who = await self._network.authenticate(connect, self.address, self._tls)
             self._logging_in = False
-            if isinstance(who, Refusal):
-                self._client.refuse(who.code, who.reason)
+            if self._network.is_busy():  # crowds come at once, when the robot's network is back
+                self._read_later()
             else:
-                self._client.accept(who.username)
-            self._broker.flush()
-            self._read_on()
+                self._read_on()
         except Exception as error:
             self.fault("connection.login", error)
+
+    def _answer_connect(self, who: Identity | Refusal) -> None:
+        if isinstance(who, Refusal):
+            self._client.refuse(who.code, who.reason)
+        else:
+            self._client.accept(who.username)
+        self._broker.flush()
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered.
@@ -565,6 +581,10 @@ class ClientProtocol:
         self._ledger.take(self._account, -self._frame)
         self._ledger.take(account, self._frame)
         self._account = account
+
+    def holds(self, size: int) -> None:
+        """A chunk is not little that may be the last byte of a large packet."""
+        self._little = 0 if size > LITTLE else min(LITTLE, self._network.portion)
 
     def secured(self) -> Secured:
         """The version of TLS, and the name in the client's certificate."""
@@ -716,6 +736,9 @@ class _Gone:
 
     def accepted(self, account: Account) -> None:
         """Nobody waits for it."""
+
+    def holds(self, size: int) -> None:
+        """Nothing more comes."""
 
     def secured(self) -> Secured:
         """Nothing is left to be secured."""

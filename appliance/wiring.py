@@ -57,6 +57,7 @@ def broker_limits(settings: Settings) -> Limits:
         retained_bytes=limits.retained_bytes,
         session_expiry=round(limits.session_expiry),
         topic_alias=limits.topic_alias,
+        user_properties=limits.user_properties,
         keep_alive=round(limits.keep_alive),
         user=UserLimits(**dict(limits.user)),
     )

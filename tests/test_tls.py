@@ -25,18 +25,42 @@ from waiting import PATIENCE, until
 from appliance import certs, tls
 from appliance.broker.faults import Faults
 from appliance.entries import Entries
-from appliance.tls import RECORD_SIZE, TlsTransport
+from appliance.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
+from appliance.turns import Turn
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 MIB = 1 << 20
 ALERT = 0x15  # the record's type (RFC 8446, section 5.1)
-OWN = tls.accept
 
 
-def entries() -> Entries:
-    return Entries(asyncio.get_running_loop(), Faults())
+class Turns:
+    """Whose turn it is: in the next round of the loop, and there is nobody else."""
+
+    def __init__(self) -> None:
+        self.entries = Entries(asyncio.get_running_loop(), Faults())
+        self.effort = 0
+        self.busy = False
+
+    def count(self, effort: int) -> None:
+        self.effort += effort
+
+    def is_busy(self) -> bool:
+        return self.busy
+
+    def queue_turn(self, member: Turn) -> None:
+        asyncio.get_running_loop().call_soon(member.take_turn)
+
+
+async def own(
+    connection: socket.socket,
+    context: ssl.SSLContext,
+    protocol: asyncio.Protocol,
+    timeout: float,
+    turns: Turns | None = None,
+) -> None:
+    await tls.accept(connection, context, protocol, timeout, turns or Turns())
 
 
 async def asyncios(
@@ -44,7 +68,6 @@ async def asyncios(
     context: ssl.SSLContext,
     protocol: asyncio.Protocol,
     timeout: float,
-    entries: Entries,
 ) -> None:
     """The same with the loop's own transport."""
     await asyncio.get_running_loop().connect_accepted_socket(
@@ -253,14 +276,14 @@ class House:
         *,
         behind: bytes = b"",
         receive_buffer: int = 0,
-        accept: Any = OWN,
+        accept: Any = own,
     ) -> tuple[Caller, Served]:
         """A connection after its handshake."""
         caller, accepted = await self.dial(receive_buffer)
         served = Served(on_data)
         self.all.append(served)
         shaking = asyncio.ensure_future(caller.shake_hands(behind))
-        await accept(accepted, self.server, served, PATIENCE, entries())
+        await accept(accepted, self.server, served, PATIENCE)
         await shaking
         return caller, served
 
@@ -338,6 +361,50 @@ async def test_a_chunk_of_many_records_is_handed_on_as_one(house: House):
     await caller.put(b"".join(caller.seal(b"message %d" % n) for n in range(50)))
     await until(lambda: served.data.endswith(b"message 49"))
     assert served.chunks == 1
+
+
+async def test_many_records_in_one_chunk_take_turns(house: House):
+    """Some of them at a time, whatever they hold, and what ends the connection behind them all."""
+    turns = Turns()
+    served = Served()
+    caller, accepted = await house.dial()
+    house.all.append(served)
+    shaking = asyncio.ensure_future(caller.shake_hands())
+    await own(accepted, house.server, served, PATIENCE, turns)
+    await shaking
+    text = noise(5000)
+    await caller.put(b"".join(caller.seal(text[n : n + 1]) for n in range(len(text))))
+    caller.sock.shutdown(socket.SHUT_WR)
+    await served.ended()
+    assert bytes(served.data) == text
+    assert served.chunks >= len(text) / RECORDS_A_TURN
+    assert turns.effort >= len(text)
+
+
+async def test_while_others_have_to_be_served_a_chunk_waits(house: House):
+    turns = Turns()
+    served = Served()
+    caller, accepted = await house.dial()
+    house.all.append(served)
+    shaking = asyncio.ensure_future(caller.shake_hands())
+    await own(accepted, house.server, served, PATIENCE, turns)
+    await shaking
+    queued: list[Turn] = []
+    turns.busy, turns.queue_turn = True, queued.append  # type: ignore[method-assign]
+    await caller.put(caller.seal(b"little"))
+    await until(lambda: served.data == b"little")
+    await caller.put(caller.seal(bytes(8000)) * 1)
+    await until(lambda: queued)
+    assert served.data == b"little"
+    served.transport.pause_reading()
+    queued.pop().take_turn()
+    assert served.data == b"little", "who has paused reading is handed nothing"
+    served.transport.resume_reading()
+    queued.pop().take_turn()
+    await until(lambda: len(served.data) == 8006 or queued)
+    while queued:
+        queued.pop().take_turn()
+    await until(lambda: len(served.data) == 8006)
 
 
 async def test_what_the_protocol_can_ask(house: House):
@@ -457,7 +524,7 @@ async def refused(house: House, accepted: socket.socket, timeout: float = PATIEN
     """What `accept` raises; the protocol must not have heard of the connection."""
     served = Served()
     with pytest.raises((OSError, asyncio.TimeoutError)) as caught:
-        await tls.accept(accepted, house.server, served, timeout, entries())
+        await own(accepted, house.server, served, timeout)
     accepted.close()
     assert not served.heard
     return caught.value
@@ -519,9 +586,7 @@ async def test_a_handshake_that_is_cut_off(house: House, part, reset):
     caller, accepted = await house.dial()
     hello = caller.step()
     served = Served()
-    accepting = asyncio.ensure_future(
-        tls.accept(accepted, house.server, served, PATIENCE, entries())
-    )
+    accepting = asyncio.ensure_future(own(accepted, house.server, served, PATIENCE))
     await caller.put(hello[: int(part * len(hello))])
     await turns()
     if reset:
@@ -546,9 +611,7 @@ async def test_a_handshake_that_never_ends(house: House, part):
 async def test_accepting_can_be_cancelled(house: House):
     caller, accepted = await house.dial()
     served = Served()
-    accepting = asyncio.ensure_future(
-        tls.accept(accepted, house.server, served, PATIENCE, entries())
-    )
+    accepting = asyncio.ensure_future(own(accepted, house.server, served, PATIENCE))
     await caller.put(caller.step())
     await caller.get()
     accepting.cancel()
@@ -722,7 +785,7 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
         served = Served()
         both_ends.append(weakref.ref(served))
         with contextlib.suppress(OSError, asyncio.TimeoutError):
-            await tls.accept(accepted, house.server, served, timeout, entries())
+            await own(accepted, house.server, served, timeout)
             if end.startswith("closed"):
                 served.transport.write(bytes(4 * MIB if end == "closed unread" else 10))
                 served.transport.close()
@@ -784,7 +847,7 @@ async def test_new_keys_and_a_refused_renegotiation(server, directory, version, 
     served = Served(echo)
     try:
         accepted, _ = await asyncio.get_running_loop().sock_accept(listening)
-        await tls.accept(accepted, server, served, PATIENCE, entries())
+        await own(accepted, server, served, PATIENCE)
         process.stdin.write(b"before\n")
         assert await asyncio.wait_for(process.stdout.readline(), PATIENCE) == b"before\n"
         process.stdin.write(command.encode() + b"\n")
@@ -850,15 +913,15 @@ def test_the_same_as_asyncios_own_transport(server, client, sizes, cuts, end):
         await speaking
         await served.ended()
         await house.close()
-        if accept is OWN:  # asyncio's transport tells less, depending on its version
+        if accept is own:  # asyncio's transport tells less, depending on its version
             told = [word for word in served.heard if word in {"made", "eof", "lost"}]
             assert told == ["made", "eof", "lost"] and served.error is None
         return bytes(served.data), answer
 
     loop = asyncio.SelectorEventLoop()
     try:
-        own = loop.run_until_complete(converse(OWN))
-        assert own == loop.run_until_complete(converse(asyncios))
+        ours = loop.run_until_complete(converse(own))
+        assert ours == loop.run_until_complete(converse(asyncios))
     finally:
         loop.close()
 
@@ -894,7 +957,7 @@ async def test_any_split_of_the_bytes_says_the_same(server, client, sizes, cuts,
     seen = []
     for split in (False, True):
         served, network = Served(), Network()
-        transport = TlsTransport(served, server, entries())
+        transport = TlsTransport(served, server, Turns())
         transport.connection_made(network)  # type: ignore[arg-type]
         with socket.socket() as unused:
             caller = Caller(unused, client)

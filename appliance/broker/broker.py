@@ -18,7 +18,7 @@ from appliance.broker.accounts import Account
 from appliance.broker.complaints import Complaints
 from appliance.broker.faults import Faults
 from appliance.broker.ledger import Ledger
-from appliance.broker.message import Late, Message
+from appliance.broker.message import Heads, Late, Message
 from appliance.broker.ports import (
     Access,
     Action,
@@ -35,7 +35,7 @@ from appliance.broker.retained import Retained
 from appliance.broker.routing import Route, Router
 from appliance.broker.session import Delivery, Held, PendingWill, Session, subscription_size
 from appliance.broker.shared import Share, Target
-from appliance.mqtt.codec import Property, quote
+from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_filter, parse_shared
@@ -47,6 +47,11 @@ LATE = 0.1
 
 #: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
+
+
+#: The effort to refuse a message, and to give a client that has logged in its session.
+REFUSAL_EFFORT = 2
+CONNECT_EFFORT = 50
 
 
 class Ticking(Protocol):
@@ -115,6 +120,7 @@ class Broker:
         self.router = Router(access, self.ledger, self.sessions)
         self.ledger.may_keep = self.router.may_keep
         self.retained = Retained(self.ledger, self.complaints, self._retained_changed)
+        self.heads = Heads()
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
@@ -167,6 +173,7 @@ class Broker:
                 touched; 0x97, its user has as many connections or sessions as it may have, or its
                 will has no room.
         """
+        self.counters.effort += CONNECT_EFFORT
         account = self.ledger.accounts.of(identity)
         if will is not None and not self.ledger.fits(account, will.message.size):
             reason = "no room for its will (broker.limits.memory, broker.limits.user.memory)"
@@ -376,7 +383,7 @@ class Broker:
         if will is None:
             return
         try:
-            self._publish_late(will.message, session)
+            self._publish_late(will, session)
         except ProtocolError as error:  # the limits are not what they were at its CONNECT
             self.counters.publish_dropped += 1
             self.complain(session, "its will cannot be published: %s", error)
@@ -384,13 +391,11 @@ class Broker:
             self.counters.publish_dropped += 1
             self.faults.caught("broker.will", error, session)
 
-    def _publish_late(self, message: Message, session: Session) -> None:
+    def _publish_late(self, will: PendingWill, session: Session) -> None:
         """Publish a will; its time to expire begins only now."""
-        if message.properties and Property.MESSAGE_EXPIRY_INTERVAL in message.properties:
-            message.expires_at = self.now + int(
-                message.properties[Property.MESSAGE_EXPIRY_INTERVAL]  # type: ignore[arg-type]
-            )
-        self.publish(message, session)
+        if will.expiry is not None:
+            will.message.expires_at = self.now + will.expiry
+        self.publish(will.message, session)
 
     def _is_alive(self, session: Session) -> bool:
         return session.ends_at is None or session.ends_at > self.now
@@ -599,6 +604,7 @@ class Broker:
     def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
+        self.counters.effort += REFUSAL_EFFORT
         for guard in self.guards.get(route.topic, ()):
             guard.refused(session)
         if self.observer is not None:
@@ -830,6 +836,7 @@ class Broker:
                     output.flush()
                 except Exception as error:
                     self._abandon("flush", error, output)
+        self.heads.forget()
 
     def _close_full(self, session: Session) -> None:
         session.close_link(

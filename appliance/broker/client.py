@@ -50,6 +50,9 @@ log = logging.getLogger(__name__)
 #: The effort of a packet that is not of the data path.
 PACKET_EFFORT = 5
 
+#: And of the end of a connection that broke the protocol.
+FAILURE_EFFORT = 50
+
 #: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
 HOST_BURST = 100
 
@@ -65,7 +68,8 @@ class Client:
     def __init__(self, broker: Broker, wire: Wire) -> None:
         self.broker = broker
         self.wire = wire
-        self.connection = Connection(broker.limits.packet_size, broker.limits.topic_alias)
+        limits = broker.limits
+        self.connection = Connection(limits.packet_size, limits.topic_alias, limits.user_properties)
         self.output = Output(broker, wire, self)
         self.session: Session | None = None
         self._router = broker.router
@@ -118,13 +122,14 @@ class Client:
                     else:
                         self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
-                    counters.effort += PACKET_EFFORT
+                    counters.effort += PACKET_EFFORT + connection.effort
                     self._on_packet(event)  # type: ignore[arg-type]
                 if counters.effort > effort and not connection.paused:
                     # What is left of the chunk waits until the others have had their turn.
                     connection.pause()
                     self.later()
         except ProtocolError as error:
+            counters.effort += FAILURE_EFFORT + connection.effort
             self.fail(error)
         if self._store.fresh:
             self._depend()
@@ -143,6 +148,7 @@ class Client:
         self._held += grown
         ledger.take(self.account, grown)
         ledger.input_bytes += grown
+        self.wire.holds(self._held)
         if grown > 0 and self._held > ledger.reserve and not ledger.fits(self.account, 0):
             self.fail(
                 ProtocolError(
@@ -211,15 +217,19 @@ class Client:
             packet.payload,
             packet.qos,
             packet.retain,
-            packet.properties,
+            None,
             self._expires_at(packet.properties),
-            passed_on=packet.passed_on,
+            properties_wire=packet.passed_on,
         )
         if packet.dup:
             message = Late(message, math.inf)
         route = self._router.route(session, message.topic_wire)
         packet_id = packet.packet_id or 0
-        if broker.features.check_payload_format and not is_text(message.payload, packet.properties):
+        if (
+            route.allowed  # asked before anything that costs much
+            and broker.features.check_payload_format
+            and not is_text(message.payload, packet.properties)
+        ):
             self._refuse_payload(session, message, packet_id)
         elif packet.qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
@@ -433,7 +443,6 @@ class Client:
         self._version = self.output.version = packet.version
         self.output.maximum_packet_size = maximum_packet_size(packet)
         properties = packet.properties or {}
-        properties.pop(Property.USER_PROPERTY, None)  # not used; a stranger's take no memory
         longest = self.broker.limits.client_id_length
         size = len(packet.client_id.encode())
         if size > longest:  # [MQTT-3.1.3-9], 3.1.1 [MQTT-3.1.3-9]

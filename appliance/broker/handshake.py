@@ -108,18 +108,14 @@ def pending_will(connect: Connect) -> PendingWill | None:
     will = connect.will
     if will is None:
         return None
-    properties = dict(will.properties or {})
-    delay = properties.pop(Property.WILL_DELAY_INTERVAL, 0)
+    properties = will.properties or {}
+    delay = properties.get(Property.WILL_DELAY_INTERVAL, 0)
+    expiry = properties.get(Property.MESSAGE_EXPIRY_INTERVAL)
     assert isinstance(delay, int)
     message = Message(
-        will.topic,
-        will.payload,
-        will.qos,
-        will.retain,
-        properties or None,
-        passed_on=will.passed_on,
+        will.topic, will.payload, will.qos, will.retain, properties_wire=will.passed_on
     )
-    return PendingWill(message, delay)
+    return PendingWill(message, delay, expiry if isinstance(expiry, int) else None)
 
 
 def is_text(payload: bytes, properties: Properties | None) -> bool:

@@ -14,7 +14,7 @@ from appliance.broker.ports import Limits, Store
 if TYPE_CHECKING:
     from appliance.broker.session import Session
 
-#: What one client may cause in a turn of the loop, see `Counters.effort`: about a millisecond.
+#: What one client may cause in a turn of the loop, see `Counters.effort`: some milliseconds.
 EFFORT_A_TURN = 1000
 
 
@@ -36,8 +36,8 @@ class Counters:
     connects_refused: int = 0
     connections_refused: int = 0
     sockets: int = 0
-    #: Work done, in units of about a microsecond; what takes long counts itself here, so that one
-    #: client's turn can be ended without a look at the clock.
+    #: Work done, in units of some four microseconds, as one message takes; what takes long counts
+    #: itself here, so that one client's turn can be ended without a look at the clock.
     effort: int = 0
     sessions_expired: int = 0
     #: Connections and sessions that were ended as their users had most, and others none.

@@ -5,19 +5,21 @@ from __future__ import annotations
 from typing import Protocol
 
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
+    PacketType,
     Properties,
     Property,
+    decode_properties,
+    decode_varint,
+    encode_properties,
     encode_property_list,
     encode_string,
     encode_varint,
+    text_size,
 )
 
-#: What a queued message takes beside its payload, roughly: the objects around it, in bytes.
+#: What a queued message takes beside its bytes, roughly: the objects around it, in bytes.
 OVERHEAD = 512
-
-#: And what a user property takes beside its bytes on the wire: a tuple and two strings.
-PAIR_OVERHEAD = 160
-
 
 #: The longest interval that a property can name, in seconds. More may be left of it than was asked
 #: for, as the clock of a restored message may have gone back.
@@ -27,20 +29,25 @@ LONGEST_INTERVAL = 0xFFFF_FFFF
 LARGE = 1024
 
 
+def _passed_on(properties: Properties) -> bytes:
+    """What receivers get of them, as it stands in a packet."""
+    expiry = Property.MESSAGE_EXPIRY_INTERVAL  # which is counted down
+    return encode_properties({name: properties[name] for name in properties if name != expiry})
+
+
 class Message:
     """An application message; immutable by convention, shared by all sessions that it is owed to.
 
     `topic_wire` is the topic as it stands in a PUBLISH, its two length bytes included. `expires_at`
     is in seconds of the broker's clock (`Broker.now`), None when the message does not expire.
+    `properties_wire` are the properties that all receivers get, as they stand in an MQTT 5 packet
+    between packet id and payload: a message keeps no other form of them.
     """
 
     __slots__ = (
-        "_heads",
-        "_passed_on",
-        "_properties_wire",
         "expires_at",
         "payload",
-        "properties",
+        "properties_wire",
         "qos",
         "retain",
         "size",
@@ -59,49 +66,45 @@ class Message:
         properties: Properties | None = None,
         expires_at: float | None = None,
         topic_wire: bytes | None = None,
-        passed_on: bytes | None = None,
+        properties_wire: bytes = NO_PROPERTIES,
     ) -> None:
         self.topic = topic
         self.payload = payload
         self.qos = qos
         self.retain = retain
-        self.properties = properties
         self.expires_at = expires_at
         self.topic_wire = topic_wire or encode_string(topic)
+        self.properties_wire = _passed_on(properties) if properties else properties_wire
         #: One encoded beginning (QoS 0: the whole packet), and what it is for: the packet as it
-        #: came, most often, which most often goes out again as it is. `head` knows the others.
+        #: came, most often, which most often goes out again as it is. `Heads` knows the others.
         self.wire_key = 0
         self.wire_head = b""
-        self._heads: dict[int, bytes] | None = None
-        #: The properties that all receivers get, as they stand in a packet, without their length.
-        self._passed_on = passed_on
-        self._properties_wire: bytes | None = None
-        #: Bytes that a queue counts for this message; the topic is a string, and in its packets.
-        self.size = len(payload) + 3 * len(self.topic_wire) + OVERHEAD
-        if properties:
-            pairs = properties.get(Property.USER_PROPERTY)
-            self.size += len(encode_property_list(properties) if passed_on is None else passed_on)
-            self.size += PAIR_OVERHEAD * len(pairs) if isinstance(pairs, list) else 0
+        #: Bytes that a queue counts for this message: its topic is there as a string, and twice in
+        #: bytes.
+        self.size = (
+            len(payload)
+            + 2 * len(self.topic_wire)
+            + text_size(topic)
+            + len(self.properties_wire)
+            + OVERHEAD
+        )
 
-    def head(self, version: int, first: int) -> bytes:
+    @property
+    def properties(self) -> Properties | None:
+        """The properties that all receivers get, decoded anew each time; None when there are none.
+
+        Times to live are not among them, see `expires_at`.
+        """
+        wire = self.properties_wire
+        return decode_properties(wire, 0, len(wire), PacketType.PUBLISH)[0]
+
+    def encode_head(self, version: int, first: int) -> bytes:
         """The packet's bytes up to the topic's end; for QoS 0 to the packet's end."""
-        key = version << 8 | first
-        if key == self.wire_key:
-            return self.wire_head
-        if self._heads is None:
-            self._heads = {}
-        head = self._heads.get(key)
-        if head is None:
-            packet_id = 2 if first & 0x06 else 0
-            properties = self.properties_wire if version == 5 else b""
-            size = len(self.topic_wire) + packet_id + len(properties) + len(self.payload)
-            head = bytes((first,)) + encode_varint(size) + self.topic_wire
-            if not packet_id:
-                head += properties + self.payload
-                if len(self.payload) >= LARGE:
-                    return head
-            self._heads[key] = head
-        return head
+        packet_id = 2 if first & 0x06 else 0
+        properties = self.properties_wire if version == 5 else b""
+        size = len(self.topic_wire) + packet_id + len(properties) + len(self.payload)
+        head = bytes((first,)) + encode_varint(size) + self.topic_wire
+        return head if packet_id else head + properties + self.payload
 
     @property
     def age(self) -> float:
@@ -111,37 +114,15 @@ class Message:
     def dropped(self) -> None:
         """A session has given it up, whose client was too slow; see `Watched`."""
 
-    @property
-    def properties_wire(self) -> bytes:
-        """The properties as they stand in an MQTT 5 packet, between packet id and payload."""
-        if self._properties_wire is None:
-            passed_on = self._properties_of_all()
-            self._properties_wire = encode_varint(len(passed_on)) + passed_on
-        return self._properties_wire
-
-    @property
-    def passed_on(self) -> bytes | None:
-        """The properties that all receivers get in the publisher's order, where it is known."""
-        return self._passed_on
-
-    def _properties_of_all(self) -> bytes:
-        if self._passed_on is None:
-            properties = dict(self.properties or {})
-            properties.pop(Property.MESSAGE_EXPIRY_INTERVAL, None)
-            self._passed_on = encode_property_list(properties) if properties else b""
-        return self._passed_on
-
     def is_like(self, other: Message) -> bool:
         """Whether it may be the same message, sent again."""
         return self.topic_wire == other.topic_wire and self.payload == other.payload
 
     def settle(self) -> None:
         """The message is going to wait: what can be encoded again is not kept, if it is large."""
-        if len(self.payload) >= LARGE:
-            if self.wire_key & 0x06 == 0:  # QoS 0: the whole packet
-                self.wire_key = 0
-                self.wire_head = b""
-            self._heads = None
+        if len(self.payload) >= LARGE and self.wire_key & 0x06 == 0:  # QoS 0: the whole packet
+            self.wire_key = 0
+            self.wire_head = b""
 
     def encode_for(
         self,
@@ -164,7 +145,8 @@ class Message:
             before[Property.TOPIC_ALIAS] = alias
         if subscription_ids:
             before[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
-        properties = encode_property_list(before) + self._properties_of_all()
+        own = self.properties_wire
+        properties = encode_property_list(before) + own[decode_varint(own, 0)[1] :]
         if self.expires_at is not None:
             left = round(min(max(0.0, self.expires_at - now), LONGEST_INTERVAL))
             properties += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: left})
@@ -173,6 +155,36 @@ class Message:
             body += packet_id.to_bytes(2, "big")
         body += encode_varint(len(properties)) + properties + self.payload
         return bytes((first,)) + encode_varint(len(body)) + body
+
+
+class Heads:
+    """The encoded beginnings of the message that is being given to its receivers.
+
+    They are forgotten with the next one: kept with every message that waits, they would take more
+    than it does.
+    """
+
+    def __init__(self) -> None:
+        self._message: Message | None = None
+        self._known: dict[int, bytes] = {}
+
+    def of(self, message: Message, version: int, first: int) -> bytes:
+        """`Message.encode_head`, once for all who get the same."""
+        if message is not self._message:
+            self._known.clear()
+            self._message = message
+        key = version << 8 | first
+        head = self._known.get(key)
+        if head is None:
+            head = message.encode_head(version, first)
+            if first & 0x06 or len(message.payload) < LARGE:
+                self._known[key] = head
+        return head
+
+    def forget(self) -> None:
+        """Let the message go."""
+        self._known.clear()
+        self._message = None
 
 
 class Watcher(Protocol):
@@ -210,10 +222,10 @@ class Late(Message):
             message.payload,
             message.qos,
             message.retain,
-            message.properties,
+            None,
             message.expires_at,
             message.topic_wire,
-            message._passed_on,
+            message.properties_wire,
         )
         self._age = age
 

@@ -71,6 +71,7 @@ class Output:
         self._broker = broker
         self._ledger = broker.ledger
         self._counters = broker.counters
+        self._heads = broker.heads
         #: None at the end: the two know each other, and nobody looks for such circles.
         self._client: Talker | None = client
         self._out: list[bytes] = []
@@ -137,7 +138,7 @@ class Output:
             else:
                 if message.size > LARGE_MESSAGE and self._wait_for_its_turn(message, first, None):
                     return
-                out.append(message.head(version, first))
+                out.append(self._heads.of(message, version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
                 if version == 5:

@@ -348,6 +348,9 @@ class Wire(Protocol):
     def accepted(self, account: Account) -> None:
         """The client has logged in as that user: the time limit for that is over."""
 
+    def holds(self, size: int) -> None:
+        """So many bytes came and wait for more: the next chunk, however small, may be costly."""
+
     def secured(self) -> Secured:
         """What protects the connection, and who its certificate says that the client is."""
 
@@ -452,6 +455,7 @@ class Limits:
     retained_bytes: int = 64 * 1024 * 1024
     session_expiry: int = 7 * 24 * 3600
     topic_alias: int = 10
+    user_properties: int = 1000
     keep_alive: int = 65535
     sessions: int = 10_000
     user: UserLimits = UserLimits()

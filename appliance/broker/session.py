@@ -69,10 +69,12 @@ class Held(NamedTuple):
 
 
 class PendingWill(NamedTuple):
-    """A will and the seconds that it waits after the connection ended."""
+    """A will, the seconds that it waits after the connection ended, and those that it is good for
+    once it is published; None for ever."""
 
     message: Message
     delay: int
+    expiry: int | None = None
 
 
 def _wrong(kind: str, packet_id: int) -> ProtocolError:

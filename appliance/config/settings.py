@@ -172,6 +172,7 @@ class Limits(_Section):
     session_expiry: Annotated[Duration, Field(ge=0, lt=0xFFFF_FFFF)] = 7 * 86400.0
     keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 65535.0
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
+    user_properties: Annotated[int, Field(ge=0, le=10_000)] = 1000
     user: UserLimits = _section()
 
 

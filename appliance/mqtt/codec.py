@@ -7,6 +7,7 @@ reads at an index and returns the value and the index after it; it raises Protoc
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Final, TypeAlias, cast
@@ -101,9 +102,15 @@ class Kind(Enum):
     STRING_PAIR = 8
 
 
-#: User Properties of one packet. Each is an object many times its size on the wire: without a bound
-#: one packet could stop the broker for seconds.
+#: User Properties of one packet, where no limit is set. Decoded, each is an object many times its
+#: size on the wire.
 MAXIMUM_PAIRS: Final = 10_000
+
+
+_USER_PROPERTY: Final = 0x26  # a plain number, as it is compared with each byte
+
+NO_PROPERTIES: Final = b"\0"
+"""How no properties stand on the wire: v5 [MQTT-2.2.2-1]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,6 +264,11 @@ def _encode_uint(value: int, size: int) -> bytes:
     return value.to_bytes(size, "big")
 
 
+def text_size(text: str) -> int:
+    """Bytes of memory that a string takes: up to four a character, where one is beyond the BMP."""
+    return sys.getsizeof(text)
+
+
 def encode_binary(value: bytes) -> bytes:
     """Binary Data with its length of two bytes (5.0 section 1.5.6)."""
     if len(value) > MAX_LENGTH:
@@ -301,7 +313,7 @@ def decode_string(buf: bytes, pos: int) -> tuple[str, int]:
 def encode_properties(properties: Properties | None) -> bytes:
     """Properties with their length in front (5.0 section 2.2.2); None and {} give a single 0."""
     if not properties:
-        return b"\0"  # v5 [MQTT-2.2.2-1]
+        return NO_PROPERTIES
     out = encode_property_list(properties)
     return encode_varint(len(out)) + out
 
@@ -338,61 +350,152 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
     table forbids is Malformed (unknown, or not in this packet) or a Protocol Error (twice, or out
     of range), as 5.0 sections 2.2.2.2 and 3.x.2 say. No properties give None.
     """
-    length, pos = decode_varint(buf, pos)
-    stop = pos + length
-    if stop > end:
-        raise malformed("the properties are longer than the packet")
-    if not length:
+    stop, pos = _property_section(buf, pos, end)
+    if pos == stop:
         return None, pos
     properties: Properties = {}
     buf = buf[:stop]  # a value that is cut off is not completed by what comes behind
+    count = 0
     while pos < stop:
-        # An identifier is a Variable Byte Integer; no known one needs a second byte.
-        known = _KNOWN.get(buf[pos])
-        if known is None:
-            raise malformed(f"unknown property 0x{buf[pos]:02x}")
-        identifier, rule = known
-        if owner not in rule.owners:
-            raise malformed(f"{_owner_name(owner)} may not hold {identifier.name}")
-        if identifier in properties and owner not in rule.repeatable:
-            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, f"{identifier.name} is there twice")
-        pos = _decode_property(buf, pos + 1, identifier, rule, properties)
+        identifier, rule = _legal_property(buf[pos], owner, properties)
+        if rule.kind is not Kind.STRING_PAIR:
+            pos = _decode_property(buf, pos + 1, identifier, rule, properties)
+            continue
+        count += 1
+        if count > MAXIMUM_PAIRS:
+            raise _too_many_pairs(MAXIMUM_PAIRS)
+        name, pos = decode_string(buf, pos + 1)
+        text, pos = decode_string(buf, pos)
+        # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
+        cast("list[tuple[str, str]]", properties.setdefault(identifier, [])).append((name, text))
     return properties, pos
 
 
-def without_properties(buf: bytes, pos: int, left_out: frozenset[Property]) -> bytes:
-    """The properties at `pos`, which `decode_properties` has accepted, but for some of them.
+@dataclass(slots=True)
+class CheckedProperties:
+    """The properties of a message as they came, all of them valid.
 
-    In their own order, which a `Properties` does not keep: there all User Properties are one.
+    `passed_on` is what receivers get, in the publisher's order and with its length in front: all
+    but what belongs to one connection, or is counted down. `values` are all but the User
+    Properties, which nobody has looked at: there are so many `pairs` of them.
     """
-    length, pos = decode_varint(buf, pos)
-    stop = pos + length
+
+    values: Properties
+    passed_on: bytes
+    pairs: int
+
+
+#: What is of one connection, or is counted down, and so is not passed on as it came.
+_NOT_PASSED_ON: Final = frozenset(
+    {
+        Property.TOPIC_ALIAS,
+        Property.SUBSCRIPTION_IDENTIFIER,
+        Property.MESSAGE_EXPIRY_INTERVAL,
+        Property.WILL_DELAY_INTERVAL,
+    }
+)
+
+
+def check_properties(
+    buf: bytes, pos: int, end: int, owner: int, pairs: int
+) -> tuple[CheckedProperties | None, int]:
+    """`decode_properties` for who passes them on: the same errors, and no User Property decoded.
+
+    More than so many `pairs`, User Properties, are over a limit of ours: Quota exceeded.
+    """
+    begin = pos
+    stop, pos = _property_section(buf, pos, end)
+    if pos == stop:
+        return None, pos
+    taken = pos  # up to here they are in `kept`, or left out
+    values: Properties = {}
     kept: list[bytes] = []
+    buf = buf[:stop]  # a value that is cut off is not completed by what comes behind
+    count = 0
     while pos < stop:
+        if buf[pos] == _USER_PROPERTY:
+            count += 1
+            if count > pairs:  # before it is looked at
+                raise _too_many_pairs(pairs)
+            pos = _check_string(buf, _check_string(buf, pos + 1, stop), stop)
+            continue
+        identifier, rule = _legal_property(buf[pos], owner, values)
         start = pos
-        identifier, rule = _KNOWN[buf[pos]]
-        pos = _decode_property(buf, pos + 1, identifier, rule, {})
-        if identifier not in left_out:
-            kept.append(buf[start:pos])
-    return b"".join(kept)
+        pos = _decode_property(buf, pos + 1, identifier, rule, values)
+        if identifier in _NOT_PASSED_ON:
+            kept.append(buf[taken:start])
+            taken = pos
+    if not kept:
+        return CheckedProperties(values, buf[begin:stop], count), pos
+    kept.append(buf[taken:stop])
+    passed_on = b"".join((encode_varint(sum(map(len, kept))), *kept))
+    return CheckedProperties(values, passed_on, count), pos
+
+
+def read_properties(
+    buf: bytes, pos: int, end: int, owner: int, pairs: int | None
+) -> tuple[Properties | None, int]:
+    """`decode_properties`, or, with a limit of `pairs`, all but the checked User Properties."""
+    if pairs is None:
+        return decode_properties(buf, pos, end, owner)
+    checked, pos = check_properties(buf, pos, end, owner, pairs)
+    return (checked.values or None) if checked is not None else None, pos
+
+
+def _property_section(buf: bytes, pos: int, end: int) -> tuple[int, int]:
+    """Where the properties at `pos` end, and where the first of them begins."""
+    length, pos = decode_varint(buf, pos)
+    if pos + length > end:
+        raise malformed("the properties are longer than the packet")
+    return pos + length, pos
+
+
+def _legal_property(
+    identifier: int, owner: int, properties: Properties
+) -> tuple[Property, PropertyRule]:
+    """What may come behind `properties` in that packet, and its rule."""
+    # An identifier is a Variable Byte Integer; no known one needs a second byte.
+    known = _KNOWN.get(identifier)
+    if known is None:
+        raise malformed(f"unknown property 0x{identifier:02x}")
+    name, rule = known
+    if owner not in rule.owners:
+        raise malformed(f"{_owner_name(owner)} may not hold {name.name}")
+    if name in properties and owner not in rule.repeatable:
+        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, f"{name.name} is there twice")
+    return known
+
+
+def _too_many_pairs(limit: int) -> ProtocolError:
+    """The error for more User Properties than that.
+
+    0x97 is there for "an implementation or administrative imposed limit", in CONNACK as in
+    DISCONNECT (5.0 sections 3.2.2.2 and 3.14.2.1).
+    """
+    return ProtocolError(ReasonCode.QUOTA_EXCEEDED, f"more than {limit} User Properties")
+
+
+def _check_string(buf: bytes, pos: int, stop: int) -> int:
+    """Refuses what `decode_string` would refuse; returns the index after the string."""
+    start = pos + 2
+    if start > stop:
+        raise malformed("the packet ends inside a Two Byte Integer")
+    end = start + (buf[pos] << 8 | buf[pos + 1])
+    if end > start:
+        if end > stop:
+            raise malformed("the packet ends inside a string or binary data")
+        if buf.find(0, start, end) >= 0:  # [MQTT-1.5.3-2] v5 [MQTT-1.5.4-2]
+            raise malformed("a string holds U+0000")
+        if not buf[start:end].isascii():
+            decode_string(buf, pos)
+    return end
 
 
 def _decode_property(
     buf: bytes, pos: int, identifier: Property, rule: PropertyRule, properties: Properties
 ) -> int:
-    """Reads one value at `pos` into `properties`; returns the index after it."""
+    """Reads one value at `pos`, no User Property, into `properties`; returns the index after it."""
     kind = rule.kind
-    if kind is Kind.STRING_PAIR:
-        name, pos = decode_string(buf, pos)
-        text, pos = decode_string(buf, pos)
-        # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
-        pairs = cast("list[tuple[str, str]]", properties.setdefault(identifier, []))
-        if len(pairs) >= MAXIMUM_PAIRS:
-            raise ProtocolError(
-                ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_PAIRS} User Properties"
-            )
-        pairs.append((name, text))
-        return pos
     if kind is Kind.STRING:
         text, pos = decode_string(buf, pos)
         if identifier is Property.RESPONSE_TOPIC:

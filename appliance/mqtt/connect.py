@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
     V5,
     V311,
     WILL,
@@ -16,6 +17,7 @@ from appliance.mqtt.codec import (
     Property,
     check_end,
     check_flags,
+    check_properties,
     check_qos,
     decode_binary,
     decode_byte,
@@ -31,8 +33,8 @@ from appliance.mqtt.codec import (
     malformed,
     protocol_error,
     quote,
+    read_properties,
     reason_name,
-    without_properties,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode, connack_v5, connack_v311
 from appliance.mqtt.topics import check_topic, holds_control
@@ -43,15 +45,6 @@ _FLAG_WILL: Final = 0x04
 _FLAG_WILL_RETAIN: Final = 0x20
 _FLAG_PASSWORD: Final = 0x40
 _FLAG_USERNAME: Final = 0x80
-
-_NOT_PASSED_ON: Final = frozenset(
-    {
-        Property.TOPIC_ALIAS,
-        Property.SUBSCRIPTION_IDENTIFIER,
-        Property.MESSAGE_EXPIRY_INTERVAL,
-        Property.WILL_DELAY_INTERVAL,
-    }
-)
 
 _R = ReasonCode
 _CONNACK_REASONS = frozenset(
@@ -83,7 +76,7 @@ class Will:
     retain: bool = False
     properties: Properties | None = None
     #: As `Publish.passed_on`.
-    passed_on: bytes | None = field(default=None, repr=False, compare=False)
+    passed_on: bytes = field(default=NO_PROPERTIES, repr=False, compare=False)
 
 
 @dataclass(slots=True)
@@ -134,7 +127,7 @@ class Connect:
         return frame(self.TYPE, 0, *parts)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int = 0) -> Connect:
+    def decode(cls, flags: int, body: bytes, version: int = 0, pairs: int | None = None) -> Connect:
         """The packet; what is wrong after the version is in that version's terms."""
         check_flags(cls.TYPE, flags)
         name, pos = decode_string(body, 0)
@@ -152,14 +145,20 @@ class Connect:
             connect_flags, pos = decode_byte(body, pos)
             _check_connect_flags(connect_flags, v5)
             keep_alive, pos = decode_uint16(body, pos)
-        properties = None
-        if v5:
+        properties: Properties | None = None
+        if v5 and pairs is None:
             properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+        elif v5:
+            checked, pos = check_properties(body, pos, len(body), cls.TYPE, pairs or 0)
+            if checked is not None:
+                properties = checked.values
+                pairs = (pairs or 0) - checked.pairs  # the will's count with them
+        if v5:
             _check_authentication(cls.TYPE, properties)
         client_id, pos = _decode_client_id(body, pos)
         will = username = password = None
         if connect_flags & _FLAG_WILL:
-            will, pos = _decode_will(connect_flags, body, pos, v5)
+            will, pos = _decode_will(connect_flags, body, pos, v5, pairs)
         with _untold():
             if connect_flags & _FLAG_USERNAME:
                 username, pos = decode_string(body, pos)
@@ -217,12 +216,17 @@ def _check_connect_flags(flags: int, v5: bool) -> None:
         raise malformed("CONNECT with a password but no user name")
 
 
-def _decode_will(flags: int, body: bytes, pos: int, v5: bool) -> tuple[Will, int]:
-    properties = passed_on = None
-    if v5:
-        start = pos
+def _decode_will(
+    flags: int, body: bytes, pos: int, v5: bool, pairs: int | None
+) -> tuple[Will, int]:
+    properties: Properties | None = None
+    passed_on = NO_PROPERTIES
+    if v5 and pairs is None:
         properties, pos = decode_properties(body, pos, len(body), WILL)
-        passed_on = properties_to_pass_on(body, start, properties)
+    elif v5:
+        checked, pos = check_properties(body, pos, len(body), WILL, pairs or 0)
+        if checked is not None:
+            properties, passed_on = checked.values, checked.passed_on
     with _untold():
         topic, pos = decode_string(body, pos)
         try:
@@ -232,17 +236,6 @@ def _decode_will(flags: int, body: bytes, pos: int, v5: bool) -> tuple[Will, int
         payload, pos = decode_binary(body, pos)
     retain = bool(flags & _FLAG_WILL_RETAIN)
     return Will(topic, payload, flags >> 3 & 3, retain, properties, passed_on), pos
-
-
-def properties_to_pass_on(body: bytes, pos: int, properties: Properties | None) -> bytes | None:
-    """The properties at `pos` as the receivers of a message get them, where order can be lost.
-
-    Receivers that compare bytes, such as test suites, find them in the publisher's order. What
-    belongs to one connection, or is counted down, is not among them.
-    """
-    if properties and len(properties) > 1 and Property.USER_PROPERTY in properties:
-        return without_properties(body, pos, _NOT_PASSED_ON)
-    return None
 
 
 @dataclass(slots=True)
@@ -267,7 +260,7 @@ class Connack:
         return frame(self.TYPE, 0, bytes((self.session_present, connack_v311(self.reason_code))))
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Connack:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Connack:
         """The packet, a return code of 3.1.1 as the reason code that means the same."""
         check_flags(cls.TYPE, flags)
         acknowledge_flags, pos = decode_byte(body, 0)
@@ -277,7 +270,7 @@ class Connack:
         properties = None
         if version == V5:
             reason_code = decode_reason(cls.TYPE, code, _CONNACK_REASONS)
-            properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
             _check_authentication(cls.TYPE, properties)
         elif code <= 5:
             reason_code = connack_v5(code)
@@ -311,7 +304,7 @@ class Auth:
         return frame(self.TYPE, 0, bytes((self.reason_code,)), encode_properties(self.properties))
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Auth:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Auth:
         """The packet; empty it is Success."""
         if version != V5:  # Packet type 15 is reserved, section 2.2.1.
             raise malformed("MQTT 3.1.1 has no AUTH")
@@ -319,7 +312,7 @@ class Auth:
         if not body:
             return cls()
         reason_code = decode_reason(cls.TYPE, body[0], _AUTH_REASONS)
-        properties, pos = decode_properties(body, 1, len(body), cls.TYPE)
+        properties, pos = read_properties(body, 1, len(body), cls.TYPE, pairs)
         check_end(cls.TYPE, body, pos)
         _check_authentication(cls.TYPE, properties, needed=reason_code != ReasonCode.SUCCESS)
         return cls(reason_code, properties)

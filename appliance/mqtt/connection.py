@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import TypeAlias
 
-from appliance.mqtt.codec import PacketType, Property, decode_varint
+from appliance.mqtt.codec import PacketType, Property, decode_varint, text_size
 from appliance.mqtt.packets import Connect, Packet, Publish, decode_packet
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
@@ -33,6 +33,12 @@ Event: TypeAlias = "Packet | RawPublish | int"
 MAXIMUM_CONNECT = 100_000
 MAXIMUM_CONTROL = 384 * 1024
 
+#: User Properties that a packet of a client may hold that has not logged in.
+STRANGERS_PAIRS = 64
+
+#: And of one that has, where nothing else is said.
+USUAL_PAIRS = 1000
+
 PUBACK = PacketType.PUBACK << 16
 PUBREC = PacketType.PUBREC << 16
 PUBREL = PacketType.PUBREL << 16
@@ -44,6 +50,23 @@ _ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
 
 #: How the variable header of a CONNECT of MQTT 5 begins.
 _MQTT_5 = b"\0\4MQTT\5"
+
+
+#: Bytes of a User Property that is empty.
+SHORTEST_PAIR = 5
+
+# Where the properties of a packet that is no PUBLISH begin in its body, if it has any; CONNECT has
+# them in two places.
+_PROPERTIES_AT: dict[int, int] = {
+    PacketType.PUBACK: 3,
+    PacketType.PUBREC: 3,
+    PacketType.PUBREL: 3,
+    PacketType.PUBCOMP: 3,
+    PacketType.SUBSCRIBE: 2,
+    PacketType.UNSUBSCRIBE: 2,
+    PacketType.DISCONNECT: 1,
+    PacketType.AUTH: 1,
+}
 
 
 class State(Enum):
@@ -86,12 +109,21 @@ class Connection:
     """The server's end of one MQTT connection, as bytes.
 
     `maximum_packet_size` bounds a whole packet, in bytes, once the client has logged in;
-    `topic_alias_maximum` is what CONNACK announces to a version 5 client.
+    `topic_alias_maximum` is what CONNACK announces to a version 5 client; `user_properties` bounds
+    those of a packet, once the client has logged in. They are not decoded here.
     """
 
-    def __init__(self, maximum_packet_size: int, topic_alias_maximum: int) -> None:
+    def __init__(
+        self,
+        maximum_packet_size: int,
+        topic_alias_maximum: int,
+        user_properties: int = USUAL_PAIRS,
+    ) -> None:
         self.maximum_packet_size = maximum_packet_size
         self.topic_alias_maximum = topic_alias_maximum
+        self.user_properties = user_properties
+        #: What it took to check the properties of the last `Packet`, see `Counters.effort`.
+        self.effort = 0
         self.state = State.NEW
         self.version = 0
         #: False while nothing may be yielded: paused, or closed.
@@ -319,7 +351,10 @@ class Connection:
             return self._publish(first, body)
         if first >> 4 == PacketType.CONNECT and body[:7] == _MQTT_5:
             self.version = 5  # so that what is wrong behind it can be answered
-        packet = decode_packet(first, body, self.version)
+        most = self.user_properties if self.state is State.CONNECTED else STRANGERS_PAIRS
+        self.effort = _effort(most, len(body))  # and so it stays for one that is refused
+        packet = decode_packet(first, body, self.version, most)
+        self.effort = _effort(most, _properties_size(first >> 4, body, self.version))
         if isinstance(packet, Connect):
             self.version = packet.version
             self.state = State.AUTHENTICATING
@@ -328,8 +363,11 @@ class Connection:
 
     def _publish(self, first: int, body: bytes) -> Publish:
         """The full decoder for a PUBLISH, with its alias resolved and its topic checked."""
-        packet = decode_packet(first, body, self.version)
+        most = self.user_properties
+        self.effort = _effort(most, len(body))
+        packet = decode_packet(first, body, self.version, most)
         assert isinstance(packet, Publish)
+        self.effort = _effort(most, len(packet.passed_on))
         properties = packet.properties
         if properties and Property.SUBSCRIPTION_IDENTIFIER in properties:  # [MQTT-3.3.4-6]
             raise ProtocolError(
@@ -343,7 +381,8 @@ class Connection:
                     f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
                 )
             if packet.topic:
-                self._aliased += _size(packet.topic) - _size(self._aliases.get(alias, ""))
+                before = self._aliases.get(alias)
+                self._aliased += text_size(packet.topic) - (text_size(before) if before else 0)
                 self._aliases[alias] = packet.topic
             elif alias in self._aliases:
                 packet.topic = self._aliases[alias]
@@ -358,9 +397,19 @@ class Connection:
         return packet
 
 
-def _size(text: str) -> int:
-    """Bytes of memory, roughly."""
-    return len(text) * (1 if text.isascii() else 4)
+def _effort(most: int, size: int) -> int:
+    """The effort to check properties of so many bytes, with no more User Properties than that."""
+    return min(most, size // SHORTEST_PAIR) // 2 + (size >> 9)
+
+
+def _properties_size(kind: int, body: bytes, version: int) -> int:
+    """Bytes of a packet that may be properties; it was accepted, and is no PUBLISH."""
+    if version != 5:
+        return 0
+    begin = _PROPERTIES_AT.get(kind)
+    if begin is None:
+        return len(body)
+    return decode_varint(body, begin)[0] if begin < len(body) else 0
 
 
 def _check_type(first: int) -> None:

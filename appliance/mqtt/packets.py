@@ -5,8 +5,10 @@ All fifteen are found here; those that begin a connection are written in connect
 `encode(version)` gives the whole packet and leaves out what that version cannot say, such as
 properties in 3.1.1; it raises ValueError for a value that fits no packet. `decode(flags, body,
 version)` takes the low four bits of the first byte and what follows the fixed header; it is
-strict, and raises ProtocolError with the standard's reason code. `str()` is short, for logs,
-and shows no password and no payload. Reason codes are those of 5.0 in both versions.
+strict, and raises ProtocolError with the standard's reason code. With a limit of User Properties
+(`pairs`) these are counted and checked, and left out of `properties`: who only passes them on, or
+has no use for them, makes no objects of what a client has sent. `str()` is short, for logs, and
+shows no password and no payload. Reason codes are those of 5.0 in both versions.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final, TypeAlias, TypeVar
 
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
     V5,
     V311,
     PacketType,
@@ -23,6 +26,7 @@ from appliance.mqtt.codec import (
     Property,
     check_end,
     check_flags,
+    check_properties,
     check_qos,
     decode_byte,
     decode_packet_id,
@@ -36,9 +40,10 @@ from appliance.mqtt.codec import (
     malformed,
     protocol_error,
     quote,
+    read_properties,
     reason_name,
 )
-from appliance.mqtt.connect import Auth, Connack, Connect, Will, properties_to_pass_on
+from appliance.mqtt.connect import Auth, Connack, Connect, Will
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import parse_shared
 
@@ -123,8 +128,8 @@ class Publish:
     dup: bool = False
     packet_id: int | None = None
     properties: Properties | None = None
-    #: Its properties as they came, for those it goes to, when `properties` has lost their order.
-    passed_on: bytes | None = field(default=None, repr=False, compare=False)
+    #: Its properties as its receivers get them, when it was read to be passed on.
+    passed_on: bytes = field(default=NO_PROPERTIES, repr=False, compare=False)
 
     def encode(self, version: int) -> bytes:
         """The whole packet."""
@@ -141,7 +146,7 @@ class Publish:
         return frame(self.TYPE, flags, *parts, self.payload)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Publish:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Publish:
         """The packet."""
         qos = flags >> 1 & 3
         dup = flags >= 8
@@ -153,11 +158,15 @@ class Publish:
         packet_id = None
         if qos:
             packet_id, pos = decode_packet_id(cls.TYPE, body, pos)
-        properties = passed_on = None
+        properties: Properties | None = None
+        passed_on = NO_PROPERTIES
         if version == V5:
-            start = pos
-            properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
-            passed_on = properties_to_pass_on(body, start, properties)
+            if pairs is None:
+                properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            else:
+                checked, pos = check_properties(body, pos, len(body), cls.TYPE, pairs)
+                if checked is not None:
+                    properties, passed_on = checked.values, checked.passed_on
             # A Protocol Error in 5.0 section 3.3.2.1.
             if not topic and (properties is None or Property.TOPIC_ALIAS not in properties):
                 raise protocol_error("PUBLISH without a topic and without a topic alias")
@@ -197,7 +206,9 @@ class _Acknowledgement:
         return frame(self.TYPE, self.FLAGS, *parts)
 
     @classmethod
-    def decode(cls: type[_A], flags: int, body: bytes, version: int) -> _A:
+    def decode(
+        cls: type[_A], flags: int, body: bytes, version: int, pairs: int | None = None
+    ) -> _A:
         """The packet; without a reason code it is Success (5.0 section 3.4.2.1)."""
         check_flags(cls.TYPE, flags, cls.FLAGS)
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
@@ -208,7 +219,7 @@ class _Acknowledgement:
                 reason_code = decode_reason(cls.TYPE, body[pos], cls.REASONS)
                 pos += 1
             if pos < len(body):
-                properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+                properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
         check_end(cls.TYPE, body, pos)
         return cls(packet_id, reason_code, properties)
 
@@ -323,13 +334,13 @@ class Subscribe:
         return frame(self.TYPE, 0b0010, *parts)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Subscribe:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Subscribe:
         """The packet."""
         check_flags(cls.TYPE, flags, 0b0010)  # [MQTT-3.8.1-1]
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
         properties = None
         if version == V5:
-            properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
         subscriptions: list[Subscription] = []
         while pos < len(body):
             subscription, pos = Subscription._decode(body, pos, version)
@@ -378,7 +389,7 @@ class Suback:
         return frame(self.TYPE, 0, packet_id, bytes(min(code, 0x80) for code in self.reason_codes))
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Suback:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Suback:
         """The packet."""
         check_flags(cls.TYPE, flags)
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
@@ -386,7 +397,7 @@ class Suback:
         allowed = _SUBACK_REASONS_V311
         if version == V5:
             allowed = _SUBACK_REASONS
-            properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
         codes = [decode_reason(cls.TYPE, code, allowed) for code in body[pos:]]
         if not codes:
             raise protocol_error("SUBACK without a reason code")
@@ -416,13 +427,13 @@ class Unsubscribe:
         return frame(self.TYPE, 0b0010, *parts)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Unsubscribe:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Unsubscribe:
         """The packet."""
         check_flags(cls.TYPE, flags, 0b0010)  # [MQTT-3.10.1-1]
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
         properties = None
         if version == V5:
-            properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+            properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
         filters: list[str] = []
         while pos < len(body):
             topic_filter, pos = decode_string(body, pos)  # [MQTT-3.10.3-1]
@@ -456,14 +467,14 @@ class Unsuback:
         return frame(self.TYPE, 0, packet_id)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Unsuback:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Unsuback:
         """The packet; no reason codes in 3.1.1."""
         check_flags(cls.TYPE, flags)
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
         if version != V5:
             check_end(cls.TYPE, body, pos)
             return cls(packet_id)
-        properties, pos = decode_properties(body, pos, len(body), cls.TYPE)
+        properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
         codes = [decode_reason(cls.TYPE, code, _UNSUBACK_REASONS) for code in body[pos:]]
         if not codes:
             raise protocol_error("UNSUBACK without a reason code")
@@ -492,7 +503,9 @@ class _Ping:
         return frame(self.TYPE, 0)
 
     @classmethod
-    def decode(cls: type[_P], flags: int, body: bytes, version: int) -> _P:
+    def decode(
+        cls: type[_P], flags: int, body: bytes, version: int, pairs: int | None = None
+    ) -> _P:
         """The packet."""
         check_flags(cls.TYPE, flags)
         if body:
@@ -535,7 +548,7 @@ class Disconnect:
         return frame(self.TYPE, 0, bytes((self.reason_code,)), properties)
 
     @classmethod
-    def decode(cls, flags: int, body: bytes, version: int) -> Disconnect:
+    def decode(cls, flags: int, body: bytes, version: int, pairs: int | None = None) -> Disconnect:
         """The packet; empty it is a normal disconnection."""
         check_flags(cls.TYPE, flags)  # v5 [MQTT-3.14.1-1]
         if version != V5:
@@ -549,7 +562,7 @@ class Disconnect:
             raise
         properties = None
         if len(body) > 1:
-            properties, pos = decode_properties(body, 1, len(body), cls.TYPE)
+            properties, pos = read_properties(body, 1, len(body), cls.TYPE, pairs)
             check_end(cls.TYPE, body, pos)
         return cls(reason_code, properties)
 
@@ -576,7 +589,7 @@ Packet: TypeAlias = (
     | Auth
 )
 
-_DECODERS: dict[int, Callable[[int, bytes, int], Packet]] = {
+_DECODERS: dict[int, Callable[[int, bytes, int, int | None], Packet]] = {
     PacketType.CONNECT: Connect.decode,
     PacketType.CONNACK: Connack.decode,
     PacketType.PUBLISH: Publish.decode,
@@ -595,13 +608,13 @@ _DECODERS: dict[int, Callable[[int, bytes, int], Packet]] = {
 }
 
 
-def decode_packet(first_byte: int, body: bytes, version: int) -> Packet:
+def decode_packet(first_byte: int, body: bytes, version: int, pairs: int | None = None) -> Packet:
     """The packet whose fixed header begins with `first_byte` and whose rest is `body`.
 
-    `version` is that of the connection; a CONNECT brings its own. ProtocolError when it is no
-    packet of that version.
+    `version` is that of the connection; a CONNECT brings its own. `pairs` is as for `decode`.
+    ProtocolError when it is no packet of that version.
     """
     decode = _DECODERS.get(first_byte >> 4)
     if decode is None:  # Packet type 0 is reserved, section 2.2.1.
         raise protocol_error("packet type 0 is reserved")
-    return decode(first_byte & 0x0F, body, version)
+    return decode(first_byte & 0x0F, body, version, pairs)

@@ -14,7 +14,17 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Held, PendingWill, Session
 from appliance.broker.shared import Share
-from appliance.mqtt.codec import PacketType, decode_properties, encode_properties
+from appliance.mqtt.codec import (
+    MAXIMUM_PAIRS,
+    NO_PROPERTIES,
+    CheckedProperties,
+    PacketType,
+    Property,
+    check_properties,
+    decode_varint,
+    encode_property_list,
+    encode_varint,
+)
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError
 from appliance.mqtt.topics import check_filter, check_topic, parse_shared
@@ -35,17 +45,26 @@ LATEST = 1e12
 # --- to rows: `offset` is what the store's time is ahead of the broker's, in seconds --------------
 
 
-def message_row(key: int, message: Message, offset: float, now: float) -> Row:
-    """The row of a message that is stored at `now`, by the store's time."""
-    properties = message.properties
+def message_row(
+    key: int, message: Message, offset: float, now: float, expiry: int | None = None
+) -> Row:
+    """The row of a message that is stored at `now`, by the store's time.
+
+    `expiry` is that of a will, in seconds from its being published.
+    """
+    properties = message.properties_wire
+    if expiry is not None:
+        own = properties[decode_varint(properties, 0)[1] :]
+        own += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: expiry})
+        properties = encode_varint(len(own)) + own
     return (
         key,
         message.topic,
         message.payload,
         message.qos,
         int(message.retain),
-        encode_properties(properties) if properties else None,
-        message.passed_on if properties else None,
+        properties if properties != NO_PROPERTIES else None,
+        None,
         None if message.expires_at is None else message.expires_at + offset,
         now,
     )
@@ -150,6 +169,8 @@ class Loaded:
 
     sessions: dict[int, LoadedSession] = field(default_factory=dict)
     messages: dict[int, Message] = field(default_factory=dict)
+    #: By the key of a message that was stored as a will: the seconds that it is good for.
+    expiries: dict[int, int] = field(default_factory=dict)
     retained: dict[int, Owned] = field(default_factory=dict)
     useless: list[tuple[Table, int]] = field(default_factory=list)
     last_key: int = 0
@@ -186,10 +207,13 @@ def load(rows: Rows, offset: float) -> Loaded:
                 loaded.useless.append((table, key))
 
     def take_message(row: Row) -> None:
-        loaded.messages[cast(int, row[0])] = _message(row, offset)
+        key = cast(int, row[0])
+        loaded.messages[key], expiry = _message(row, offset)
+        if expiry is not None:
+            loaded.expiries[key] = expiry
 
     def take_session(row: Row) -> None:
-        session = _session(row, offset, loaded.messages)
+        session = _session(row, offset, loaded)
         loaded.sessions[session.key] = session
 
     each(Table.MESSAGE, take_message)
@@ -246,32 +270,45 @@ def _time(value: object, offset: float) -> float | None:
     return moment - offset
 
 
-def _message(row: Row, offset: float) -> Message:
+def _message(row: Row, offset: float) -> tuple[Message, int | None]:
+    """The message, and the seconds that it is good for if it is a will."""
     _, topic, payload, qos, retain, properties, passed_on, expires_at, stored_at = row
     check_topic(_of(str, topic))
-    decoded = None
+    wire, expiry = NO_PROPERTIES, None
     if properties is not None:
-        encoded = _of(bytes, properties)
-        decoded, end = decode_properties(encoded, 0, len(encoded), PacketType.PUBLISH)
-        if end != len(encoded):
-            raise _WrongRowError("properties with something behind them")
+        checked = _properties(_of(bytes, properties))
+        wire = checked.passed_on
+        expiry = cast("int | None", checked.values.get(Property.MESSAGE_EXPIRY_INTERVAL))
+    if passed_on is not None:  # an older appliance kept their order here
+        wire = encode_varint(len(_of(bytes, passed_on))) + _of(bytes, passed_on)
+        wire = _properties(wire).passed_on
     _of(float, stored_at)
-    return Message(
+    message = Message(
         _of(str, topic),
         _of(bytes, payload),
         _within(qos, 0, 2),
         _within(retain, 0, 1) == 1,
-        decoded,
+        None,
         _time(expires_at, offset),
-        passed_on=None if passed_on is None else _of(bytes, passed_on),
+        properties_wire=wire,
     )
+    return message, expiry
 
 
-def _session(row: Row, offset: float, messages: dict[int, Message]) -> LoadedSession:
+def _properties(wire: bytes) -> CheckedProperties:
+    checked, end = check_properties(wire, 0, len(wire), PacketType.PUBLISH, MAXIMUM_PAIRS)
+    if end != len(wire):
+        raise _WrongRowError("properties with something behind them")
+    return checked or CheckedProperties({}, NO_PROPERTIES, 0)
+
+
+def _session(row: Row, offset: float, loaded: Loaded) -> LoadedSession:
     key, client_id, username, expiry, ends_at, will, will_delay, will_at = row
     pending = None
     if will is not None:
-        pending = PendingWill(messages[_of(int, will)], _within(will_delay, 0, 0xFFFF_FFFF))
+        message = loaded.messages[_of(int, will)]
+        delay = _within(will_delay, 0, 0xFFFF_FFFF)
+        pending = PendingWill(message, delay, loaded.expiries.get(_of(int, will)))
     identity = Identity(None if username is None else _of(str, username), _of(str, client_id))
     kept = Kept(
         identity,

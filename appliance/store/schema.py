@@ -74,8 +74,8 @@ MIGRATIONS: tuple[str, ...] = (
         payload BLOB NOT NULL,
         qos INTEGER NOT NULL,
         retain INTEGER NOT NULL,
-        properties BLOB,          -- as in a packet, with their length
-        passed_on BLOB,           -- the same in the publisher's order, where that could be lost
+        properties BLOB,          -- as in a packet, with their length; of a will with its expiry
+        passed_on BLOB,           -- the same in the publisher's order, by older appliances
         expires_at REAL,
         stored_at REAL NOT NULL
     );

@@ -49,8 +49,8 @@ RETRY = 1.0
 #: Seconds between two looks at the wall clock. What is too old is looked for as often.
 CLOCK_CHECK = 10.0
 
-#: Bytes that a message takes in the database beside topic and payload, roughly, with what it is
-#: owed to.
+#: Bytes that a message takes in the database beside topic, payload and properties, roughly, with
+#: what it is owed to.
 MESSAGE_OVERHEAD = 120
 
 
@@ -62,7 +62,8 @@ class _Stored:
     def __init__(self, key: int, message: Message, stored_at: float) -> None:
         self.key = key
         self.references = 0
-        self.size = len(message.topic) + len(message.payload) + MESSAGE_OVERHEAD
+        self.size = len(message.topic_wire) + len(message.payload) + MESSAGE_OVERHEAD
+        self.size += len(message.properties_wire)
         self.expires_at = message.expires_at
         self.stored_at = stored_at
 
@@ -477,24 +478,27 @@ class SqliteStore:
 
     # --- messages ------------------------------------------------------------------------------
 
-    def _refer(self, message: Message, account: Account) -> int:
-        """The key of the message's row, which is made when there is none, for one who refers."""
+    def _refer(self, message: Message, account: Account, expiry: int | None = None) -> int:
+        """The key of the message's row, which is made when there is none, for one who refers.
+
+        `expiry` is that of a will.
+        """
         stored = self._messages.get(message)
         if stored is None:
             stored = _Stored(next(self._keys), message, self._loop.time() + self._offset)
             self._messages[message] = stored
             self.bytes += stored.size
             self._open.messages += 1
-            self._put_message(message, stored)
+            self._put_message(message, stored, expiry)
         elif stored.expires_at is not message.expires_at:  # a will that is published
             self._put_message(message, stored)
         stored.references += 1
         account.stored += stored.size
         return stored.key
 
-    def _put_message(self, message: Message, stored: _Stored) -> None:
+    def _put_message(self, message: Message, stored: _Stored, expiry: int | None = None) -> None:
         stored.expires_at = message.expires_at
-        row = message_row(stored.key, message, self._offset, stored.stored_at)
+        row = message_row(stored.key, message, self._offset, stored.stored_at, expiry)
         self._open.put(Table.MESSAGE, stored.key, row)
 
     def _release(self, message: Message, account: Account) -> None:
@@ -525,8 +529,8 @@ class SqliteStore:
             known = self._sessions[session] = _Known(next(self._keys), session.account)
         will = session.will.message if session.will is not None else None
         if will is not known.will:
-            if will is not None:
-                self._refer(will, known.account)
+            if session.will is not None:
+                self._refer(session.will.message, known.account, session.will.expiry)
             if known.will is not None:
                 self._release(known.will, known.account)
             known.will = will

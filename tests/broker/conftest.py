@@ -187,6 +187,9 @@ class FakeWire:
     def accepted(self, account: Account) -> None:
         assert not self.closed
 
+    def holds(self, size: int) -> None:
+        pass
+
     def is_behind(self) -> bool:
         return self.behind
 

@@ -1052,7 +1052,7 @@ def test_the_queue_is_bounded_in_bytes(join: Join, broker: Broker):
         other.drain()
     session = broker.sessions["subscriber"]
     assert len(session.queue) == 2 and session.bytes <= 10_000
-    properties = {Property.USER_PROPERTY: [("key", "value")] * 10_000}
+    properties = {Property.USER_PROPERTY: [("key" * 10, "value")] * 1000}
     publisher.publish("a", b"", 1, properties=properties)
     assert len(session.queue) == 2, "properties are bytes as well"
 

@@ -12,12 +12,15 @@ from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.session import REPLAYED_A_TURN, subscription_size
-from appliance.mqtt.codec import MAXIMUM_PAIRS, Property
+from appliance.mqtt.codec import Properties, Property
+from appliance.mqtt.connection import STRANGERS_PAIRS
 from appliance.mqtt.packets import (
     MAXIMUM_FILTERS,
+    Connack,
     Connect,
     Pingreq,
     Pingresp,
+    Puback,
     Publish,
     Suback,
     Subscribe,
@@ -170,7 +173,7 @@ def test_a_message_that_waits_is_held_once(join: Join, size):
     join("publisher", version=4).publish("a", bytes(size))
     ((message, *_),) = subscriber.session.latest.values()
     assert (size < 1024) == bool(message.wire_head)
-    assert message.head(5, 0x30) == Publish("a", bytes(size)).encode(5)
+    assert message.encode_head(5, 0x30) == Publish("a", bytes(size)).encode(5)
     message.settle()
     subscriber.fast()
     assert subscriber.payloads() == [bytes(size)]
@@ -322,16 +325,72 @@ def test_what_has_come_in_is_counted(join: Join, broker: Broker):
     peers[0].wire.closed or peers[0].lose()
     aliased = join("aliased")
     aliased.publish("x" * 10_000, properties=alias)
-    assert broker.ledger.input_bytes == 10_000
+    assert 10_000 < broker.ledger.input_bytes < 10_100
+    aliased.publish("é" * 3_000 + "\U0001f916", properties=alias)
+    assert 12_000 < broker.ledger.input_bytes < 12_100, "four bytes a character"
     aliased.publish("y", properties=alias)
-    assert broker.ledger.input_bytes == 1
+    assert broker.ledger.input_bytes < 100
+
+
+def user_properties(count: int) -> Properties:
+    return {Property.USER_PROPERTY: [("", "")] * count}
+
+
+@pytest.mark.parametrize("limits", [Limits(user_properties=100)])
+def test_user_properties_are_refused_while_they_are_counted(join: Join, broker: Broker):
+    """What is behind those that are too many is not looked at"""
+    subscriber = join("subscriber")
+    subscriber.subscribe("a", 1)
+    for number, packet in enumerate(
+        [
+            Publish("a", b"", 1, packet_id=1, properties=user_properties(101)),
+            Subscribe(1, [Subscription("a")], user_properties(101)),
+            Unsubscribe(1, ["a"], user_properties(101)),
+            Puback(1, 0, user_properties(101)),
+        ]
+    ):
+        peer = join(f"peer-{number}")
+        # The last one of them is no text.
+        peer.send(packet.encode(5).replace(b"\x26\0\0\0\0" * 101, HUNDRED + b"\x26\0\1\xff\0\0"))
+        assert peer.farewell() == ReasonCode.QUOTA_EXCEEDED, packet
+    peer = join("peer")
+    assert peer.publish("a", b"", 1, properties=user_properties(100)) == 0
+    (message,) = subscriber.messages()
+    assert message.properties == user_properties(100)
+
+
+HUNDRED = b"\x26\0\0\0\0" * 100
+
+
+def test_a_stranger_has_fewer_user_properties(broker: Broker):
+    """Those of CONNECT and of its will together"""
+    for more in (0, 1):
+        peer = Peer(broker)
+        will = Will("w", b"", properties=user_properties(STRANGERS_PAIRS // 2))
+        peer.say_connect(will=will, properties=user_properties(STRANGERS_PAIRS // 2 + more))
+        if more:
+            assert peer.only(Connack).reason_code == ReasonCode.QUOTA_EXCEEDED  # type: ignore
+            assert peer.wire.closed
+        else:
+            assert peer.wire.asked is not None
+
+
+@pytest.mark.parametrize("limits", [Limits(user_properties=200)])
+def test_the_effort_of_a_packet_is_that_of_its_parts(join: Join, broker: Broker):
+    peer = join("peer")
+    for packet in [
+        Publish("a", b"", properties=user_properties(200)),
+        Subscribe(1, [Subscription("a")], user_properties(200)),
+    ]:
+        before = broker.counters.effort
+        peer.send(packet)
+        assert 100 <= broker.counters.effort - before < 200, packet
+    before = broker.counters.effort
+    peer.send(Publish("a", b"", properties=user_properties(201)))
+    assert broker.counters.effort - before >= 100, "what was done in vain"
 
 
 def test_packets_of_countless_parts_are_refused(join: Join):
-    pairs = [("", "")] * (MAXIMUM_PAIRS + 1)
-    first = join("first")
-    first.send(Publish("a", b"", properties={Property.USER_PROPERTY: pairs}))
-    assert first.farewell() == ReasonCode.QUOTA_EXCEEDED
     second = join("second")
     second.send(Subscribe(1, [Subscription("a")] * (MAXIMUM_FILTERS + 1)))
     assert second.farewell() == ReasonCode.QUOTA_EXCEEDED

@@ -17,9 +17,6 @@ from witness import Report, Target, Witness
 
 MIB = 1 << 20
 
-#: Seconds that the healthy client may have to wait for its own message.
-ROUND_TRIP = 0.5
-
 #: Round trips, in ten seconds, of which one in a hundred can be told.
 MANY = 500
 
@@ -124,7 +121,7 @@ class Arena:
             problems.append(f"the attack failed: {failure}")
         if seen.failure:
             problems.append(seen.failure)
-        if seen.worst > ROUND_TRIP:
+        if seen.worst > attack.worst:
             problems.append(f"a round trip took {seen.worst * 1000:.0f} ms")
         # Of few the 99th percentile is the worst one, which has a bound of its own.
         part = 0.99 if len(seen.round_trips) >= MANY else 0.9

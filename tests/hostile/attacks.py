@@ -11,7 +11,7 @@ import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from combat import USER, Attack, Fight, Line, encode4, encode5
+from combat import PATIENCE, ROUND_TRIP, USER, Attack, Fight, Line, encode4, encode5
 
 from appliance.mqtt.codec import Property, encode_varint
 from appliance.mqtt.connection import MAXIMUM_CONTROL
@@ -47,6 +47,7 @@ def attack(
     short: bool = True,
     said_after: float = 0.0,
     p99: float = math.inf,
+    worst: float = ROUND_TRIP,
     **limits: Any,
 ) -> Callable[[Run], Run]:
     """Enter a function into ATTACKS under its name."""
@@ -54,7 +55,8 @@ def attack(
     def enter(run: Run) -> Run:
         name = run.__name__.replace("_", "-")
         what = " ".join((run.__doc__ or "").split())
-        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after, p99)
+        bounds = p99, worst
+        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after, *bounds)
         return run
 
     return enter
@@ -120,6 +122,185 @@ async def costly_strangers(fight: Fight) -> None:
 
     while fight.on:
         await fight.crowd(200, say, 1.0)
+
+
+#: What the healthy client may have to wait while work is made that is large for its bytes.
+BOUNDED: dict[str, float] = {"p99": 0.05, "worst": 0.25}
+
+#: User Properties that a stranger's CONNECT may hold, and by default a packet behind the login.
+STRANGERS_PAIRS = 64
+PAIRS = 1000
+
+
+async def _last_bytes(fight: Fight, packet: bytes, answer: int) -> None:
+    """Crowds whose CONNECTs miss their last byte, which then comes from all in one moment."""
+
+    async def wait(number: int) -> Line:
+        line = await fight.dial()
+        await line.send(packet[:-1])
+        return line
+
+    async def hear(line: Line) -> None:
+        with contextlib.suppress(asyncio.TimeoutError):
+            await line.hear(4)
+        code = line.first[3] if len(line.first) > 3 else -1
+        fight.counts["answered" if code == answer else f"answered {code:#04x}"] += 1
+
+    while fight.on:
+        lines = await fight.crowd(245, wait, 1.0)
+        await asyncio.sleep(0.3)  # for the broker to have read them
+        for line in lines:
+            line.say(packet[-1:])
+        await asyncio.gather(*(hear(line) for line in lines))
+        for line in lines:
+            line.hang_up()
+            fight.lines.discard(line)
+    assert fight.counts["answered"], f"nobody was answered with {answer:#04x}"
+
+
+def _pairs(count: int, size: int) -> list[tuple[str, str]]:
+    """So many User Properties of so many bytes, of characters that take four bytes in memory."""
+    return [("", "x\U0001f916" + "é" * ((size - 10) // 2))] * count
+
+
+@attack(
+    r"\(0x97\)|more than \d+ User Properties",
+    at_least=2.0,
+    short=False,
+    connect_timeout="10 s",
+    **BOUNDED,
+)
+async def last_bytes(fight: Fight) -> None:
+    """The last byte of 245 CONNECTs with 2 x 9,900 empty user properties, all in one moment."""
+    pairs = [("", "")] * 9_900
+    will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
+    packet = fight.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
+    await _last_bytes(fight, packet, 0x97)
+
+
+@attack(
+    rf"{CLIENT}.*taken over",
+    at_least=2.0,
+    short=False,
+    connect_timeout="10 s",
+    **BOUNDED,
+)
+async def last_bytes_allowed(fight: Fight) -> None:
+    """The same with as many user properties as are allowed, each of 1,500 bytes: all log in."""
+    pairs = _pairs(STRANGERS_PAIRS // 2, 1500)
+    will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
+    packet = fight.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
+    await _last_bytes(fight, packet, 0)
+
+
+@attack(r"\(0x97\)|more than \d+ User Properties", at_least=1.0, **BOUNDED)
+async def costly_connects(fight: Fight) -> None:
+    """A hundred CONNECTs a second with 2 x 9,900 empty user properties."""
+    pairs = [("", "")] * 9_900
+    will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
+    packet = fight.connect_packet("costly", will=will, properties={Property.USER_PROPERTY: pairs})
+
+    async def come(number: int) -> None:
+        async for _ in fight.rounds(0.1):
+            line = await fight.dial()
+            await line.send(packet)
+            if await line.hear(4):
+                assert line.first[3] == 0x97, line.first.hex()
+                fight.counts["answered"] += 1
+            line.hang_up()
+            fight.lines.discard(line)
+
+    await fight.together(*(come(number) for number in range(10)))
+    assert fight.counts["answered"]
+
+
+async def _forbidden_properties(fight: Fight, pairs: list[tuple[str, str]], clients: int) -> None:
+    """Messages full of user properties, of clients that come again when they are cut off."""
+    packet = encode5(
+        Publish(
+            "r2d2/forbidden/x",
+            b"",
+            1,
+            packet_id=1,
+            properties={Property.USER_PROPERTY: pairs},
+        )
+    )
+
+    async def say(number: int) -> None:
+        async for turn in fight.rounds():
+            line = await fight.join(f"pairs-{number}-{turn}")
+            before = line.received
+            await fight.flood(line, packet, 1, "packets")
+            fight.counts["answered"] += line.received > before
+
+    await fight.together(*(say(number) for number in range(clients)))
+    assert fight.counts["packets"]
+
+
+@attack(rf"{CLIENT}.*broke the protocol.*User Properties", **BOUNDED)
+async def too_many_pairs(fight: Fight) -> None:
+    """Twenty clients send messages with 9,900 user properties to where they may not write."""
+    await _forbidden_properties(fight, [("", "")] * 9_900, 20)
+
+
+@attack(r"may not publish to 'r2d2/forbidden", **BOUNDED)
+async def many_pairs(fight: Fight) -> None:
+    """The same with as many user properties as are allowed, empty ones."""
+    await _forbidden_properties(fight, [("", "")] * PAIRS, 20)
+
+
+@attack(r"may not publish to 'r2d2/forbidden", **BOUNDED)
+async def long_pairs(fight: Fight) -> None:
+    """The same, of 300 bytes each, in characters that take the most memory."""
+    await _forbidden_properties(fight, _pairs(PAIRS, 300), 20)
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+async def tls_records(fight: Fight) -> None:
+    """Twenty clients whose TLS records hold one byte each."""
+
+    async def send(number: int) -> None:
+        loop = asyncio.get_running_loop()
+        incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        tls = fight.target.context().wrap_bio(incoming, outgoing, server_hostname="localhost")
+        with await fight.raw(tls=True) as sock:
+
+            async def receive() -> None:
+                data = await asyncio.wait_for(loop.sock_recv(sock, 65536), PATIENCE)
+                if not data:
+                    raise ConnectionError("the broker closed")
+                incoming.write(data)
+
+            while True:
+                try:
+                    tls.do_handshake()
+                    break
+                except ssl.SSLWantReadError:
+                    await loop.sock_sendall(sock, outgoing.read())
+                    await receive()
+            tls.write(fight.connect_packet(f"records-{number}"))
+            await loop.sock_sendall(sock, outgoing.read())
+            answer = b""
+            while len(answer) < 4:
+                try:
+                    answer += tls.read(65536)
+                except ssl.SSLWantReadError:
+                    await receive()
+            assert answer[3] == 0, answer.hex()
+            fight.counts["logins"] += 1
+            ping = Pingreq().encode(5)
+            while fight.on:
+                for _ in range(2000):
+                    tls.write(ping[:1])
+                    tls.write(ping[1:])
+                    fight.counts["records"] += 2
+                await asyncio.sleep(0)
+                await loop.sock_sendall(sock, outgoing.read())
+                with contextlib.suppress(BlockingIOError):
+                    fight.counts["bytes answered"] += len(sock.recv(65536))
+
+    await fight.together(*(send(number) for number in range(20)))
+    assert fight.counts["bytes answered"], "no ping was answered"
 
 
 #: Logins a second with a wrong password.

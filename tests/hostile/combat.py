@@ -32,6 +32,9 @@ USER = "mallory"
 #: Seconds for what takes milliseconds when nothing is attacked.
 PATIENCE = 15.0
 
+#: Seconds that the healthy client may have to wait for its own message.
+ROUND_TRIP = 0.5
+
 #: Seconds that an attack may end later than it should.
 LATEST = 1.0
 
@@ -274,8 +277,8 @@ class Attack:
     `limits` are of `broker.limits`, beside those of `arena.LIMITS`; with less time than `at_least`
     (seconds) nothing comes of it, and with less than `said_after` too little for the log to tell:
     the buffers on the way take that long to fill. `short` is whether it is worth a second in CI,
-    beside the others. `p99` is what 99 of 100 round trips of the healthy client may take, in
-    seconds.
+    beside the others. `p99` is what 99 of 100 round trips of the healthy client may take, and
+    `worst` what the longest may, in seconds.
     """
 
     name: str
@@ -287,6 +290,7 @@ class Attack:
     short: bool = True
     said_after: float = 0.0
     p99: float = math.inf
+    worst: float = ROUND_TRIP
 
 
 def encode(version: int, *packets: Packet) -> bytes:

@@ -82,6 +82,9 @@ class Wire:
     def now(self):
         return time.monotonic()
 
+    def holds(self, size):
+        """Of a packet that is not whole."""
+
     def accepted(self, account):
         pass
 

@@ -1,0 +1,45 @@
+"""python -m tests.memory [SHAPE …]: by how much memory grows, and what the limits allow."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+
+from .shapes import MIB, SHAPES, run
+
+
+def measure(name: str) -> tuple[int, int, int]:
+    """`run`, in a process of its own."""
+    said = subprocess.run(
+        [sys.executable, "-m", "tests.memory", "--one", name],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+    grown, counted, allowed = json.loads(said)
+    return grown, counted, allowed
+
+
+def main(arguments: list[str]) -> int:
+    if arguments[:1] == ["--one"]:
+        logging.disable(logging.CRITICAL)
+        print(json.dumps(run(arguments[1])))
+        return 0
+    failed = False
+    print(f"{'shape':<46} {'grown':>7} {'counted':>8} {'allowed':>8}  (MiB)")
+    for name in arguments or SHAPES:
+        grown, counted, allowed = measure(name)
+        bad = grown > 1.5 * allowed
+        failed |= bad
+        print(
+            f"{name:<46} {grown / MIB:>7.1f} {counted / MIB:>8.1f} {allowed / MIB:>8.1f}"
+            f"  {grown / max(counted, 1):>6.2f}  {'TOO MUCH' if bad else ''}",
+            flush=True,
+        )
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
