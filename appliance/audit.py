@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from appliance.broker.ports import Action, Identity, Secured
+from appliance.mqtt.codec import VERSION_NAMES
 from appliance.mqtt.reason import ReasonCode
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class Audit:
             "connected",
             **_who(session.identity),
             address=address,
-            mqtt="5" if version == 5 else "3.1.1",
+            mqtt=VERSION_NAMES[version],
             **_how(secured),
         )
 

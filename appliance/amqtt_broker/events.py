@@ -17,6 +17,7 @@ from amqtt.session import IncomingApplicationMessage
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Session
+from appliance.mqtt.codec import V31
 from appliance.mqtt.packets import Connect
 
 from .guard import Guard
@@ -82,7 +83,8 @@ class PluginEvents:
         if MQTTEvents.PACKET_RECEIVED not in self._wanted:
             return
         will = connect.will
-        header = ConnectVariableHeader(0, connect.keep_alive, "MQTT", connect.version)
+        protocol = "MQIsdp" if connect.version == V31 else "MQTT"
+        header = ConnectVariableHeader(0, connect.keep_alive, protocol, connect.version)
         header.clean_session_flag = connect.clean_start
         header.username_flag = connect.username is not None
         payload = ConnectPayload(connect.client_id, username=connect.username)

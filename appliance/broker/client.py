@@ -25,7 +25,15 @@ from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
 from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
 from appliance.broker.subscribing import subscribe, unsubscribe
-from appliance.mqtt.codec import Properties, Property, quote
+from appliance.mqtt.codec import (
+    V5,
+    V31,
+    V311,
+    VERSION_NAMES,
+    Properties,
+    Property,
+    quote,
+)
 from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, RawPublish
 from appliance.mqtt.packets import (
     Auth,
@@ -440,7 +448,7 @@ class Client:
 
     def _on_connect(self, packet: Connect) -> None:
         self._connect = packet
-        self._version = self.output.version = packet.version
+        self._version = self.output.version = max(packet.version, V311)
         self.output.maximum_packet_size = maximum_packet_size(packet)
         properties = packet.properties or {}
         longest = self.broker.limits.client_id_length
@@ -451,9 +459,13 @@ class Client:
             )
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, reason)
             return
-        if not packet.client_id and not packet.clean_start and packet.version != 5:
+        is_nameless = not packet.client_id and packet.version != V5
+        if is_nameless and not packet.clean_start:
             # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
+            return
+        if is_nameless and packet.version == V31:
+            self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, needed in MQTT 3.1")
             return
         if packet.client_id.startswith(INSIDE):
             reason = f"client ids that begin with {INSIDE} are the appliance's own"
@@ -600,13 +612,14 @@ class Client:
             self.broker.features,
             authentication or {},
         )
-        self._send(Connack(present, ReasonCode.SUCCESS, properties))
+        # In 3.1 the byte that says it is reserved.
+        self._send(Connack(present and packet.version != V31, ReasonCode.SUCCESS, properties))
         if self._closed:
             return
         log.info(
             "%s connected: MQTT %s, keep alive %d s%s",
             self,
-            "5" if packet.version == 5 else "3.1.1",
+            VERSION_NAMES[packet.version],
             agreement.keep_alive,
             ", session continued" if present else "",
         )

@@ -15,11 +15,17 @@ from typing import Final, TypeAlias, cast
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
+V31: Final = 3
+"""The protocol level of MQTT 3.1. Only CONNECT has it: a connection of it is one of 3.1.1."""
+
 V311: Final = 4
 """The protocol level of MQTT 3.1.1."""
 
 V5: Final = 5
 """The protocol version of MQTT 5.0."""
+
+VERSION_NAMES: Final = {V31: "3.1", V311: "3.1.1", V5: "5"}
+"""What people call them."""
 
 MAX_VARINT: Final = 268_435_455
 """The greatest Variable Byte Integer, and so Remaining Length: four bytes of 7 bits."""

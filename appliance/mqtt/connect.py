@@ -10,7 +10,9 @@ from typing import ClassVar, Final
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
     V5,
+    V31,
     V311,
+    VERSION_NAMES,
     WILL,
     PacketType,
     Properties,
@@ -39,7 +41,9 @@ from appliance.mqtt.codec import (
 from appliance.mqtt.reason import ProtocolError, ReasonCode, connack_v5, connack_v311
 from appliance.mqtt.topics import check_topic, holds_control
 
-_PROTOCOL_NAME: Final = encode_string("MQTT")
+#: [MQTT-3.1.2-1] [MQTT-3.1.2-2]; MQTT 3.1 calls itself otherwise.
+_PROTOCOLS: Final = {V31: "MQIsdp", V311: "MQTT", V5: "MQTT"}
+_FLAG_RESERVED: Final = 0x01
 _FLAG_CLEAN_START: Final = 0x02
 _FLAG_WILL: Final = 0x04
 _FLAG_WILL_RETAIN: Final = 0x20
@@ -104,7 +108,8 @@ class Connect:
         v5 = self.version == V5
         will = self.will
         flags = _FLAG_CLEAN_START if self.clean_start else 0
-        parts = [_PROTOCOL_NAME, bytes((self.version,)), b"", encode_uint16(self.keep_alive)]
+        name = encode_string(_PROTOCOLS[self.version])
+        parts = [name, bytes((self.version,)), b"", encode_uint16(self.keep_alive)]
         if v5:
             parts.append(encode_properties(self.properties))
         parts.append(encode_string(self.client_id))
@@ -120,7 +125,7 @@ class Connect:
             parts.append(encode_string(self.username))
         if self.password is not None:
             if self.username is None and not v5:  # [MQTT-3.1.2-22]
-                raise ValueError("MQTT 3.1.1 has no password without a user name")
+                raise ValueError("MQTT 3 has no password without a user name")
             flags |= _FLAG_PASSWORD
             parts.append(encode_binary(self.password))
         parts[2] = bytes((flags,))
@@ -132,17 +137,18 @@ class Connect:
         check_flags(cls.TYPE, flags)
         name, pos = decode_string(body, 0)
         level, pos = decode_byte(body, pos)
-        # [MQTT-3.1.2-1] [MQTT-3.1.2-2]; MQTT 3.1 calls itself MQIsdp, level 3.
-        if name != "MQTT" or level not in (V311, V5):
+        if _PROTOCOLS.get(level) != name:
             raise ProtocolError(
                 ReasonCode.UNSUPPORTED_PROTOCOL_VERSION,
-                f"protocol {quote(name)} level {level} is not MQTT 3.1.1 or 5.0",
-                told=name in ("MQTT", "MQIsdp"),
+                f"protocol {quote(name)} level {level} is not MQTT 3.1, 3.1.1 or 5.0",
+                told=name in _PROTOCOLS.values(),
             )
         v5 = level == V5
         # In 5.0 wrong properties are answered; other wrong bytes only end the connection.
         with _untold():
             connect_flags, pos = decode_byte(body, pos)
+            if level == V31:
+                connect_flags &= ~_FLAG_RESERVED  # it says nothing about that one
             _check_connect_flags(connect_flags, v5)
             keep_alive, pos = decode_uint16(body, pos)
         properties: Properties | None = None
@@ -159,19 +165,21 @@ class Connect:
         will = username = password = None
         if connect_flags & _FLAG_WILL:
             will, pos = _decode_will(connect_flags, body, pos, v5, pairs)
+        # In section 3.1 of 3.1 the length takes precedence over what the last two flags promise.
+        end = len(body) if level == V31 else -1
         with _untold():
-            if connect_flags & _FLAG_USERNAME:
+            if connect_flags & _FLAG_USERNAME and pos != end:
                 username, pos = decode_string(body, pos)
                 if holds_control(username):
                     raise malformed("the user name holds control characters")
-            if connect_flags & _FLAG_PASSWORD:
+            if connect_flags & _FLAG_PASSWORD and pos != end:
                 password, pos = decode_binary(body, pos)
         check_end(cls.TYPE, body, pos)
         clean_start = bool(connect_flags & _FLAG_CLEAN_START)
         return cls(client_id, clean_start, keep_alive, level, username, password, will, properties)
 
     def __str__(self) -> str:
-        parts = [f"CONNECT v{'5' if self.version == V5 else '3.1.1'} {quote(self.client_id)}"]
+        parts = [f"CONNECT v{VERSION_NAMES[self.version]} {quote(self.client_id)}"]
         parts.append(f"clean_start={self.clean_start:d} keep_alive={self.keep_alive}")
         if self.username is not None:
             parts.append(f"username={quote(self.username)}")
@@ -202,7 +210,7 @@ def _decode_client_id(body: bytes, pos: int) -> tuple[str, int]:
 
 
 def _check_connect_flags(flags: int, v5: bool) -> None:
-    if flags & 0x01:  # [MQTT-3.1.2-3]
+    if flags & _FLAG_RESERVED:  # [MQTT-3.1.2-3]
         raise malformed("CONNECT with the reserved flag set")
     will_qos = flags >> 3 & 3
     if flags & _FLAG_WILL:

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import TypeAlias
 
-from appliance.mqtt.codec import PacketType, Property, decode_varint, text_size
+from appliance.mqtt.codec import V31, V311, PacketType, Property, decode_varint, text_size
 from appliance.mqtt.packets import Connect, Packet, Publish, decode_packet
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
@@ -102,6 +102,11 @@ _LEGAL: dict[State, frozenset[PacketType]] = {
 }
 
 
+#: What the flags of the fixed header have to be, where not 0 (section 2.2.2).
+_FLAGS_OF_V311 = {
+    int(kind): 2 for kind in (PacketType.PUBREL, PacketType.SUBSCRIBE, PacketType.UNSUBSCRIBE)
+}
+
 _FLAGLESS = frozenset({PacketType.SUBACK, PacketType.UNSUBACK, PacketType.PINGRESP})
 
 
@@ -126,6 +131,8 @@ class Connection:
         self.effort = 0
         self.state = State.NEW
         self.version = 0
+        #: Whether it is one of MQTT 3.1, where DUP and QoS may stand in any packet's first byte.
+        self._is_v31 = False
         #: False while nothing may be yielded: paused, or closed.
         self._reading = True
         #: Whether its CONNECT named an authentication method, so that AUTH may come.
@@ -351,12 +358,15 @@ class Connection:
             return self._publish(first, body)
         if first >> 4 == PacketType.CONNECT and body[:7] == _MQTT_5:
             self.version = 5  # so that what is wrong behind it can be answered
+        if self._is_v31:
+            first = first & 0xF0 | _FLAGS_OF_V311.get(first >> 4, 0)
         most = self.user_properties if self.state is State.CONNECTED else STRANGERS_PAIRS
         self.effort = _effort(most, len(body))  # and so it stays for one that is refused
         packet = decode_packet(first, body, self.version, most)
         self.effort = _effort(most, _properties_size(first >> 4, body, self.version))
         if isinstance(packet, Connect):
-            self.version = packet.version
+            self._is_v31 = packet.version == V31
+            self.version = V311 if self._is_v31 else packet.version
             self.state = State.AUTHENTICATING
             self.authenticates = Property.AUTHENTICATION_METHOD in (packet.properties or {})
         return packet

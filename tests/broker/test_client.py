@@ -110,7 +110,7 @@ def test_refusals(broker: Broker, version, code, return_code):
 
 def test_an_unknown_version_is_told_so(broker: Broker):
     """[MQTT-3.1.2-2]: 0x01"""
-    for data in ("10 0c 0004 4d515454 06 02 003c 0000", "10 0e 0006 4d5149736470 03 02 003c 0000"):
+    for data in ("10 0c 0004 4d515454 06 02 003c 0000", "10 0e 0006 4d5149736470 04 02 003c 0000"):
         peer = Peer(broker, 4)
         peer.send(bytes.fromhex(data))
         assert peer.received() == [Connack(False, ReasonCode.UNSUPPORTED_PROTOCOL_VERSION)]

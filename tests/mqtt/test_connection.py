@@ -419,7 +419,7 @@ def test_packet_type_0_and_auth_in_3_1_1_are_errors():
 
 def test_a_protocol_that_is_not_ours():
     """[MQTT-3.1.2-2]"""
-    for name in (b"\x00\x06MQIsdp\x03", b"\x00\x04MQTT\x06"):
+    for name in (b"\x00\x06MQIsdp\x04", b"\x00\x04MQTT\x03", b"\x00\x04MQTT\x06"):
         body = name + b"\x02\x00\x00\x00\x00"
         wire = b"\x10" + encode_varint(len(body)) + body
         found = said(Connection(SIZE, ALIASES), [wire])

@@ -94,7 +94,11 @@ def read_hex(text: str) -> bytes:
     return out
 
 
-ALL = read_vectors(VECTORS / "mqtt-3.1.1.txt", 4) + read_vectors(VECTORS / "mqtt-5.0.txt", 5)
+ALL = [
+    *read_vectors(VECTORS / "mqtt-3.1.txt", 4),
+    *read_vectors(VECTORS / "mqtt-3.1.1.txt", 4),
+    *read_vectors(VECTORS / "mqtt-5.0.txt", 5),
+]
 GOOD = [vector for vector in ALL if vector.verb in ("is", "reads")]
 EXACT = [vector for vector in ALL if vector.verb == "is"]
 BAD = [vector for vector in ALL if vector.verb == "fails"]
