@@ -145,6 +145,7 @@ class Gate(BaseTopicPlugin):
     asked: ClassVar[list[tuple[str | None, str | None, AmqttAction | None]]] = []
     answers: ClassVar[dict[str, Any]] = {}
     attributes: ClassVar[list[dict[str, Any]]] = []
+    delay: ClassVar[float] = 0.0
 
     async def topic_filtering(
         self,
@@ -156,7 +157,7 @@ class Gate(BaseTopicPlugin):
         assert session is not None
         task = asyncio.current_task()
         if self.config.waits:
-            await asyncio.sleep(0)
+            await asyncio.sleep(self.delay)
         if task is not None or not self.config.waits:
             self.asked.append((session.username, topic, action))
             self.attributes.append(session.attributes)
@@ -586,24 +587,75 @@ async def test_files_and_plugins_must_both_allow(tmp_path: Path, users: Path) ->
         assert "acl.conf" in decide(identity, Action.PUBLISH, "a/b").reason
 
 
-async def test_a_topic_plugin_that_waits(caplog: pytest.LogCaptureFixture) -> None:
+async def test_what_a_topic_plugin_is_asked_for_the_first_time_waits_for_its_answer(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(Gate, "delay", 0.05)
+    Gate.answers["no"] = False
     async with running({**OPEN, own(Gate): {}, own(Login): {}}) as rig:
         client = await rig.connect("bob:x", "b1")
-        subscription = [("a", 1), ("test/end", 1)]
-        assert await client.subscribe(subscription) == [0x80, 0x80]  # asked, not yet answered
+        subscriptions = [("a", 1), ("no", 1), ("wild/#", 1), ("test/end", 1)]
+        assert await client.subscribe(subscriptions) == [1, 0x80, 1, 1]
         assert "Gate has to wait" in caplog.text
-        await until(lambda: ("bob", "a", AmqttAction.SUBSCRIBE) in Gate.asked)
-        await until(lambda: rig.frame._access._asked == {})
-        assert await client.subscribe(subscription) == [1, 1]
-        for topic in ("a", "test/end"):
-            await client.publish(topic, b"asked", qos=1)  # may b1 publish it?
-            await until(lambda: rig.frame._access._asked == {})
-            await client.publish(topic, b"asked", qos=1)  # may b1 receive it?
-            await until(lambda: rig.frame._access._asked == {})
-        await client.publish("a", b"through", qos=1)
-        assert (await receive(client)).data == b"through"
+        # Right away, each on a topic that nobody has asked about, and in their order.
+        for topic in ("wild/1", "a", "wild/2"):
+            await client.publish(topic, topic.encode(), qos=1)
+        assert [(await receive(client)).data for _ in range(3)] == [b"wild/1", b"a", b"wild/2"]
         await nothing_more(client, client)
         assert all(seen == {"test.login": 1} for seen in Gate.attributes)
+
+
+async def test_what_waits_for_a_plugin_keeps_nobody_else() -> None:
+    Gate.answers["hang"] = "hang"
+    async with running({**OPEN, own(Gate): {}}, plugin_timeout=1.0) as rig:
+        ann, bob = await rig.connect("ann:x", "a1"), await rig.connect("bob:x", "b1")
+        assert await ann.subscribe([("a", 1), ("test/end", 1)]) == [1, 1]
+        hung = asyncio.create_task(bob.subscribe([("hang", 1), ("a", 1)]))
+        await until(lambda: ("bob", "hang", AmqttAction.SUBSCRIBE) in Gate.asked)
+        await ann.publish("a", b"meanwhile", qos=1)
+        assert (await receive(ann)).data == b"meanwhile"
+        assert not hung.done()
+        codes = await hung  # it is refused when the plugin has had its time, and the rest goes on
+        assert codes[0] == 0x80
+        await bob.publish("a", b"behind", qos=1)
+        assert (await receive(ann)).data == b"behind"
+
+
+async def test_who_leaves_while_a_plugin_is_asked_is_forgotten() -> None:
+    Gate.answers["hang"] = "hang"
+    async with running({**OPEN, own(Gate): {}}, plugin_timeout=1.0) as rig:
+        bob = await rig.connect("bob:x", "b1")
+        hung = asyncio.create_task(bob.subscribe([("hang", 1)]))
+        await until(lambda: ("bob", "hang", AmqttAction.SUBSCRIBE) in Gate.asked)
+        rig.broker.sessions["b1"].close_link(ReasonCode.ADMINISTRATIVE_ACTION, "by the test")
+        await until(lambda: not rig.broker.clients)
+        await until(lambda: rig.frame._access._asked == {})
+        assert rig.frame._access._waiting == {}
+        hung.cancel()
+
+
+async def test_more_questions_than_there_is_room_for_wait_in_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(access, "QUESTIONS", 2)
+    monkeypatch.setattr(Gate, "delay", 0.02)
+    async with running({**OPEN, own(Gate): {}}) as rig:
+        several = [await rig.connect(f"user{n}:x", f"c{n}") for n in range(6)]
+        codes = await asyncio.gather(*(each.subscribe([("a", 1)]) for each in several))
+        assert codes == [[1]] * 6
+        assert rig.frame._access._line == {}
+
+
+async def test_one_user_leaves_room_for_the_questions_of_others() -> None:
+    Gate.answers["hang"] = "hang"
+    async with running({own(Gate): {}}, plugin_timeout=SHORT) as rig:
+        decide, asked = rig.frame._access.decide, rig.frame._access._asked
+        for number in range(access.QUESTIONS):
+            decide(Identity("eve", f"e{number}"), Action.PUBLISH, "hang")
+        assert len(asked) == access.USER_QUESTIONS
+        decide(Identity("ann", "a1"), Action.PUBLISH, "hang")
+        assert len(asked) == access.USER_QUESTIONS + 1
+        await until(lambda: asked == {})
 
 
 async def test_an_answer_in_the_background_that_turns_to_no(

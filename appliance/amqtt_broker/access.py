@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import logging
 from collections import OrderedDict
-from typing import Any, Final, TypeAlias
+from collections.abc import Callable
+from typing import Any, Final
 
 from amqtt.broker import BrokerContext
 from amqtt.contexts import Action as AmqttAction
@@ -15,7 +16,7 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Access, Action, Decision, Identity
+from appliance.broker.ports import Access, Action, Decision, Identity, Question
 
 from .guard import Guard, name, redacted
 from .logins import Answers
@@ -29,9 +30,10 @@ VERDICT_USE = 600.0
 #: Questions to such plugins at one time, in all and of one client.
 QUESTIONS = 64
 CLIENT_QUESTIONS = 8
-
-#: Who wants to do what with which topic.
-Question: TypeAlias = "tuple[Identity, Action, str]"
+#: And of one user's clients together.
+USER_QUESTIONS = 16
+#: Seconds between two looks at whether those who could not ask for want of room can now.
+LINE_INTERVAL = 0.25
 
 #: The answer of a plugin that has none without waiting.
 _WAITS: Final = object()
@@ -42,8 +44,9 @@ class PluginAccess:
 
     The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait for
     anything (rules in the configuration, a token) are run on the spot. From the first time that
-    one has to wait (HTTP, SQL, LDAP), all are asked in the background: what is asked for the first
-    time is refused meanwhile, a SUBSCRIBE too, and the answer holds for the next try. Later one
+    one has to wait (HTTP, SQL, LDAP), all are asked in the background: a SUBSCRIBE or PUBLISH that
+    is asked about for the first time, and what its client sends behind it, waits for the answer, up
+    to `patience`; then it is refused, and the answer holds for the next try. Later one
     that is older than `answers` says, or from before the files were read again, holds while they
     are asked anew, for 10 minutes at most.
 
@@ -72,6 +75,10 @@ class PluginAccess:
         self._waits = False
         self._verdicts: OrderedDict[Question, tuple[Decision, float, int]] = OrderedDict()
         self._asked: dict[Question, asyncio.Task[None]] = {}
+        #: Who waits for the answer to each of them, and who for room to ask, in their order.
+        self._waiting: dict[Question, dict[Callable[[], None], None]] = {}
+        self._line: dict[Callable[[], None], None] = {}
+        self._line_timer: asyncio.TimerHandle | None = None
 
     @property
     def epoch(self) -> int:
@@ -95,6 +102,30 @@ class PluginAccess:
                 return Decision(False, f"refused by {refusing}") if refusing else decision
         return self._verdict((identity, action, topic))
 
+    @property
+    def patience(self) -> float:
+        """Seconds that a packet waits for an answer."""
+        return self._guard.timeout
+
+    def waits(self, question: Question, wake: Callable[[], None]) -> bool:
+        """Whether there is no answer yet; `wake` is then called when there may be one."""
+        if not self.decide(*question).pending:
+            return False
+        if question in self._asked:
+            self._waiting.setdefault(question, {})[wake] = None
+        else:
+            self._line[wake] = None
+            if self._line_timer is None:
+                loop = asyncio.get_running_loop()
+                self._line_timer = loop.call_later(LINE_INTERVAL, self._wake_line)
+        return True
+
+    def _wake_line(self) -> None:
+        self._line_timer = None
+        line, self._line = self._line, {}
+        for wake in line:
+            wake()
+
     def changed(self) -> None:
         """Let what was decided be decided again."""
         self._epoch += 1
@@ -104,6 +135,10 @@ class PluginAccess:
         """Ask no more."""
         for asking in self._asked.values():
             asking.cancel()
+        self._waiting.clear()
+        self._line.clear()
+        if self._line_timer is not None:
+            self._line_timer.cancel()
 
     def _ask_now(self, identity: Identity, action: Action, topic: str) -> tuple[bool, str]:
         """Whether the plugins could answer on the spot, and which one refuses."""
@@ -119,8 +154,9 @@ class PluginAccess:
                 self._waits = True
                 log.warning(
                     "%s has to wait before it can say whether a topic is allowed: what is asked "
-                    "for the first time is refused until it has answered",
+                    "for the first time waits with it, for up to %g s",
                     name(plugin),
+                    self.patience,
                 )
                 return False, ""
             if not answer:  # As in amqtt, None is a no.
@@ -137,14 +173,20 @@ class PluginAccess:
             or epoch != self._files.epoch
         )
         if is_old and question not in self._asked:
-            own = sum(1 for asked in self._asked if asked[0] == question[0])
-            if len(self._asked) >= QUESTIONS or own >= CLIENT_QUESTIONS:
+            if not self._has_room(question[0]):
                 return Decision(False, "the topic plugins have too many questions to answer", True)
             self._asked[question] = asyncio.ensure_future(self._ask(question))
         if decision is None or age > VERDICT_USE:
             return Decision(False, "the topic plugins were asked; the next try is answered", True)
         self._verdicts.move_to_end(question)
         return decision
+
+    def _has_room(self, identity: Identity) -> bool:
+        """Whether there may be one more question about this client."""
+        if len(self._asked) >= QUESTIONS:
+            return False
+        clients = [asked[0] for asked in self._asked if asked[0].username == identity.username]
+        return len(clients) < USER_QUESTIONS and clients.count(identity) < CLIENT_QUESTIONS
 
     async def _ask(self, question: Question) -> None:
         """Ask all topic plugins and keep what they say."""
@@ -165,7 +207,11 @@ class PluginAccess:
             decision = Decision(not refusing, reason)
         finally:
             del self._asked[question]
-        self._keep(question, decision)
+        try:
+            self._keep(question, decision)
+        finally:
+            for wake in self._waiting.pop(question, {}):
+                wake()
 
     async def _ask_all(
         self, session: AmqttSession, action: Action, topic: str

@@ -8,7 +8,8 @@ from __future__ import annotations
 import logging
 import math
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from appliance.broker.broker import Broker
 from appliance.broker.handshake import (
@@ -24,7 +25,7 @@ from appliance.broker.output import CANNOT_KEEP, Output, in_words
 from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
 from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
-from appliance.broker.subscribing import subscribe, unsubscribe
+from appliance.broker.subscribing import Awaited, Step, answers, subscribe, unsubscribe
 from appliance.mqtt.codec import (
     V5,
     V31,
@@ -89,7 +90,11 @@ class Client:
         #: QoS 2 messages that were refused, the last ones: some clients release them all the same.
         self._refused: dict[int, None] = {}
         #: A packet that is worked on in several turns.
-        self._work: Iterator[Packet | None] | None = None
+        self._work: Iterator[Step] | None = None
+        #: Whether that waits for an answer of somebody else, which does not take turns.
+        self._is_awaiting = False
+        #: Whether the PUBLISH that is worked on has waited for such an answer.
+        self._has_waited = False
         self._connect: Connect | None = None
         self._held = 0  # bytes of the connection that are counted in the ledger
         #: Who they are counted for: nobody in particular until the login.
@@ -180,6 +185,10 @@ class Client:
             route = session.routes[topic_wire]
         else:
             route = router.route(session, topic_wire)
+            if route.undecided and self._hold(
+                topic_wire, len(payload), self._on_raw_publish, event
+            ):
+                return
         targets = route.targets
         if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.effort += 1 + len(targets)
@@ -232,6 +241,10 @@ class Client:
         if packet.dup:
             message = Late(message, math.inf)
         route = self._router.route(session, message.topic_wire)
+        if route.undecided and self._hold(
+            message.topic_wire, len(packet.payload), self._on_publish, packet
+        ):
+            return
         packet_id = packet.packet_id or 0
         if (
             route.allowed  # asked before anything that costs much
@@ -253,6 +266,38 @@ class Client:
             return False
         self.output.object(0x40, packet_id, objection)
         return True
+
+    def _hold(
+        self, topic_wire: bytes, size: int, publish: Callable[[Any], None], packet: object
+    ) -> bool:
+        """Let a PUBLISH, and all behind it, wait until it is known where it may go; False when it
+        has waited, or nobody is asked about it."""
+        session = self.session
+        asked = self._router.asked
+        if asked is None or self._has_waited or session is None:
+            return False
+        until = self._ledger.now + asked.patience
+        self._counters.publish_received -= 1  # it will be
+        self._counters.publish_bytes_received -= size
+
+        def work() -> Iterator[Step]:
+            route = self._router.route
+            yield from answers(
+                self.broker, lambda: route(session, topic_wire).undecided, self._wake, until
+            )
+            self._has_waited = True
+            try:
+                publish(packet)
+            finally:
+                self._has_waited = False
+
+        self._begin(work())
+        return True
+
+    def _wake(self) -> None:
+        """Somebody has answered what a packet waits for."""
+        if not self._closed:
+            self.later()
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
@@ -394,7 +439,7 @@ class Client:
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
         elif isinstance(packet, Subscribe) and session is not None:
-            self._begin(subscribe(self.broker, session, packet))
+            self._begin(subscribe(self.broker, session, packet, self._wake))
         elif isinstance(packet, Unsubscribe) and session is not None:
             self._begin(unsubscribe(self.broker, session, packet))
         elif isinstance(packet, Disconnect):
@@ -404,22 +449,26 @@ class Client:
         elif isinstance(packet, Auth):
             self._on_auth(packet)
 
-    def _begin(self, work: Iterator[Packet | None]) -> None:
+    def _begin(self, work: Iterator[Step]) -> None:
         """Do what a packet asks for that may be much; None is for the turn of the others."""
         for answer in work:
-            if answer is None:
+            if answer is None or isinstance(answer, Awaited):
                 # What comes behind the packet waits for its end.
                 self._work = work
+                self._is_awaiting = answer is not None
                 self.connection.pause()
-                self.later()
+                if answer is None:
+                    self.later()
                 return
             self._send(answer)
             if self._closed:
                 return
         self._work = None
 
-    def _go_on(self, work: Iterator[Packet | None]) -> None:
+    def _go_on(self, work: Iterator[Step]) -> None:
         """Go on with what the last turn was too short for."""
+        self._is_awaiting = False
+        self._heard_at = self._ledger.now  # what it says meanwhile is not heard
         try:
             self._begin(work)
         except ProtocolError as error:
@@ -735,7 +784,7 @@ class Client:
 
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
-        if not self._silence or now - self._heard_at <= self._silence:
+        if not self._silence or self._is_awaiting or now - self._heard_at <= self._silence:
             return False
         self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
         return True

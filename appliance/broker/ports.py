@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
@@ -104,6 +104,20 @@ class Contact:
 
 #: What is on this computer is there as long as its connection is.
 HERE = Contact()
+
+#: A client's identity, what it wants to do, and the topic or filter: what rules are asked.
+Question: TypeAlias = "tuple[Identity, Action, str]"
+
+
+class Asked(Protocol):
+    """Those who may have to ask somebody else before they decide."""
+
+    @property
+    def patience(self) -> float:
+        """For how many seconds a packet waits for them."""
+
+    def waits(self, question: Question, wake: Callable[[], None]) -> bool:
+        """Whether there is no answer yet; `wake` is then called when there may be one."""
 
 
 class Link(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.ledger import Ledger
-from appliance.broker.ports import Access, Action, Decision, Guard, Identity
+from appliance.broker.ports import Access, Action, Asked, Decision, Guard, Identity, Question
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target
 from appliance.mqtt.codec import decode_string
@@ -22,6 +22,9 @@ CACHED_TOPIC = 512
 
 #: Entries and targets in the caches of all sessions together, some 80 bytes each.
 CACHED_IN_ALL = 500_000
+
+#: Questions about one route that a message waits for at a time.
+UNDECIDED = 16
 
 #: The effort to find a route, see `Counters.effort`; each match comes on top.
 ROUTE_EFFORT = 20
@@ -43,6 +46,8 @@ class Route:
     shares: list[tuple[Share, list[Target]]]
     #: Whether there is any subscription to the topic, be it of a client that gets nothing.
     subscribed: bool
+    #: What could not be decided yet, as somebody is asked: such a route is not kept.
+    undecided: list[Question]
 
 
 class Router:
@@ -54,6 +59,10 @@ class Router:
     def __init__(self, access: Access, ledger: Ledger, sessions: dict[str, Session]) -> None:
         #: The rules in force.
         self.access = access
+        #: Those of them who may have to ask somebody else; None where nobody has to.
+        self.asked: Asked | None = None
+        #: What could not be decided of the route that is being found.
+        self._undecided: list[Question] | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it.
         self.guards: dict[str, list[Guard]] = {}
         #: Grows whenever a cached route may be wrong.
@@ -117,7 +126,7 @@ class Router:
         route = session.routes.get(topic_wire)
         if route is None:
             route = self._find_route(session, topic_wire)
-            if len(topic_wire) <= CACHED_TOPIC:
+            if len(topic_wire) <= CACHED_TOPIC and not route.undecided:
                 session.routes[topic_wire] = route
                 self._cached += 1 + len(route.targets)
                 if self._cached > CACHED_IN_ALL:
@@ -136,6 +145,14 @@ class Router:
             check_topic(topic)
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+        undecided: list[Question] = []
+        self._undecided = undecided
+        try:
+            return self._decide_route(session, topic, undecided)
+        finally:
+            self._undecided = None
+
+    def _decide_route(self, session: Session, topic: str, undecided: list[Question]) -> Route:
         decision = self._may_publish(session, topic)
         if decision and topic in self.guards:
             verdicts = [
@@ -146,7 +163,9 @@ class Router:
         matches = self._subscriptions.match(topic) if decision else []
         self._counters.effort += ROUTE_EFFORT + len(matches)
         targets, shares = self._targets(session, topic, matches)
-        return Route(topic, decision.allowed, decision.reason, targets, shares, bool(matches))
+        return Route(
+            topic, decision.allowed, decision.reason, targets, shares, bool(matches), undecided
+        )
 
     def _may_publish(self, session: Session, topic: str) -> Decision:
         if session.identity is None:
@@ -161,9 +180,14 @@ class Router:
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """What the rules in force say; when that ends in a fault, it is not allowed."""
-        return self._faults.run(
+        decision = self._faults.run(
             "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
         )
+        undecided = self._undecided
+        is_asked = self.asked is not None and decision is not _FAULT
+        if decision.pending and is_asked and undecided is not None and len(undecided) < UNDECIDED:
+            undecided.append((identity, action, topic))
+        return decision
 
     def excess(self, topic: str) -> str:
         """What the topic or filter has too much of, if anything."""

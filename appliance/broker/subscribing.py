@@ -6,10 +6,12 @@ so that its answers keep their order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, TypeAlias
 
 from appliance.broker.broker import Broker
 from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.broker.ports import Action, Question
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
@@ -27,8 +29,42 @@ CHECK_EFFORT = 3
 RETAINED_EFFORT = 3
 
 
-def subscribe(broker: Broker, session: Session, packet: Subscribe) -> Iterator[Packet | None]:
+#: Filters about which somebody is asked at a time.
+ASKED_AT_ONCE = 4
+
+
+class Awaited:
+    """Given in place of an answer, where the work goes on when somebody else has answered."""
+
+
+AWAITED: Final = Awaited()
+Step: TypeAlias = "Packet | Awaited | None"
+
+
+def answers(
+    broker: Broker,
+    questions: Callable[[], list[Question]],
+    wake: Callable[[], None],
+    until: float,
+) -> Iterator[Step]:
+    """Wait until what is asked has been answered, but no longer than `until`.
+
+    `questions` gives what is to be asked now, which an answer may change.
+    """
+    asked = broker.router.asked
+    while asked is not None and broker.now < until:
+        waiting = [question for question in questions() if asked.waits(question, wake)]
+        if not waiting:
+            return
+        yield AWAITED
+
+
+def subscribe(
+    broker: Broker, session: Session, packet: Subscribe, wake: Callable[[], None]
+) -> Iterator[Step]:
     """Do what the packet asks for; gives its SUBACK, and None where others are to have their turn.
+
+    Who decides may first have to ask: `wake` is called when it is to be gone on with.
 
     Raises:
         ProtocolError: a filter is none, or they are too many; none of them has any effect then.
@@ -37,6 +73,12 @@ def subscribe(broker: Broker, session: Session, packet: Subscribe) -> Iterator[P
     subscriptions = packet.subscriptions
     for _ in _check(broker, [subscription.filter for subscription in subscriptions], turn):
         yield None
+    asked = broker.router.asked
+    if asked is not None:
+        until = broker.now + asked.patience
+        for start in range(0, len(subscriptions), ASKED_AT_ONCE):
+            questions = _questions(session, subscriptions[start : start + ASKED_AT_ONCE])
+            yield from answers(broker, lambda asking=questions: asking, wake, until)  # type: ignore[misc]
     identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
     identifier = identifiers[0] if isinstance(identifiers, list) else 0
     codes: list[int] = []
@@ -63,7 +105,21 @@ def subscribe(broker: Broker, session: Session, packet: Subscribe) -> Iterator[P
     session.pump()
 
 
-def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterator[Packet | None]:
+def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[Question]:
+    """What is to be decided about them: may it subscribe and, where that says the topic, receive
+    what is retained there?"""
+    if session.identity is None:
+        return []
+    found: list[Question] = []
+    for subscription in subscriptions:
+        topic_filter = subscription.filter
+        found.append((session.identity, Action.SUBSCRIBE, topic_filter))
+        if "+" not in topic_filter and "#" not in topic_filter and topic_filter[:7] != "$share/":
+            found.append((session.identity, Action.RECEIVE, topic_filter))
+    return found
+
+
+def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterator[Step]:
     """Do what the packet asks for; gives its UNSUBACK, and None as `subscribe` does.
 
     Raises:
