@@ -21,6 +21,7 @@ from appliance.ros.graph import (
     ParameterSettings,
     ServiceSettings,
 )
+from appliance.ros.payloads import InputLimits
 from appliance.ros.rules import CommandRules, OnSilence
 
 RouteT = TypeVar("RouteT", bound=Route)
@@ -128,7 +129,7 @@ def routes(settings: Settings) -> list[RouteSettings]:
             compression=route.compression,
             fields=tuple(route.fields),
             bytes_per_second=route.bytes_per_second,
-            largest=_largest(route, settings),
+            limits=_input_limits(settings),
             rules=_command_rules(route) if route.command_keys else None,
         )
         for route, names in _named(settings.bridge.topics)
@@ -174,16 +175,17 @@ def call_routes(settings: Settings) -> CallRoutes:
             for route, names in _named(bridge.parameters)
         ),
         limits=CallLimits(
-            bridge.limits.calls_per_client, bridge.limits.calls, bridge.limits.payload
+            bridge.limits.calls_per_client,
+            bridge.limits.calls,
+            bridge.limits.calls_per_user,
+            _input_limits(settings),
         ),
     )
 
 
-def _largest(route: TopicRoute, settings: Settings) -> int:
-    """Bytes of a payload for ROS: `binary` is not converted, and takes no time."""
-    packet_size = settings.broker.limits.packet_size
-    payload = packet_size if route.encoding == "binary" else settings.bridge.limits.payload
-    return min(packet_size, payload)
+def _input_limits(settings: Settings) -> InputLimits:
+    limits = settings.bridge.limits
+    return InputLimits(limits.payload, settings.broker.limits.packet_size, limits.items)
 
 
 def _named(routes: Sequence[RouteT]) -> Iterator[tuple[RouteT, tuple[str, ...]]]:

@@ -375,12 +375,14 @@ class ParameterRoute(_CalledRoute):
 
 
 class BridgeLimits(_Section):
-    """Calls and goals under way: of one client, and of all together; and what one message for ROS
-    may have, in bytes."""
+    """Calls and goals under way: of all together, of one user (None: a quarter of these) and of
+    one client; and what one message for ROS may have: bytes of JSON or text, and items."""
 
     calls: Count = 500
+    calls_per_user: Count | None = None
     calls_per_client: Count = 20
     payload: Annotated[Size, Field(gt=0)] = 1 << 20
+    items: Count = 100_000
 
 
 class Bridge(_Section):

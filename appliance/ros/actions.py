@@ -22,10 +22,11 @@ import asyncio
 import contextlib
 import logging
 import secrets
-from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import takewhile
 from typing import Any, Literal
 
 from appliance.broker.message import Message
@@ -41,11 +42,14 @@ from appliance.ros.calls import (
     CallError,
     ErrorCode,
     Offer,
+    Place,
+    Places,
     Switchboard,
     error_payload,
 )
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.definitions import UnknownTypeError
+from appliance.ros.fair import FairTable
 from appliance.ros.figures import Counters
 from appliance.ros.goals import ALL, CANCEL, STATUS
 from appliance.ros.mailbox import Lane, Mailbox
@@ -73,14 +77,19 @@ _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
 #: Goals whose feedback waits for a busy broker, each with its newest.
 LANES = 256
 
-#: Results that one action keeps at a time; the oldest go first.
+#: Results that one action keeps at a time, and bytes of them; the oldest of the user with most go
+#: first.
 RESULTS = 1000
+RESULT_BYTES = 16 * 1024 * 1024
 
-#: Goals of one action that were given up before they were accepted; the oldest are forgotten first.
+#: Goals of one action that were given up before they were accepted; so are these.
 UNWANTED = 1000
 
-#: Goals, of all actions, of which is known who sent them; the oldest are forgotten first.
-OWNED = 10_000
+#: Goals of all actions that have ended of which is known who sent them; and these.
+ENDED = 10_000
+
+#: Bytes of a call that cancels.
+LARGEST_CANCEL = 1024
 
 #: Seconds that a server which has just come has to say that it does not know a goal.
 CHECK_TIME = 5.0
@@ -115,6 +124,7 @@ class _Goal:
 
     id: bytes
     owner: Session
+    place: Place
     result: asyncio.Future[tuple[str, bytes]]
     is_accepted: bool = False
     is_orphan: bool = False
@@ -164,10 +174,10 @@ class ActionRoutes:
         #: Actions that patterns speak of and do not take.
         self._refused: list[Skip] = []
         self._tasks = _Tasks(entries)
-        #: Goals under way of each client, for the limit.
-        self.goals: Counter[Session] = Counter()
-        #: Who has sent a goal, by its id: also when it has ended, or its route was changed.
-        self._owners: OrderedDict[bytes, str] = OrderedDict()
+        #: Of the goals under way.
+        self.places = Places("goals")
+        #: Who has sent a goal that has ended since, by its id.
+        self.ended: FairTable[bytes, str] = FairTable(ENDED)
 
     def start(self) -> None:
         """Nothing is known of the bus yet."""
@@ -216,19 +226,17 @@ class ActionRoutes:
         for action in self._actions.values():
             yield from action.keys()
 
-    def own(self, id_: bytes, owner: str) -> None:
-        """Remember who has sent a goal."""
-        self._owners[id_] = owner
-        if len(self._owners) > OWNED:
-            self._owners.popitem(last=False)
-
-    def owner(self, id_: bytes) -> str | None:
-        """Who has sent a goal; None for one of a ROS node, or from long ago."""
-        return self._owners.get(id_)
+    def owns(self, caller: Session, id_: bytes) -> bool:
+        """Whether the goal is the caller's: as long as it is under way, and some time after."""
+        for action in self._all():
+            goal = action._goals.get(id_)
+            if goal is not None:
+                return _owner(goal.owner) == _owner(caller)
+        return self.ended.get(id_) == _owner(caller)
 
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
-        if session in self.goals:
+        if session in self.places:
             for action in self._all():
                 action.departed(session)
 
@@ -359,9 +367,9 @@ class Action:
         self._wire = routes._node.wire
         self._goals: dict[bytes, _Goal] = {}
         #: Goals that nobody waits for any more, should their server accept them yet.
-        self._unwanted: OrderedDict[bytes, None] = OrderedDict()
+        self._unwanted: FairTable[bytes, None] = FairTable(UNWANTED)
         #: Topics of results that are retained, and until when; they all have the same time.
-        self._kept: deque[tuple[str, float]] = deque()
+        self._kept: FairTable[str, float] = FairTable(RESULTS, RESULT_BYTES)
         # The ROS thread's.
         self._subscriptions: list[RosSubscription] = []
         self._subscribed: str | None = None
@@ -379,6 +387,8 @@ class Action:
                 handle,
                 route.encoding,
                 (*WITHOUT_RAW, self._wire.encoding),
+                LARGEST_CANCEL if verb == "_cancel" else None,
+                verb == "_cancel",
             )
             for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
         ]
@@ -408,19 +418,31 @@ class Action:
 
     # Goals
 
-    async def _on_goal(self, call: Call) -> Answer:
+    def _on_goal(self, call: Call) -> Callable[[], Awaitable[Answer]]:
         type_name = self.type
         if type_name is None or not self.is_there:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
-        goal_cdr = to_request(self._converters, f"{type_name}_Goal", call.payload, call.encoding)
-        self._check_room(call.caller)
+        limits = self._board.limits
+        self._routes.places.check(call.caller, limits)
+        goal_cdr = to_request(
+            self._converters, f"{type_name}_Goal", call.payload, call.encoding, limits.input
+        )
+        return partial(self._send_goal, call, type_name, goal_cdr)
+
+    async def _send_goal(self, call: Call, type_name: str, goal_cdr: bytes) -> Answer:
+        routes = self._routes
+        routes.places.check(call.caller, self._board.limits)
         if self.route.cancel_on_disconnect and call.caller.link is None:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
         request = goals.with_id(goal_cdr, id_, self._wire)
-        goal = _Goal(id_, call.caller, asyncio.get_running_loop().create_future())
+        goal = _Goal(
+            id_,
+            call.caller,
+            routes.places.take(call.caller),
+            asyncio.get_running_loop().create_future(),
+        )
         self._goals[id_] = goal
-        self._routes.goals[call.caller] += 1
         try:
             response = await self._requests.ask(
                 f"{self.ros}{SEND_GOAL}", f"{type_name}_SendGoal", request
@@ -444,35 +466,21 @@ class Action:
             self._forget(goal)
             raise
         goal.is_accepted = True
-        self._routes.own(id_, _owner(call.caller))
         self._routes._tasks.begin(self._follow_goal(goal, type_name))
         if goal.is_orphan:
             self._cancel_orphan(goal)
         return goals.accepted(self._converters, id_, said["stamp"], call.encoding)
 
-    def _check_room(self, caller: Session) -> None:
-        limits = self._board.limits
-        under_way = self._routes.goals
-        if under_way[caller] >= limits.client:
-            raise CallError(
-                "too_many", f"{limits.client} goals of this client are under way, as many as may be"
-            )
-        if under_way.total() >= limits.total:
-            raise CallError("too_many", f"{limits.total} goals are under way, as many as may be")
-
     def _forget(self, goal: _Goal) -> None:
         if self._goals.pop(goal.id, None) is not None:
-            under_way = self._routes.goals
-            under_way[goal.owner] -= 1
-            if not under_way[goal.owner]:
-                del under_way[goal.owner]
+            self._routes.places.give_back(goal.place)
+            if goal.is_accepted:
+                self._routes.ended.put(goal.place.user, goal.id, _owner(goal.owner))
 
     def _give_up(self, goal: _Goal) -> None:
         """Nobody waits for its acceptance any more: should it come, it is cancelled."""
         self._forget(goal)
-        self._unwanted[goal.id] = None
-        if len(self._unwanted) > UNWANTED:
-            self._unwanted.popitem(last=False)
+        self._unwanted.put(goal.place.user, goal.id, None)
 
     async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
         """Wait for the result, as long as it takes, and publish it."""
@@ -481,8 +489,9 @@ class Action:
             await asyncio.wait({asking, goal.result}, return_when=asyncio.FIRST_COMPLETED)
             status, cdr = goal.result.result() if goal.result.done() else asking.result()
             encoding = self.route.encoding
+            read = partial(goals.result, self._converters, type_name, cdr, encoding)
             try:
-                payload = goals.result(self._converters, type_name, cdr, encoding)
+                payload = await self._board.convert(goal.owner, len(cdr), read)
             except ConversionError as problem:
                 raise CallError("ros_error", f"the result cannot be read: {problem}") from None
         except CallError as error:
@@ -503,7 +512,7 @@ class Action:
             Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
             Property.USER_PROPERTY: about,
         }
-        self._publish_result(f"{self.base}/_result/{goal.id.hex()}", payload, properties)
+        self._publish_result(goal, payload, properties)
 
     async def _ask_result(self, goal: _Goal, type_name: str) -> tuple[str, bytes]:
         """What became of the goal, and the response of `get_result`. Raises CallError."""
@@ -526,24 +535,18 @@ class Action:
             raise CallError("vanished", text)
         return status, response
 
-    def _publish_result(self, topic: str, payload: bytes, properties: Properties) -> None:
+    def _publish_result(self, goal: _Goal, payload: bytes, properties: Properties) -> None:
         keep = self.route.keep_result
-        message = Message(
-            topic,
-            payload,
-            1,
-            keep > 0,
-            properties,
-            self._board.now() + keep if keep > 0 else None,
-        )
-        self._board.publish(message)
-        if message.expires_at is not None:
-            kept = self._kept
-            while kept and kept[0][1] <= self._board.now():
-                kept.popleft()  # the broker has let go of it by itself
-            kept.append((topic, message.expires_at))
-            if len(kept) > RESULTS:
-                self._board.publish(Message(kept.popleft()[0], b"", 0, True))
+        topic = f"{self.base}/_result/{goal.id.hex()}"
+        until = self._board.now() + keep if keep > 0 else None
+        self._board.publish(Message(topic, payload, 1, keep > 0, properties, until))
+        if until is None:
+            return
+        now = self._board.now()
+        for old in list(takewhile(lambda item: item[1] <= now, self._kept.items())):
+            self._kept.remove(old[0])  # the broker has let go of it by itself
+        for dropped, _ in self._kept.put(goal.place.user, topic, until, len(payload)):
+            self._board.publish(Message(dropped, b"", 0, True))
 
     @property
     def has_goals(self) -> bool:
@@ -570,11 +573,14 @@ class Action:
 
     # Cancelling
 
-    async def _on_cancel(self, call: Call) -> Answer:
+    def _on_cancel(self, call: Call) -> Callable[[], Awaitable[Answer]]:
         id_, stamp = goals.which(self._converters, call.payload, call.encoding)
         self._check_right(call.caller, id_)
         if not self.is_there:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
+        return partial(self._cancel_for, call, id_, stamp)
+
+    async def _cancel_for(self, call: Call, id_: bytes, stamp: dict[str, int]) -> Answer:
         canceling, response = await self._cancel(id_, stamp)
         if call.encoding in RAW:
             return Answer(response, call.encoding, f"{CANCEL}_Response")
@@ -583,7 +589,7 @@ class Action:
     def _check_right(self, caller: Session, id_: bytes) -> None:
         """Raises CallError when the caller may cancel only its own goals, and this is another's."""
         right = f"{self.base}/_cancel_any"
-        if self.route.cancel == "any" or self._routes.owner(id_) == _owner(caller):
+        if self.route.cancel == "any" or self._routes.owns(caller, id_):
             return
         if not self._board.may_publish(caller, right):
             what = f"goal {id_.hex()} is" if id_ != ALL else "these goals may be"
@@ -626,7 +632,7 @@ class Action:
     def _cancel_unwanted(self, ids: list[bytes]) -> None:
         for id_ in ids:
             if id_ in self._unwanted:
-                del self._unwanted[id_]
+                self._unwanted.remove(id_)
                 why = "it was accepted when nobody waited for it any more"
                 self._routes._tasks.begin(self._cancel_quietly(id_, why))
 

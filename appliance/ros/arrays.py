@@ -34,6 +34,21 @@ class Numbers:
     primitive: Primitive
     data: bytes
 
+    def listed(self) -> list[Any]:
+        """The numbers."""
+        return unpack_numbers(f"<{self.primitive.code}", self.data)
+
+
+def unpack_numbers(code: str, data: bytes) -> list[Any]:
+    """The numbers that `data` is: `code` is `struct`'s, the byte order and one number.
+
+    Raises ValueError when it ends within a number.
+    """
+    count, left = divmod(len(data), struct.calcsize(code))
+    if left:
+        raise ValueError
+    return list(struct.unpack(f"{code[:-1]}{count}{code[-1]}", data))
+
 
 def _octets(value: Any) -> bytes:
     """uint8[] and its like: base64 in JSON, bytes from `careful.accept`."""
@@ -41,6 +56,15 @@ def _octets(value: Any) -> bytes:
         return pybase64.b64decode(value, validate=True)
     if value.__class__ is bytes:
         return bytes(value)
+    if value.__class__ is Numbers and value.primitive.name == "uint8":
+        return bytes(value.data)
+    raise TypeError
+
+
+def _listed(value: Any) -> list[Any]:
+    """The list that stands for an array of numbers which is none."""
+    if isinstance(value, Numbers):
+        return value.listed()
     raise TypeError
 
 
@@ -64,7 +88,9 @@ def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
 
     def write_floats(values: Any) -> bytes:
         if values.__class__ is not list:
-            raise TypeError
+            if values.__class__ is Numbers and values.primitive == primitive:
+                return bytes(values.data)
+            values = _listed(values)
         count = len(values)
         pack = few[count] if count < _FEW else struct.Struct(f"<{count}{code}").pack
         try:
@@ -76,7 +102,11 @@ def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
         return pack(*[nan if x is None else x for x in values])
 
     def write_exactly(values: Any) -> bytes:
-        if values.__class__ is not list or not types.issuperset(map(type, values)):
+        if values.__class__ is not list:
+            if values.__class__ is Numbers and values.primitive == primitive:
+                return bytes(values.data)
+            values = _listed(values)
+        if not types.issuperset(map(type, values)):
             raise TypeError
         count = len(values)
         pack = few[count] if count < _FEW else struct.Struct(f"<{count}{code}").pack
@@ -200,6 +230,7 @@ WRITERS: dict[str, Any] = {
     "NUMBERS": _NUMBERS,
     "join": b"".join,
     "octets": _octets,
+    "listed": _listed,
     "write_wide_string": _write_wide_string,
     **{f"write_{p.name}": _writer(p) for p in PRIMITIVES.values() if not p.is_octet},
 }

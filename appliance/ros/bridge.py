@@ -15,18 +15,20 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from time import thread_time, time_ns
+from functools import partial
+from time import time_ns
 from typing import Literal, TypeAlias
 
 import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
+from appliance.broker.ports import InsideLink, Objection
 from appliance.broker.session import Session
 from appliance.entries import Entries, Repeated
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ReasonCode
 from appliance.ros.commands import Commands
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError
@@ -36,12 +38,13 @@ from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.lease import Leases
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
-from appliance.ros.payloads import CONTENT_TYPE, ZSTD_MAGIC
+from appliance.ros.payloads import CONTENT_TYPE
 from appliance.ros.schema import json_schema, topic_of
 from appliance.ros.skips import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 from appliance.ros.to_mqtt import ToMqtt
 from appliance.ros.to_ros import Surroundings, ToRos
+from appliance.ros.turns import LITTLE, Turns, size_of
 
 __all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 
@@ -51,9 +54,6 @@ CLIENT_ID = "_bridge"
 
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
-
-#: Bytes of a payload up to which converting it takes some ten microseconds.
-LITTLE = 1024
 
 #: Every so many looks at the graph (within a second) a topic's number of endpoints is not trusted:
 #: one may have been replaced by another. At each look it is the turn of some topics.
@@ -122,7 +122,8 @@ class Bridge:
         self._session: Session | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
-        self._around = Surroundings(entries, self._post, broker, Leases())
+        self._turns = Turns(entries, broker.ledger)
+        self._around = Surroundings(entries, self._post, broker, Leases(), self._turns)
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None
         self._metered = 0
@@ -154,7 +155,14 @@ class Bridge:
         self._is_joined = False
         #: Services, actions and parameters.
         self.calls = Calls(
-            node, broker, entries, self._converters, self._mailbox, self._post, self._announce
+            node,
+            broker,
+            entries,
+            self._converters,
+            self._mailbox,
+            self._post,
+            self._announce,
+            self._turns,
         )
         self.replace(routes)
         self.calls.replace(calls or CallRoutes())
@@ -354,23 +362,51 @@ class Bridge:
         return self._node.name
 
     def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
-        payload = message.payload
-        # A few bytes can be a megabyte when they are decompressed, and a list of texts takes ten
-        # times as long as one of numbers: only the clock knows whose turn is over. It is that of
-        # the thread's own work, and too dear for a command.
-        is_long = len(payload) > LITTLE or payload.startswith(ZSTD_MAGIC)
-        begun = thread_time() if is_long else 0.0
+        size = size_of(message.payload)
         for receiver in self._receivers.get(message.topic, ()):
-            try:
-                objection = receiver.receive(message, retain, origin)
-            except Exception as error:
-                self._faults.caught("bridge.receive", error, receiver)
-                receiver.counters.errors += 1
-                objection = receiver.objection(message, "could not be carried: see the log")
-            if objection is not None and message.qos == 1:
-                self._broker.objection = objection
-        if is_long:
-            self._broker.counters.effort += int((thread_time() - begun) * 1e6)
+            self._turns_for(receiver, message, retain, origin, size)
+
+    def _turns_for(
+        self,
+        receiver: ToRos,
+        message: Message,
+        retain: bool,
+        origin: Session | None,
+        size: int,
+    ) -> None:
+        """Hand it over now or, when it is large and others wait, when it is its turn.
+
+        What has waited was acknowledged before: that it cannot be converted is told by its route.
+        """
+        turns = self._turns
+        work = partial(self._hand_over, receiver, message, retain, origin)
+        if size <= LITTLE and not turns.waits(origin):
+            work()
+        elif isinstance(receiver, Commands):
+            # Its rules depend on when a command comes, and a stop message never waits for one.
+            turns.now(work)
+        elif turns.has_room(origin, size):
+            turns.do(origin, size, work)
+        else:
+            why = "was refused: too much of its user waits to be converted"
+            receiver.fail(why)
+            self._object(receiver.objection(message, why, ReasonCode.QUOTA_EXCEEDED))
+
+    def _hand_over(
+        self, receiver: ToRos, message: Message, retain: bool, origin: Session | None
+    ) -> None:
+        try:
+            objection = receiver.receive(message, retain, origin)
+        except Exception as error:
+            self._faults.caught("bridge.receive", error, receiver)
+            receiver.counters.errors += 1
+            objection = receiver.objection(message, "could not be carried: see the log")
+        if objection is not None:
+            self._object(objection)
+
+    def _object(self, objection: Objection) -> None:
+        if objection.message.qos == 1:
+            self._broker.objection = objection
 
     def _drain(self) -> None:
         if self._deliver():

@@ -13,7 +13,11 @@ a way back or because the caller may not use it, is not carried out: the error i
 `r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
 
 A call may be JSON, CBOR or ROS's own bytes, as its content type says, else as the route does; its
-answer is the same. Everything here is for the event loop's thread.
+answer is the same. Both are converted when it is their turn, see turns.py.
+
+How many are under way is bounded for each client, each user and all together. Cancelling has places
+of its own, which nothing else takes and no other user: who has sent a goal can always stop it.
+Everything here is for the event loop's thread.
 """
 
 from __future__ import annotations
@@ -24,7 +28,8 @@ import re
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from functools import partial
+from typing import Literal, TypeAlias, TypeVar
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -35,7 +40,16 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.ros.backlog import Backlog
-from appliance.ros.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps, named_encoding, too_large
+from appliance.ros.convert import TooLargeError
+from appliance.ros.payloads import (
+    CONTENT_TYPE,
+    RAW,
+    CallEncoding,
+    InputLimits,
+    dumps,
+    named_encoding,
+)
+from appliance.ros.turns import Turns, user_of
 
 log = logging.getLogger(__name__)
 
@@ -74,8 +88,12 @@ BYTES_AN_EFFORT = 16
 #: Bytes of a topic, as of every string in MQTT.
 LONGEST_TOPIC = 0xFFFF
 
-#: Bytes of payload of all calls under way.
+#: Bytes of payload of all calls under way, and of those of one user.
 TOTAL_BYTES = 64 * 1024 * 1024
+USER_BYTES = TOTAL_BYTES // 4
+
+T = TypeVar("T")
+K = TypeVar("K")
 
 
 class CallError(Exception):
@@ -97,11 +115,75 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Calls and goals under way: of one client, and of all together; and bytes of a call."""
+    """Calls under way, and as many goals: of one client, of all together, and of one user (None: a
+    quarter of these); and what one call may be."""
 
     client: int = 20
     total: int = 500
-    payload: int = 1024 * 1024
+    user: int | None = None
+    input: InputLimits = field(default_factory=InputLimits)
+
+    @property
+    def share(self) -> int:
+        """What one user may have under way."""
+        return max(1, self.total // 4) if self.user is None else self.user
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place that is taken: by this client, of this user."""
+
+    client: Session
+    user: str | None
+
+
+class Places:
+    """Places for what is under way: `what` says what that is, in the plural.
+
+    Where a place is `sure`, what other users have never keeps it from anybody.
+    """
+
+    def __init__(self, what: str, *, sure: bool = False) -> None:
+        self._what = what
+        self._is_sure = sure
+        self._clients: Counter[Session] = Counter()
+        self._users: Counter[str | None] = Counter()
+        self._total = 0
+
+    def __contains__(self, client: Session) -> bool:
+        return client in self._clients
+
+    def check(self, client: Session, limits: CallLimits) -> None:
+        """Raises CallError when there is no place left for the client."""
+        if self._clients[client] >= limits.client:
+            raise self._full(limits.client, "this client", "calls_per_client")
+        user = user_of(client)
+        if self._users[user] >= limits.share:
+            whose = "the clients without a user" if user is None else f"the user {quote(user)}"
+            raise self._full(limits.share, whose, "calls_per_user")
+        if self._total >= limits.total and not self._is_sure:
+            raise self._full(limits.total, "all clients", "calls")
+
+    def _full(self, count: int, whose: str, key: str) -> CallError:
+        return CallError(
+            "too_many",
+            f"{count} {self._what} of {whose} are under way, as many as may be "
+            f"(bridge.limits.{key})",
+        )
+
+    def take(self, client: Session) -> Place:
+        """Take a place, which `check` has found."""
+        place = Place(client, user_of(client))
+        self._total += 1
+        self._clients[place.client] += 1
+        self._users[place.user] += 1
+        return place
+
+    def give_back(self, place: Place) -> None:
+        """It is free again."""
+        self._total -= 1
+        _take_off(self._clients, place.client, 1)
+        _take_off(self._users, place.user, 1)
 
 
 @dataclass(eq=False, slots=True)
@@ -131,18 +213,22 @@ class Call:
     encoding: CallEncoding
     doubt: str = ""
     is_late: bool = False
+    place: Place | None = None
+    timer: asyncio.TimerHandle | None = None
     task: asyncio.Task[None] | None = None
 
 
-Handle: TypeAlias = Callable[[Call], Awaitable[Answer]]
+#: Takes in what a call asks for, at once, and gives what finds the answer. Both raise CallError.
+Handle: TypeAlias = Callable[[Call], Callable[[], Awaitable[Answer]]]
 
 
 @dataclass(eq=False, slots=True)
 class Offer:
-    """What can be called under a topic: `handle` gives the answer or raises CallError.
+    """What can be called under a topic, and how it is handled.
 
     `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
-    `encodings` are those that it takes.
+    `encodings` are those that it takes, with `largest` bytes at most if that is said. What cancels
+    (`is_cancel`) has places of its own.
     """
 
     topic: str
@@ -152,6 +238,8 @@ class Offer:
     handle: Handle
     encoding: CallEncoding = "json"
     encodings: tuple[CallEncoding, ...] = WITHOUT_RAW
+    largest: int | None = None
+    is_cancel: bool = False
 
 
 Receive: TypeAlias = Callable[[Session, Message], None]
@@ -181,8 +269,9 @@ class Ear(InsideLink):
 class Switchboard:
     """Takes calls from MQTT, has them handled, and answers each of them once."""
 
-    def __init__(self, broker: Broker, entries: Entries, limits: CallLimits | None = None) -> None:
-        self.limits = limits or CallLimits()
+    def __init__(self, broker: Broker, entries: Entries, turns: Turns) -> None:
+        self.limits = CallLimits()
+        self.turns = turns
         self._backlog = Backlog()
         self._broker = broker
         self._entries = entries
@@ -194,9 +283,10 @@ class Switchboard:
         self._last_identifier = 0
         #: By topic, the first of those that were offered there; the others wait for it to go.
         self._offers: dict[str, list[Offer]] = {}
-        self._under_way: Counter[Session] = Counter()
-        self._calls: set[Call] = set()
-        self._bytes = 0
+        self._places = Places("calls")
+        self._cancel_places = Places("calls that cancel goals", sure=True)
+        self._calls: dict[Call, Offer] = {}
+        self._bytes: Counter[str | None] = Counter()
         self._report_at: dict[str, float] = {}
 
     def start(self) -> None:
@@ -213,6 +303,9 @@ class Switchboard:
         for topic in list(self._offers):
             del self._offers[topic]
             self._ignore_calls(topic)
+        for call in list(self._calls):
+            if call.task is None:  # it waits for its turn
+                self._end(call, _stopping())
         tasks = [call.task for call in self._calls if call.task is not None]
         for task in tasks:
             task.cancel()
@@ -341,20 +434,54 @@ class Switchboard:
         if isinstance(said, str) and named is None:
             call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
         try:
-            self._admit(offer, caller, message)
-            if encoding not in offer.encodings:
-                either = " or ".join(offer.encodings)
-                text = f"a call of {offer.name} may be {either}, not {encoding}"
-                raise CallError("bad_request", text)
+            self._admit(offer, call, message)
         except CallError as error:
             self._fail(offer, caller, reply, encoding, error)
             return
-        self._under_way[caller] += 1
+        self._enter(offer, call)
+        self.turns.do(caller, len(call.payload), partial(self._begin, offer, call))
+
+    def _enter(self, offer: Offer, call: Call) -> None:
+        places = self._cancel_places if offer.is_cancel else self._places
+        call.place = places.take(call.caller)
         offer.counters.under_way += 1
-        self._calls.add(call)
-        self._bytes += len(call.payload)
-        call.task = self._entries.task("calls.call", self._run(offer, call), served=offer.name)
-        self._entries.when_done("calls.end", call.task, self._forget, offer, call)
+        self._calls[call] = offer
+        self._bytes[call.place.user] += len(call.payload)
+        call.timer = self._entries.later(
+            "calls.timeout", offer.timeout, self._expire, call, served=offer.name
+        )
+
+    def _begin(self, offer: Offer, call: Call) -> None:
+        """It is the call's turn to be converted."""
+        if call not in self._calls:  # it was given up
+            return
+        try:
+            find = offer.handle(call)
+        except CallError as error:
+            self._end(call, error)
+        except Exception as problem:  # a fault in here must not leave the caller without an answer
+            self._entries.faults.caught("calls.take", problem, offer.name)
+            self._end(call, CallError("ros_error", repr(problem)))
+        else:
+            call.task = self._entries.task(
+                "calls.call", self._run(offer, call, find), served=offer.name
+            )
+            self._entries.when_done("calls.end", call.task, self._leave, call)
+
+    async def convert(self, caller: Session, size: int, work: Callable[[], T]) -> T:
+        """What `work` gives, which converts so many bytes, when it is the caller's turn."""
+        done: asyncio.Future[T] = self._loop.create_future()
+
+        def settle() -> None:
+            if done.done():
+                return
+            try:
+                done.set_result(work())
+            except Exception as error:
+                done.set_exception(error)
+
+        self.turns.do(caller, size, settle)
+        return await done
 
     def _way_back(self, caller: Session, message: Message, own: str, token: str) -> Message:
         """An empty answer with its topic and correlation. Raises CallError."""
@@ -399,65 +526,85 @@ class Switchboard:
                 f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
             )
 
-    def _admit(self, offer: Offer, caller: Session, message: Message) -> None:
+    def _admit(self, offer: Offer, call: Call, message: Message) -> None:
+        """Raises CallError for a call that is not even looked at."""
+        caller = call.caller
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
         is_over = message.expires_at is not None and message.expires_at <= self._broker.now
         if is_over or self._backlog.has(message, caller, offer.timeout, self._loop.time()):
             # Nobody waits for its answer any more, and what it would do nobody expects now.
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
-        limits = self.limits
-        size = len(message.payload)
-        if size > limits.payload:
-            raise CallError("too_large", too_large(size, limits.payload))
-        if self._bytes + size > TOTAL_BYTES:
-            raise CallError("too_many", f"{self._bytes} bytes of calls are under way")
-        if self._under_way[caller] >= limits.client:
-            raise CallError(
-                "too_many", f"{limits.client} calls of this client are under way, as many as may be"
-            )
-        if len(self._calls) >= limits.total:
-            raise CallError("too_many", f"{limits.total} calls are under way, as many as may be")
-
-    async def _run(self, offer: Offer, call: Call) -> None:
-        def expire() -> None:
-            call.is_late = True
-            if call.task is not None:
-                call.task.cancel()
-
-        timer = self._entries.later("calls.timeout", offer.timeout, expire, served=offer.name)
+        size = len(call.payload)
         try:
-            answer = await offer.handle(call)
+            self.limits.input.check_size(size, call.encoding)
+        except TooLargeError as error:
+            raise CallError("too_large", str(error)) from None
+        if offer.largest is not None and size > offer.largest:
+            text = f"it has {size} bytes, {offer.name} takes {offer.largest} at most"
+            raise CallError("too_large", text)
+        if offer.is_cancel:
+            self._cancel_places.check(caller, self.limits)
+        else:
+            self._places.check(caller, self.limits)
+            self._check_bytes(caller, size)
+        if call.encoding not in offer.encodings:
+            either = " or ".join(offer.encodings)
+            text = f"a call of {offer.name} may be {either}, not {call.encoding}"
+            raise CallError("bad_request", text)
+
+    def _check_bytes(self, caller: Session, size: int) -> None:
+        own, total = self._bytes[user_of(caller)], self._bytes.total()
+        if own and own + size > USER_BYTES:
+            raise CallError("too_many", f"{own} bytes of calls of its user are under way")
+        if total and total + size > TOTAL_BYTES:
+            raise CallError("too_many", f"{total} bytes of calls of all clients are under way")
+
+    async def _run(self, offer: Offer, call: Call, find: Callable[[], Awaitable[Answer]]) -> None:
+        try:
+            answer = await find()
         except CallError as error:
-            if error.code == "bad_request" and call.doubt:
-                error = CallError(error.code, f"{error}{call.doubt}")
-            self._fail(offer, call.caller, call.reply, call.encoding, error)
+            self._tell(offer, call, error)
         except asyncio.CancelledError:
-            text = f"no answer from {offer.name} within {offer.timeout:g} s"
-            end = CallError("timeout", text) if call.is_late else _stopping()
-            self._fail(offer, call.caller, call.reply, call.encoding, end)
+            self._tell(offer, call, _too_late(offer) if call.is_late else _stopping())
         except Exception as problem:  # a fault in here must not leave the caller without an answer
             self._entries.faults.caught("calls.handle", problem, offer.name)
-            end = CallError("ros_error", repr(problem))
-            self._fail(offer, call.caller, call.reply, call.encoding, end)
+            self._tell(offer, call, CallError("ros_error", repr(problem)))
         else:
             offer.counters.answers += 1
             about = [("status", "ok")]
             if answer.type is not None:
                 about.append(("ros-type", answer.type))
             self._answer(call.reply, answer.payload, answer.encoding, about)
-        finally:
-            timer.cancel()
 
-    def _forget(self, offer: Offer, call: Call) -> None:
+    def _expire(self, call: Call) -> None:
+        """Its time is over."""
+        call.is_late = True
+        if call.task is not None:
+            call.task.cancel()
+        elif call in self._calls:  # it waits for its turn yet
+            self._end(call, _too_late(self._calls[call]))
+
+    def _end(self, call: Call, error: CallError) -> None:
+        """It fails before anybody was asked."""
+        self._tell(self._calls[call], call, error)
+        self._leave(call)
+
+    def _leave(self, call: Call) -> None:
+        offer = self._calls.pop(call)
+        if call.timer is not None:
+            call.timer.cancel()
         offer.counters.under_way -= 1
-        self._calls.discard(call)
-        self._bytes -= len(call.payload)
-        self._under_way[call.caller] -= 1
-        if not self._under_way[call.caller]:
-            del self._under_way[call.caller]
+        assert call.place is not None
+        _take_off(self._bytes, call.place.user, len(call.payload))
+        (self._cancel_places if offer.is_cancel else self._places).give_back(call.place)
         if call.task is not None and call.task.cancelled():  # before it had begun
-            self._fail(offer, call.caller, call.reply, call.encoding, _stopping())
+            self._tell(offer, call, _too_late(offer) if call.is_late else _stopping())
+
+    def _tell(self, offer: Offer, call: Call, error: CallError) -> None:
+        if error.code == "bad_request" and call.doubt:
+            error = CallError(error.code, f"{error}{call.doubt}")
+        self._fail(offer, call.caller, call.reply, call.encoding, error)
 
     def _fail(
         self,
@@ -511,6 +658,16 @@ def _is_level(client_id: str) -> bool:
 def _is_own_topic(caller: Session, topic: str) -> bool:
     """Whether there can be such a topic with the caller's id, which may be any text, in it."""
     return _is_level(caller.client_id) and len(topic.encode()) <= LONGEST_TOPIC
+
+
+def _take_off(counter: Counter[K], key: K, count: int) -> None:
+    counter[key] -= count
+    if not counter[key]:
+        del counter[key]
+
+
+def _too_late(offer: Offer) -> CallError:
+    return CallError("timeout", f"no answer from {offer.name} within {offer.timeout:g} s")
 
 
 def _stopping() -> CallError:

@@ -13,7 +13,7 @@ import struct
 from binascii import Error as Base64Error
 from collections.abc import Callable
 from difflib import get_close_matches
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import pybase64
@@ -34,6 +34,7 @@ from appliance.ros.definitions import (
     Wire,
     least_size,
 )
+from appliance.ros.weigh import ITEMS, WEIGHT, too_much, weight_of
 
 # How much of a wrong value an error message quotes.
 _QUOTED = 40
@@ -49,11 +50,20 @@ class ConversionError(ValueError):
         self.problem = problem
 
 
+class TooLargeError(ConversionError):
+    """A message that is more work than one may be."""
+
+
 # --- CDR to values --------------------------------------------------------------------------
 
 
 def decode(
-    description: TypeDescription, cdr: bytes, *, binary: bool = False, strict: bool = False
+    description: TypeDescription,
+    cdr: bytes,
+    *,
+    binary: bool = False,
+    strict: bool = False,
+    most: float = inf,
 ) -> dict[str, Any]:
     """The value of a serialized message: byte order, alignment and strings as its wire has them.
 
@@ -61,7 +71,8 @@ def decode(
     arrays of numbers, but for bools, as `Numbers`. Bytes after the message are ignored,
     as every DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) comes with
     U+FFFD in it; when `strict`, what is not UTF-16 is refused, as rclpy cannot take it, and so is
-    a string that is longer than its bound. Raises ConversionError.
+    a string that is longer than its bound. Raises ConversionError, TooLargeError for what weighs
+    more than `most` (weigh.py).
     """
     order = "<"
     if description.wire.header:
@@ -70,7 +81,8 @@ def decode(
         if cdr[0] != 0 or cdr[1] > 1:
             raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
         order = "<" if cdr[1] else ">"
-    return _Reader(cdr, description.wire, order, binary, strict).structure(description, "")
+    budget = _Budget(most)
+    return _Reader(cdr, description.wire, order, binary, strict, budget).structure(description, "")
 
 
 def pick(value: Any, wanted: Selection) -> Any:
@@ -84,15 +96,37 @@ def pick(value: Any, wanted: Selection) -> Any:
     }
 
 
+class _Budget:
+    """What a message may weigh yet."""
+
+    def __init__(self, most: float) -> None:
+        self._most = self._left = most
+
+    def spend(self, weight: int) -> None:
+        """Raises TooLargeError when that is too much."""
+        self._left -= weight
+        if self._left < 0:
+            raise TooLargeError("", too_much(int(self._most)))
+
+
 class _Reader:
     """A position in the bytes of one message."""
 
-    def __init__(self, cdr: bytes, wire: Wire, order: str, binary: bool, strict: bool) -> None:
+    def __init__(
+        self,
+        cdr: bytes,
+        wire: Wire,
+        order: str,
+        binary: bool,
+        strict: bool,
+        budget: _Budget,
+    ) -> None:
         self._cdr = cdr
         self._wire = wire
         self._order = order
         self._binary = binary
         self._strict = strict
+        self._budget = budget
         self._position = len(wire.header)
 
     def structure(self, description: TypeDescription, path: str) -> dict[str, Any]:
@@ -125,10 +159,12 @@ class _Reader:
             if item.is_octet:
                 octets = self._take(count, path)
                 return octets if self._binary else pybase64.b64encode_as_string(octets)
+            self._budget.spend(count)
             numbers = self._numbers(item, count, path)
             if self._binary and item.name != "bool":
                 return Numbers(item, struct.pack(f"<{count}{item.code}", *numbers))
             return list(numbers)
+        self._budget.spend(count * weight_of(item))
         return [self._value(item, f"{path}[{i}]") for i in range(count)]
 
     def _numbers(self, primitive: Primitive, count: int, path: str) -> tuple[Any, ...]:
@@ -186,19 +222,24 @@ _UNIT = Primitive("uint32", "I", 4)
 # --- JSON's values, checked -----------------------------------------------------------------
 
 
-def accept(description: TypeDescription, value: object, now: Callable[[], int]) -> dict[str, Any]:
+def accept(
+    description: TypeDescription, value: object, now: Callable[[], int], most: float = ITEMS
+) -> dict[str, Any]:
     """`value` by the conventions' rules for input, complete and checked to the last item.
 
     What comes back has every field and nothing else: defaults filled in, null as NaN, bytes for
-    uint8[], byte[] and char[]. `now` gives nanoseconds since the epoch. Raises ConversionError.
+    uint8[], byte[] and char[]. `now` gives nanoseconds since the epoch. Raises ConversionError,
+    TooLargeError for what weighs more than `most` (weigh.py), defaults included: with these, a
+    few bytes can be a large message.
     """
-    return _Checker(now, description.wire).structure(description, value, "")
+    return _Checker(now, description.wire, _Budget(most)).structure(description, value, "")
 
 
 class _Checker:
-    def __init__(self, now: Callable[[], int], wire: Wire) -> None:
+    def __init__(self, now: Callable[[], int], wire: Wire, budget: _Budget) -> None:
         self._now = now
         self._wire = wire
+        self._budget = budget
 
     def structure(self, description: TypeDescription, value: object, path: str) -> dict[str, Any]:
         if value == "now" and description.name == TIME:
@@ -206,6 +247,7 @@ class _Checker:
             value = {"sec": sec, "nanosec": nanosec}
         if not isinstance(value, dict):
             raise ConversionError(path, f"expected an object, got {_say(value)}")
+        self._budget.spend(WEIGHT + len(description.fields))
         names = [field.name for field in description.fields]
         for name in value:
             if name not in names:
@@ -213,9 +255,13 @@ class _Checker:
         return {
             field.name: self._value(field.type, value[field.name], _join(path, field.name))
             if field.name in value
-            else default(field)
+            else self._default(field)
             for field in description.fields
         }
+
+    def _default(self, field: Field) -> Any:
+        self._budget.spend(weight_of(field.type))
+        return default(field)
 
     def _value(self, type_: FieldType, value: object, path: str) -> Any:
         if isinstance(type_, Primitive):
@@ -237,13 +283,18 @@ class _Checker:
                 return _base64(value, path)
             if isinstance(value, (bytes, bytearray, memoryview)):
                 return bytes(value)
+            if isinstance(value, Numbers) and value.primitive.name == "uint8":
+                return value.data
+            value = value.listed() if isinstance(value, Numbers) else value
             if not isinstance(value, (list, tuple)):
                 raise ConversionError(path, f"expected base64 or an array, got {_say(value)}")
             if _all_fit(item, value):
                 return bytes(value)
             return bytes(_number(item, x, f"{path}[{i}]") for i, x in enumerate(value))
+        value = value.listed() if isinstance(value, Numbers) else value
         if not isinstance(value, (list, tuple)):
             raise ConversionError(path, f"expected an array, got {_say(value)}")
+        self._budget.spend(len(value) * (1 if isinstance(item, Primitive) else WEIGHT))
         if isinstance(item, Primitive) and _all_fit(item, value):
             return list(value)
         return [self._value(item, x, f"{path}[{i}]") for i, x in enumerate(value)]
@@ -351,7 +402,7 @@ def _say(value: object) -> str:
         return str(value)
     if isinstance(value, dict):
         return "an object"
-    return "an array" if isinstance(value, (list, tuple)) else f"a {type(value).__name__}"
+    return "an array" if isinstance(value, (list, tuple, Numbers)) else f"a {type(value).__name__}"
 
 
 def _quote(text: str) -> str:

@@ -8,15 +8,16 @@ some bytes could stand for gigabytes.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any
 
 import cbor2
 
-from appliance.ros.arrays import Numbers
+from appliance.ros.arrays import Numbers, unpack_numbers
 from appliance.ros.careful import ConversionError
+from appliance.ros.definitions import PRIMITIVES
+from appliance.ros.weigh import DEPTH
 
 #: Tags of typed arrays in little endian.
 TAGS = {
@@ -59,8 +60,11 @@ _CODES = {
 #: The tags that cbor2 would do something about.
 _KNOWN = (0, 1, 2, 3, 4, 5, 25, 28, 29, 30, 35, 36, 37, 100, 256, 258, 260, 261, 1004, 43000)
 
-#: Deeper than any message type.
-_DEPTH = 64
+#: Those that are on the wire of ROS as they are here.
+_AS_THEY_ARE = {
+    **{tag: PRIMITIVES[name] for name, tag in TAGS.items()},
+    **dict.fromkeys((64, 68), PRIMITIVES["uint8"]),
+}
 
 
 def _encode_numbers(encoder: cbor2.CBOREncoder, value: Any) -> None:
@@ -73,16 +77,24 @@ def dumps(value: object) -> bytes:
     return cbor2.dumps(value, default=_encode_numbers)
 
 
-def _read_typed_array(tag: cbor2.CBORTag, _: bool) -> list[Any]:
+def _read_list(tag: cbor2.CBORTag, _: bool) -> list[Any]:
     code = _CODES.get(tag.tag)
     if code is None:
         raise ValueError(f"tag {tag.tag} has no place in a message")
     if not isinstance(tag.value, bytes):
         raise ValueError(f"the typed array of tag {tag.tag} is not a byte string")
-    count, left = divmod(len(tag.value), struct.calcsize(code))
-    if left:
-        raise ValueError(f"the typed array of tag {tag.tag} ends within a number")
-    return list(struct.unpack(f"{code[:-1]}{count}{code[-1]}", tag.value))
+    try:
+        return unpack_numbers(code, tag.value)
+    except ValueError:
+        raise ValueError(f"the typed array of tag {tag.tag} ends within a number") from None
+
+
+def _read_numbers(tag: cbor2.CBORTag, is_immutable: bool) -> Numbers | list[Any]:
+    primitive = _AS_THEY_ARE.get(tag.tag)
+    data = tag.value
+    if primitive is None or not isinstance(data, bytes) or len(data) % primitive.size:
+        return _read_list(tag, is_immutable)
+    return Numbers(primitive, data)
 
 
 def _refuse(tag: int) -> Callable[..., object]:
@@ -95,14 +107,18 @@ def _refuse(tag: int) -> Callable[..., object]:
 _REFUSED = {tag: _refuse(tag) for tag in _KNOWN}
 
 
-def loads(payload: bytes) -> Any:
-    """The value of CBOR; raises ConversionError when it is none, or more than one."""
+def loads(payload: bytes, *, as_numbers: bool = False) -> Any:
+    """The value of CBOR; raises ConversionError when it is none, or more than one.
+
+    Typed arrays are lists; with `as_numbers` those that ROS has like this are `Numbers`, in which
+    nothing is looked at.
+    """
     file = BytesIO(payload)
     decoder = cbor2.CBORDecoder(
         file,
-        tag_hook=_read_typed_array,
+        tag_hook=_read_numbers if as_numbers else _read_list,
         semantic_decoders=_REFUSED,
-        max_depth=_DEPTH,
+        max_depth=DEPTH,
         strict_hashable_types=True,
     )
     try:

@@ -34,7 +34,7 @@ from typing import Any
 import orjson
 
 from appliance.ros import cbor
-from appliance.ros.careful import ConversionError, accept, decode, pick
+from appliance.ros.careful import ConversionError, TooLargeError, accept, decode, pick
 from appliance.ros.definitions import (
     PRIMITIVES,
     Bulk,
@@ -47,9 +47,18 @@ from appliance.ros.definitions import (
     bulk,
     select,
 )
-from appliance.ros.generate import MISFIT, Binary, generate, generate_binary
+from appliance.ros.generate import (
+    MISFIT,
+    Binary,
+    Checker,
+    OverBudgetError,
+    generate,
+    generate_binary,
+    generate_checker,
+)
+from appliance.ros.weigh import CAREFUL, ITEMS, too_much
 
-__all__ = ["ConversionError", "Converter", "Converters", "compile_converter"]
+__all__ = ["ConversionError", "Converter", "Converters", "TooLargeError", "compile_converter"]
 
 # orjson writes a float32 of a numpy array with the fewest digits that tell it from its neighbours.
 # Readers of JSON take digits for a double, and a double for a float32 once more: of all float32
@@ -109,6 +118,7 @@ class Converter:
         #: Made when they are first needed: few routes do.
         self._binary: Binary | None = None
         self._data: Binary | None = None
+        self._checker: Checker | None = None
         self._has_float32_arrays = "read_float32" in self.source
         self._text_type = _text_type(description)
 
@@ -134,17 +144,22 @@ class Converter:
             raise ConversionError("", f"not JSON: {error}") from None
         return self.from_values(value, len(payload))
 
-    def checked(self, cdr: bytes) -> bytes:
+    def checked(self, cdr: bytes, most: int = ITEMS) -> bytes:
         """The serialized message, as it is safe to hand on: nodes end over one that cannot be read
         (rclpy's over text that is not UTF-16), and rclpy does not look.
 
         CDR's options become 0, which say how many bytes of padding are at its end: more than there
-        are would end a node, too, and fewer are passed over.
+        are would end a node, too, and fewer are passed over. It may weigh `most` (weigh.py).
         """
+        if self._checker is None:
+            self._checker = generate_checker(self.description)
         try:
-            self._decode(cdr)
+            self._checker.check(cdr, most)
+        except OverBudgetError:
+            raise TooLargeError("", too_much(most)) from None
         except MISFIT:
-            decode(self.description, cdr, strict=True)
+            # Strings that are not UTF-8 take the careful way, which is ten times as long.
+            decode(self.description, cdr, strict=True, most=most // CAREFUL)
         return cdr[:2] + b"\0\0" + cdr[4:] if self.description.wire.header else cdr
 
     def to_dict(self, cdr: bytes) -> dict[str, Any]:
@@ -174,7 +189,7 @@ class Converter:
 
     def from_cbor(self, payload: bytes) -> bytes:
         """The serialized message, in little endian, of its CBOR."""
-        return self.from_values(cbor.loads(payload), len(payload))
+        return self.from_values(cbor.loads(payload, as_numbers=True), len(payload))
 
     def from_values(self, value: object, size: int) -> bytes:
         """The serialized message of what a payload of so many bytes was; as `from_dict`, and fast

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
 
@@ -22,7 +22,7 @@ from appliance.ros.definitions import CDR, UnknownTypeError, Wire
 from appliance.ros.figures import Counters, Meter
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode
 from appliance.ros.patterns import Names, compile_pattern
-from appliance.ros.payloads import Compression, Encoding
+from appliance.ros.payloads import Compression, Encoding, InputLimits
 from appliance.ros.rules import CommandRules
 from appliance.ros.skips import Skip, Why
 
@@ -47,8 +47,8 @@ class RouteSettings:
     None is: no limit (`rate`, in Hz, and `bytes_per_second` of payload), found from the graph
     (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
     is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
-    paths of those that go to MQTT, all of them when there are none; what comes from MQTT has at
-    most `largest` bytes, and no more when it is decompressed.
+    paths of those that go to MQTT, all of them when there are none; `limits` are for what comes
+    from MQTT.
     """
 
     ros: str | tuple[str, ...]
@@ -63,7 +63,7 @@ class RouteSettings:
     compression: Compression = "none"
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
-    largest: int = 1024 * 1024
+    limits: InputLimits = field(default_factory=InputLimits)
     #: What holds for what goes to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 

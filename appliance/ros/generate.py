@@ -35,6 +35,7 @@ from appliance.ros.definitions import (
     WideString,
     Wire,
 )
+from appliance.ros.weigh import weight_of
 
 # What generated code raises when a message is not exactly as expected.
 MISFIT = (
@@ -61,6 +62,18 @@ class Generated(NamedTuple):
     source: str
 
 
+class Checker(NamedTuple):
+    """The function that reads a type for nothing but to see that it can be read, and its source.
+    It gives up with OverBudgetError when that is more work than it may be (see weigh.py)."""
+
+    check: Callable[[bytes, int], object]
+    source: str
+
+
+class OverBudgetError(Exception):
+    """A message is more work than it may be."""
+
+
 class Binary(NamedTuple):
     """The function that reads a type for encodings that have bytes, and its source. Octets are
     bytes, and other arrays of numbers `arrays.Numbers`."""
@@ -76,6 +89,15 @@ def generate_binary(description: TypeDescription, wanted: Selection | None = Non
     namespace = {**decoder.constants, **binary_readers()}
     exec(compile(source, f"<binary reader of {description.name}>", "exec"), namespace)
     return Binary(namespace["decode"], source)
+
+
+def generate_checker(description: TypeDescription) -> Checker:
+    """Generates and compiles the function that looks whether a message is one of the type."""
+    decoder = _Decoder(description.wire, None, has_budget=True)
+    source = decoder.function(description)
+    namespace = {**decoder.constants, **binary_readers(), "OverBudgetError": OverBudgetError}
+    exec(compile(source, f"<checker of {description.name}>", "exec"), namespace)
+    return Checker(namespace["decode"], source)
 
 
 def generate(description: TypeDescription, wanted: Selection | None = None) -> Generated:
@@ -320,13 +342,22 @@ class _Generator:
 class _Decoder(_Generator):
     """Writes `decode(b)`: the value of the message `b`, or of the fields that are wanted.
 
-    `row` is what becomes of the name of a type and the names of numbers that are a row.
+    `row` is what becomes of the name of a type and the names of numbers that are a row. With
+    `has_budget` it is `decode(b, left)`, which raises OverBudgetError when the message weighs more.
     """
 
-    def __init__(self, wire: Wire, wanted: Selection | None, row: str = "[{1}]") -> None:
+    def __init__(
+        self,
+        wire: Wire,
+        wanted: Selection | None,
+        row: str = "[{1}]",
+        *,
+        has_budget: bool = False,
+    ) -> None:
         super().__init__(wire)
         self._wanted = wanted
         self._row = row
+        self._has_budget = has_budget
 
     def function(self, description: TypeDescription) -> str:
         if self._wire.header:
@@ -334,7 +365,8 @@ class _Decoder(_Generator):
         value = self._value(description, "message")
         self._flush()
         self._line(f"return {value}")
-        return "\n".join(["def decode(b):", *self._lines, ""])
+        head = "def decode(b, left):" if self._has_budget else "def decode(b):"
+        return "\n".join([head, *self._lines, ""])
 
     def _pass(self, type_: FieldType) -> None:
         """Lines that pass a value without reading it."""
@@ -490,6 +522,9 @@ class _Decoder(_Generator):
         return name
 
     def _loop(self, item: ItemType, count: str, hint: str) -> str:
+        if self._has_budget:
+            self._line(f"left -= {count} * {weight_of(item)}")
+            self._line("if left < 0: raise OverBudgetError")
         self._align(_first_size(item), count)
         items = self._name(hint)
         self._settle()
@@ -639,7 +674,8 @@ class _Encoder(_Generator):
             self._line(f"if len({name}) != {length}: raise ValueError")
             self._run.append(_Part(item, length, name if length > 1 else f"{name}[0]"))
         elif _is_row(array):
-            name = self._list(hint, source)
+            name = self._assign(hint, source)
+            self._line(f"if {name}.__class__ is not list: {name} = listed({name})")
             self._line(f"if len({name}) != {length}: raise ValueError")
             self._line(
                 f"if not {_python_types(item)}.issuperset(map(type, {name})): raise TypeError"

@@ -23,6 +23,7 @@ from appliance.ros.parameters import ParameterRoutes
 from appliance.ros.requests import Requests
 from appliance.ros.services import ServiceRoutes, ServiceSettings
 from appliance.ros.skips import Skip
+from appliance.ros.turns import Turns
 
 __all__ = [
     "ActionSettings",
@@ -68,6 +69,7 @@ class Calls:
         mailbox: Mailbox,
         post: Callable[..., None],
         announce: Callable[[], None],
+        turns: Turns,
     ) -> None:
         """`post` calls on the loop's thread; `announce` is called there when what `bridged` gives
         may have changed."""
@@ -76,7 +78,7 @@ class Calls:
         self._post = post
         self._announce = announce
         self._routes = CallRoutes()
-        self.board = Switchboard(broker, entries)
+        self.board = Switchboard(broker, entries, turns)
         self._requests = Requests(node, entries.loop, post, self._follow)
         self._services = ServiceRoutes(self.board, self._requests, converters, node, entries, post)
         self._actions = ActionRoutes(

@@ -7,8 +7,9 @@ place for all (parameter_server.py).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
 import orjson
@@ -18,9 +19,12 @@ from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.topics import check_topic
 from appliance.ros.calls import Answer, Call, CallCounters, CallError, Offer, Switchboard
-from appliance.ros.convert import ConversionError
+from appliance.ros.convert import LARGEST_LENIENT, ConversionError, TooLargeError
 from appliance.ros.patterns import Names, compile_pattern
-from appliance.ros.payloads import CONTENT_TYPE, dumps, loads
+from appliance.ros.payloads import CONTENT_TYPE, InputLimits, dumps, loads
+
+#: Parameters that one call sets.
+SET_AT_ONCE = 200
 
 #: Longer names, in characters, are not shown: they would be no topics.
 LONGEST_NAME = 1024
@@ -119,12 +123,13 @@ class ParameterTopics(ABC, Generic[HolderT]):
         """Take calls for it from now on."""
         self._holders[holder.name] = holder
 
-        async def set_one(call: Call) -> Answer:
-            values = {call.topic.split("/")[-2]: value_of(call)}
-            return await self._check_and_set(holder, values, call, at_once=False)
+        def set_one(call: Call) -> Callable[[], Awaitable[Answer]]:
+            values = {call.topic.split("/")[-2]: value_of(call, self._board.limits.input)}
+            return partial(self._check_and_set, holder, values, call, at_once=False)
 
-        async def set_all(call: Call) -> Answer:
-            return await self._check_and_set(holder, values_of(call), call, at_once=True)
+        def set_all(call: Call) -> Callable[[], Awaitable[Answer]]:
+            values = values_of(call, self._board.limits.input)
+            return partial(self._check_and_set, holder, values, call, at_once=True)
 
         route = holder.route
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
@@ -135,6 +140,7 @@ class ParameterTopics(ABC, Generic[HolderT]):
                 self._counters[route],
                 handle,
                 route.encoding,
+                largest=LARGEST_LENIENT,
             )
             holder.offers.append(offer)
             self._board.offer(offer)
@@ -204,20 +210,26 @@ def _is_topic(name: str, topic: str) -> bool:
     return len(name) <= LONGEST_NAME
 
 
-def value_of(call: Call) -> Any:
+def value_of(call: Call, limits: InputLimits) -> Any:
     """The value in a call. Raises CallError."""
     try:
+        limits.check(call.payload, call.encoding)
         return loads(call.payload, call.encoding)
+    except TooLargeError as error:
+        raise CallError("too_large", str(error)) from None
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
 
 
-def values_of(call: Call) -> dict[str, Any]:
+def values_of(call: Call, limits: InputLimits) -> dict[str, Any]:
     """The values in a call, by the names of parameters. Raises CallError."""
-    values = value_of(call)
+    values = value_of(call, limits)
     is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
     if not is_mapping or not values:
         raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
+    if len(values) > SET_AT_ONCE:
+        text = f"{len(values)} parameters, at most {SET_AT_ONCE} are set at once"
+        raise CallError("too_large", text)
     named: dict[str, Any] = values
     return named
 

@@ -24,7 +24,7 @@ from appliance.ros.calls import (
     CallError,
     Switchboard,
 )
-from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.convert import ConversionError, Converters, TooLargeError
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
 from appliance.ros.parameter_topics import Holder, ParameterTopics, shorten, to_bytes, unlike
@@ -166,10 +166,18 @@ class ParameterRoutes(ParameterTopics[_Node]):
     # Values
 
     async def _ask(self, node: _Node, verb: str, kind: str, fields: object) -> dict[str, Any]:
-        type_name = f"rcl_interfaces/srv/{kind}"
+        return await self._ask_for(node, verb, kind, self._write(kind, fields))
+
+    def _write(self, kind: str, fields: object) -> bytes:
         try:
-            request = self._converters.get(f"{type_name}_Request").from_dict(fields)
-            response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
+            return self._converters.get(f"rcl_interfaces/srv/{kind}_Request").from_dict(fields)
+        except UnknownTypeError as error:
+            raise CallError("unknown_type", str(error)) from None
+
+    async def _ask_for(self, node: _Node, verb: str, kind: str, request: bytes) -> dict[str, Any]:
+        type_name = f"rcl_interfaces/srv/{kind}"
+        response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
+        try:
             return self._converters.get(f"{type_name}_Response").to_dict(response)
         except UnknownTypeError as error:
             raise CallError("unknown_type", str(error)) from None
@@ -276,15 +284,22 @@ class ParameterRoutes(ParameterTopics[_Node]):
         names = list(values)
         said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
         descriptors = {one["name"]: one for one in said["descriptors"]}
-        parameters = [
-            {"name": name, "value": to_value(name, value, descriptors.get(name, {}))}
-            for name, value in values.items()
-        ]
         verb, kind = "set_parameters", "SetParameters"
         if at_once:
             verb, kind = "set_parameters_atomically", "SetParametersAtomically"
+
+        def write() -> bytes:
+            parameters = [
+                {"name": name, "value": to_value(name, value, descriptors.get(name, {}))}
+                for name, value in values.items()
+            ]
+            return self._write(kind, {"parameters": parameters})
+
         try:
-            said = await self._ask(node, verb, kind, {"parameters": parameters})
+            request = await self._board.convert(call.caller, len(call.payload), write)
+            said = await self._ask_for(node, verb, kind, request)
+        except TooLargeError as error:
+            raise CallError("too_large", str(error)) from None
         except ConversionError as error:
             raise CallError("bad_request", f"{', '.join(names)}: {error.problem}") from None
         result = said["result"] if at_once else (said["results"] or [{}])[0]

@@ -5,15 +5,18 @@ about it in properties.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import orjson
 
 from appliance.mqtt.codec import Properties, Property
 from appliance.ros import cbor
-from appliance.ros.careful import ConversionError
+from appliance.ros.careful import ConversionError, TooLargeError
 from appliance.ros.convert import NO_BINARY, Converter, image_format
 from appliance.ros.definitions import CDR, PACKED, UnknownTypeError, Wire
+from appliance.ros.weigh import ITEMS, too_much, weigh_cbor, weigh_json
 
 Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
 CallEncoding: TypeAlias = Literal["json", "cbor", "cdr", "ros1"]
@@ -46,6 +49,40 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 #: Bytes of history that a frame may refer to: what RFC 8878 asks of every decoder.
 ZSTD_WINDOW = 8 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class InputLimits:
+    """What one message for ROS may be, as all others wait while it is converted.
+
+    `payload` are bytes of JSON and of text, where each byte is work; `packet` of what else there
+    is, which is mostly copied. `items` is what it may weigh (weigh.py).
+    """
+
+    payload: int = 1024 * 1024
+    packet: int = 16 * 1024 * 1024
+    items: int = ITEMS
+
+    def largest(self, encoding: Encoding) -> int:
+        """Bytes that a payload in that encoding may have, decompressed."""
+        return min(self.payload, self.packet) if encoding in ("json", "text") else self.packet
+
+    def check_size(self, size: int, encoding: Encoding) -> None:
+        """Raises TooLargeError for a payload of more bytes than are converted."""
+        largest = self.largest(encoding)
+        if size > largest:
+            key = "broker.limits.packet_size" if largest == self.packet else "bridge.limits.payload"
+            raise TooLargeError("", f"it has {size} bytes, at most {largest} are converted ({key})")
+
+    def check(self, payload: bytes, encoding: Encoding) -> None:
+        """Raises TooLargeError for a payload that is more work than it may be: what ROS's own bytes
+        are is seen only when these are read."""
+        self.check_size(len(payload), encoding)
+        items = self.items
+        if encoding == "json" and weigh_json(payload, items) > items:
+            raise TooLargeError("", too_much(items))
+        if encoding == "cbor" and weigh_cbor(payload, items) > items:
+            raise TooLargeError("", too_much(items))
 
 
 def check(converter: Converter, encoding: Encoding, *, to_ros: bool) -> None:
@@ -118,31 +155,30 @@ def packer(
 
 
 def unpacker(
-    converter: Converter, encoding: Encoding, compression: Compression, largest: int
+    converter: Converter, encoding: Encoding, compression: Compression, limits: InputLimits
 ) -> Callable[[bytes], bytes]:
     """The function that makes a serialized message of a payload, or raises ConversionError.
 
-    They have at most `largest` bytes. With a compression, they may be compressed or not, and have
-    no more when they are decompressed.
+    With a compression, payloads may be compressed or not, and are measured decompressed.
     """
-
-    convert = {
+    checked = partial(converter.checked, most=limits.items)
+    ways: dict[Encoding, Callable[[bytes], bytes]] = {
         "json": converter.from_json,
         "cbor": converter.from_cbor,
         "text": converter.from_text,
         "binary": converter.from_binary,
-        "cdr": converter.checked,
-        "ros1": converter.checked,
-    }[encoding]
+        "cdr": checked,
+        "ros1": checked,
+    }
+    convert = ways[encoding]
 
     def unpack(payload: bytes) -> bytes:
-        if len(payload) > largest:
-            raise ConversionError("", too_large(len(payload), largest))
+        limits.check(payload, encoding)
         return convert(payload)
 
     if compression == "none":
         return unpack
-    decompress = _decompressor(largest)
+    decompress = _decompressor(limits, encoding)
 
     def unpack_compressed(payload: bytes) -> bytes:
         if payload.startswith(ZSTD_MAGIC):
@@ -150,11 +186,6 @@ def unpacker(
         return unpack(payload)
 
     return unpack_compressed
-
-
-def too_large(size: int, largest: int) -> str:
-    """What is wrong with a payload for ROS that would hold up all others for too long."""
-    return f"it has {size} bytes, at most {largest} are converted (bridge.limits.payload)"
 
 
 def named_encoding(content_type: object) -> CallEncoding | None:
@@ -196,17 +227,16 @@ def _compressor() -> Callable[[bytes], bytes]:
     return ZstdCompressor().compress
 
 
-def _decompressor(largest: int) -> Callable[[bytes], bytes]:
+def _decompressor(limits: InputLimits, encoding: Encoding) -> Callable[[bytes], bytes]:
     from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
+    largest = limits.largest(encoding)
     decompressor = ZstdDecompressor(max_window_size=ZSTD_WINDOW)
 
     def decompress(payload: bytes) -> bytes:
         try:
             # A size that is told is made room for, whatever it is: it is looked at first.
-            size = frame_content_size(payload)
-            if size > largest:
-                raise ConversionError("", too_large(size, largest))
+            limits.check_size(frame_content_size(payload), encoding)
             return decompressor.decompress(payload, max_output_size=largest, allow_extra_data=False)
         except ZstdError as error:
             problem = f"not zstd, or more than {largest} bytes of it: {error}"

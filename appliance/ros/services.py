@@ -16,7 +16,7 @@ import asyncio
 import logging
 import re
 import secrets
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -36,7 +36,7 @@ from appliance.ros.calls import (
     Offer,
     Switchboard,
 )
-from appliance.ros.convert import ConversionError, Converters
+from appliance.ros.convert import ConversionError, Converters, TooLargeError
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import assign, compile_pattern, refusals
@@ -44,9 +44,9 @@ from appliance.ros.payloads import (
     CONTENT_TYPE,
     RAW,
     CallEncoding,
+    InputLimits,
     loads,
     named_encoding,
-    too_large,
 )
 from appliance.ros.requests import Key, Requests
 from appliance.ros.skips import Skip, Why
@@ -85,19 +85,26 @@ class ServiceSettings:
 
 
 def to_request(
-    converters: Converters, type_name: str, payload: bytes, encoding: CallEncoding
+    converters: Converters,
+    type_name: str,
+    payload: bytes,
+    encoding: CallEncoding,
+    limits: InputLimits,
 ) -> bytes:
     """The serialized message of a payload; an empty one has every field's default.
 
-    Raises CallError: bad_request, which names the field; unknown_type.
+    Raises CallError: bad_request, which names the field; too_large, unknown_type.
     """
     try:
         converter = converters.get(type_name)
         if not payload:
             return converter.from_dict({})
+        limits.check(payload, encoding)
         if encoding in RAW:
-            return converter.checked(payload)
+            return converter.checked(payload, limits.items)
         return converter.from_cbor(payload) if encoding == "cbor" else converter.from_json(payload)
+    except TooLargeError as error:
+        raise CallError("too_large", str(error)) from None
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
     except UnknownTypeError as error:
@@ -226,14 +233,29 @@ class ServiceRoutes:
         fixed = route.type if route.type is not None and "*" not in route.type else None
         return fixed or self._types.get(name)
 
-    async def _handle(self, name: str, route: ServiceSettings, call: Call) -> Answer:
+    def _handle(
+        self, name: str, route: ServiceSettings, call: Call
+    ) -> Callable[[], Awaitable[Answer]]:
         type_name = self._type(name, route)
         if type_name is None:
             raise CallError("unavailable", f"there is no {name} on the bus")
-        request = to_request(self._converters, f"{type_name}_Request", call.payload, call.encoding)
+        request = to_request(
+            self._converters,
+            f"{type_name}_Request",
+            call.payload,
+            call.encoding,
+            self._board.limits.input,
+        )
+        return partial(self._ask, name, type_name, request, call)
+
+    async def _ask(self, name: str, type_name: str, request: bytes, call: Call) -> Answer:
         response = await self._requests.ask(name, type_name, request)
         response_type = f"{type_name}_Response"
-        payload = from_ros(self._converters, response_type, response, call.encoding)
+        payload = await self._board.convert(
+            call.caller,
+            len(response),
+            partial(from_ros, self._converters, response_type, response, call.encoding),
+        )
         return Answer(payload, call.encoding, response_type)
 
     def keys(self) -> Iterable[Key]:
@@ -413,7 +435,8 @@ class Provided:
         route = self._route
         self._counters.calls += 1
         if len(self._asked) >= self._board.limits.total:
-            self._fail(respond, f"too_many: {len(self._asked)} requests are under way")
+            count = len(self._asked)
+            self._fail(respond, f"too_many: {count} requests are under way (bridge.limits.calls)")
             return
         token = secrets.token_hex(8)
         message = Message(
@@ -444,25 +467,30 @@ class Provided:
         if asked is None:
             log.debug("%s: a response to nothing under way", self._ros)
             return
-        size, most = len(message.payload), self._board.limits.payload
-        if size > most:
-            self._fail(asked.respond, f"too_large: {too_large(size, most)}")
-            return
         properties = message.properties or {}
         told = properties.get(Property.USER_PROPERTY)
         encoding = named_encoding(properties.get(Property.CONTENT_TYPE)) or self._route.encoding
         if isinstance(told, list) and ("status", "error") in told:
             self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
             return
+        # Their number is that of the requests: each has one response.
+        take = partial(self._take_response, asked.respond, message.payload, encoding)
+        self._board.turns.do(origin, len(message.payload), take)
+
+    def _take_response(self, respond: Respond, payload: bytes, encoding: CallEncoding) -> None:
+        limits = self._board.limits.input
         try:
-            cdr = to_request(self._converters, self._response_type, message.payload, encoding)
+            cdr = to_request(self._converters, self._response_type, payload, encoding, limits)
         except CallError as error:
-            is_error = _is_error(message.payload, encoding)
-            what = f"rejected: {message.payload[:200]!r}" if is_error else f"bad response: {error}"
-            self._fail(asked.respond, what)
+            what = f"bad response: {error}"
+            if error.code == "too_large":
+                what = f"too_large: {error}"
+            elif _is_error(payload, encoding):
+                what = f"rejected: {payload[:200]!r}"
+            self._fail(respond, what)
             return
         self._counters.answers += 1
-        self._respond(asked.respond, cdr)
+        self._respond(respond, cdr)
 
     def _forget(self, token: str) -> _Asked | None:
         asked = self._asked.pop(token, None)

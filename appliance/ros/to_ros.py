@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -18,6 +19,7 @@ from appliance.ros.lease import Lease, Leases
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
 from appliance.ros.payloads import CONTENT_TYPE, check, claim, unpacker
 from appliance.ros.qos import publisher_qos
+from appliance.ros.turns import LITTLE, Turns, size_of
 
 #: Characters of a reason that a client is told.
 REASON_LENGTH = 500
@@ -29,13 +31,14 @@ class AgainstRulesError(ConversionError):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What a flow to ROS needs: the loop, a way to it from any thread, the broker, and who commands
-    which ROS topic alone."""
+    """What a flow to ROS needs: the loop, a way to it from any thread, the broker, who commands
+    which ROS topic alone, and whose turn it is to have a large message converted."""
 
     entries: Entries
     post: Callable[..., None]
     broker: Broker
     leases: Leases
+    turns: Turns
 
 
 class ToRos(Flow):
@@ -81,7 +84,7 @@ class ToRos(Flow):
         settings = self.settings
         converter = self._converters.get(type_name)
         check(converter, settings.encoding, to_ros=True)
-        unpack = unpacker(converter, settings.encoding, settings.compression, settings.largest)
+        unpack = unpacker(converter, settings.encoding, settings.compression, settings.limits)
         publisher = node.create_publisher(self.ros, type_name, qos)
         name = node.resolve(self.ros)
         if name != self._name:
@@ -192,8 +195,15 @@ class ToRos(Flow):
         return self._lease.decide(session)
 
     def inspect(self, message: Message, session: Session) -> Objection | None:
-        """Whether a message of QoS 2 can be converted."""
-        cdr = self._convert(message, session)
+        """Whether a message of QoS 2 can be converted; of a large one that is found out when it is
+        its turn, unless that is now."""
+        turns = self._around.turns
+        if size_of(message.payload) <= LITTLE:
+            cdr = self._convert(message, session)
+        elif turns.is_busy:
+            return None
+        else:
+            cdr = turns.now(partial(self._convert, message, session)) or b""
         return cdr if isinstance(cdr, Objection) else None
 
     def refused(self, session: Session) -> None:

@@ -59,12 +59,12 @@ class Rules:
 class Client(InsideLink):
     """An MQTT client; `calls` are answered as MQTT 5 does, `calls_311` by tokens."""
 
-    def __init__(self, broker, name, *subscriptions):
+    def __init__(self, broker, name, *subscriptions, user=None):
         self.broker = broker
         self.name = name
         self.received = []
         self.session, _ = broker.connect(
-            self, Identity(name, name), clean_start=True, expiry=0, will=None
+            self, Identity(user or name, name), clean_start=True, expiry=0, will=None
         )
         for topic in (f"answers/{name}", *subscriptions):
             self.subscribe(topic)
@@ -101,6 +101,7 @@ class Client(InsideLink):
 
     async def call(self, topic, payload=b"", response_topic=None):
         """(status, JSON of the answer), by MQTT 5."""
+        await asyncio.sleep(0)  # as through a network: what was set up before is there
         self._number += 1
         correlation = f"{self.name} {self._number}".encode()
         response_topic = response_topic or f"answers/{self.name}"
@@ -121,6 +122,7 @@ class Client(InsideLink):
 
     async def call_311(self, topic, payload=b""):
         """The JSON of the answer, by a token."""
+        await asyncio.sleep(0)
         self._number += 1
         reply = f"{topic.rpartition('/')[0]}/_reply/{self.name}/{self._number}"
         self.subscribe(reply)
@@ -151,8 +153,8 @@ class House:
         self.bridge.start()
         return self.bridge
 
-    def client(self, name, *subscriptions):
-        return Client(self.broker, name, *subscriptions)
+    def client(self, name, *subscriptions, user=None):
+        return Client(self.broker, name, *subscriptions, user=user)
 
     def counters(self, index=0):
         return self.bridge.calls.status()[index].counters

@@ -56,6 +56,7 @@ def decode(message, type_name):
 
 async def ask(client, topic, payload, content_type=None):
     """(status, the answer's message), by MQTT 5."""
+    await asyncio.sleep(0)  # as through a network: what was set up before is there
     said = {} if content_type is None else {"content_type": content_type}
     before = len(client.on(f"answers/{client.name}"))
     client.send(topic, payload, response_topic=f"answers/{client.name}", **said)

@@ -734,10 +734,10 @@ async def test_no_answer_to_a_call_is_a_command(house):
     house.start(CommandRules(on_silence=OnSilence(AFTER)))
     board = house.bridge.calls.board
 
-    async def slow(call):
+    async def slow():
         return Answer(GO)
 
-    offer = Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), slow)
+    offer = Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
     board.offer(offer)
     driver = Driver(house.broker, "a")
     properties = {Property.RESPONSE_TOPIC: TOPIC}

@@ -19,7 +19,7 @@ from test_bridge import STRING, TWIST, House, both, string, to_mqtt, to_ros
 
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError, import_message, load_description, select
-from appliance.ros.payloads import packer, unpacker
+from appliance.ros.payloads import InputLimits, packer, unpacker
 from appliance.ros.schema import json_schema
 
 CONVERTERS = Converters(load_description)
@@ -206,7 +206,7 @@ async def test_compressed_both_ways(house):
 def test_a_bomb_is_not_set_off(has_size):
     bomb = zstandard.ZstdCompressor(write_content_size=has_size).compress(bytes(50_000_000))
     assert len(bomb) < 5000
-    unpack = unpacker(CONVERTERS.get(STRING), "json", "zstd", 1_000_000)
+    unpack = unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(1_000_000))
     with pytest.raises(ConversionError, match="1000000"):
         unpack(bomb)
 
@@ -223,7 +223,7 @@ def test_a_bomb_is_not_set_off(has_size):
 )
 def test_what_is_no_zstd_is_refused(payload):
     with pytest.raises(ConversionError):
-        unpacker(CONVERTERS.get(STRING), "json", "zstd", 1000)(payload)
+        unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(1000))(payload)
 
 
 @pytest.mark.parametrize("encoding", ["json", "cbor", "text", "cdr"])
@@ -235,7 +235,7 @@ def test_every_encoding_can_be_compressed(encoding):
         ("ros-type", STRING),
         ("content-encoding", "zstd"),
     ]
-    assert unpacker(converter, encoding, "zstd", 1000)(payload) == string("x" * 100)
+    assert unpacker(converter, encoding, "zstd", InputLimits(1000))(payload) == string("x" * 100)
 
 
 # what MQTT 5 says about a payload
@@ -357,13 +357,13 @@ async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
 
 
 def test_what_is_too_large_is_not_converted():
-    text = unpacker(CONVERTERS.get(STRING), "json", "none", 100)
+    text = unpacker(CONVERTERS.get(STRING), "json", "none", InputLimits(100))
     assert text(b'{"data": "x"}' + b" " * 87) == string("x")
     with pytest.raises(ConversionError, match=r"it has 101 bytes, at most 100 .*limits.payload"):
         text(b'{"data": "x"}' + b" " * 88)
     small = zstandard.compress(b'{"data": "x"}' + b" " * 88)
     with pytest.raises(ConversionError, match="it has 101 bytes"):
-        unpacker(CONVERTERS.get(STRING), "json", "zstd", 100)(small)
+        unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(100))(small)
 
 
 async def test_what_takes_long_ends_the_turn_of_its_sender(house):

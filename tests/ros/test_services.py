@@ -23,6 +23,7 @@ from appliance.ros.calls import CallLimits
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
 from appliance.ros.node import FakeNode
+from appliance.ros.payloads import InputLimits
 
 SET_BOOL, TRIGGER = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
 CONVERTERS = Converters(load_description)
@@ -112,6 +113,7 @@ async def test_many_calls_at_once_get_each_its_own_answer(house):
 async def test_raw_cdr(house):
     house.start(service("/switch", encoding="cdr"))
     Switch(house)
+    await asyncio.sleep(0)  # the bridge sees it
     client = house.client("alice")
     client.send(CALL, cdr(f"{SET_BOOL}_Request", {"data": True}), response_topic="answers/alice")
     client.send(CALL, b"\0\1\0\0", response_topic="answers/alice")
@@ -197,7 +199,7 @@ async def test_a_type_that_is_not_installed(house):
 
 async def test_calls_are_bounded_a_client_and_in_all(house):
     house.start()
-    house.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5)))
+    house.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5, 4)))
     switch = Switch(house)
     switch.holds = True
     house.node.spin()
@@ -206,13 +208,13 @@ async def test_calls_are_bounded_a_client_and_in_all(house):
     await until(lambda: len(switch.asked) == 4, "the requests")
     assert await clients[0].error(CALL) == (
         "too_many",
-        "2 calls of this client are under way, as many as may be",
+        "2 calls of this client are under way, as many as may be (bridge.limits.calls_per_client)",
     )
     calls.append(asyncio.ensure_future(clients[2].call(CALL)))
     await until(lambda: len(switch.asked) == 5, "the fifth")
     assert await clients[3].error(CALL) == (
         "too_many",
-        "5 calls are under way, as many as may be",
+        "5 calls of all clients are under way, as many as may be (bridge.limits.calls)",
     )
     switch.answer()
     assert {status for status, _ in await asyncio.gather(*calls)} == {"ok"}
@@ -278,6 +280,7 @@ async def test_an_answer_is_no_call(house):
     """A Response Topic that is a call topic, or a route's to ROS, does not go round."""
     house.start(service("/switch"))
     switch = Switch(house)
+    await asyncio.sleep(0)  # the bridge sees it
     house.client("alice").send(CALL, {"data": True}, response_topic=CALL)
     await until(lambda: house.counters().answers, "the answer")
     await asyncio.sleep(0.02)
@@ -537,7 +540,7 @@ async def test_of_two_services_at_one_topic_the_second_waits_for_it(house, caplo
 
 async def test_a_call_that_is_too_large(house):
     house.start(service("/switch"), service("/ask", to="mqtt", type=SET_BOOL, on_error="{}"))
-    house.bridge.calls.board.limits = CallLimits(payload=100)
+    house.bridge.calls.board.limits = CallLimits(input=InputLimits(payload=100))
     switch = Switch(house)
     client = house.client("alice", "r2d2/ask/_request/+")
     before = house.broker.counters.effort
@@ -559,6 +562,7 @@ async def test_calls_are_bounded_in_bytes(house, monkeypatch):
     house.start(service("/switch"))
     switch = Switch(house)
     switch.holds = True
+    await asyncio.sleep(0)  # the bridge sees it
     client = house.client("alice")
     for token in (1, 2):
         client.send(f"{CALL}/{token}", b'{"data": true}' + b" " * 26)

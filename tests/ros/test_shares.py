@@ -1,0 +1,432 @@
+"""What one user does with calls and goals takes nothing from another: on a FakeNode."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+
+pytest.importorskip("test_msgs.action")
+from call_house import AllTypes, House, action, call_routes, parameters, service, until
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.broker.accounts import Account
+from appliance.broker.faults import Faults
+from appliance.broker.ledger import Ledger
+from appliance.broker.ports import Identity, Limits
+from appliance.entries import Entries
+from appliance.ros import actions, turns
+from appliance.ros.calls import CallLimits
+from appliance.ros.convert import Converters
+from appliance.ros.definitions import load_description
+from appliance.ros.fair import FairTable
+from appliance.ros.node import FakeNode
+from appliance.ros.payloads import InputLimits
+from appliance.store import MemoryStore
+
+CONVERTERS = Converters(load_description)
+SET_BOOL, ARRAYS = "std_srvs/srv/SetBool", "test_msgs/srv/Arrays"
+FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
+CALL, GOAL, STOP = "r2d2/slow/_call", "r2d2/walk/_goal", "r2d2/walk/_cancel"
+
+
+@pytest.fixture
+async def house():
+    house = House(FakeNode(types=AllTypes()))
+    yield house
+    await house.stop()
+
+
+def clients(house, user, count):
+    """So many of one user."""
+    return [house.client(f"{user}{number}", user=user) for number in range(count)]
+
+
+class Slow:
+    """A service that answers when it is told to, and an action whose goals go on until then."""
+
+    def __init__(self, house):
+        self.house = house
+        self.waiting = []
+        self.results = {}
+        #: Requests to cancel that are not answered yet.
+        self.held = []
+        self.holds_cancels = False
+        node = house.node
+        node.add_service("/slow", SET_BOOL, lambda _, respond: self.waiting.append(respond))
+        for name, type_name, handle in (
+            ("send_goal", f"{FIBONACCI}_SendGoal", self.on_goal),
+            ("get_result", f"{FIBONACCI}_GetResult", self.on_result),
+            ("cancel_goal", CANCEL, self.on_cancel),
+        ):
+            node.add_service(f"/walk/_action/{name}", type_name, self.serve(type_name, handle))
+
+    @staticmethod
+    def serve(type_name, handle):
+        def on_request(cdr, respond):
+            request = CONVERTERS.get(f"{type_name}_Request").to_dict(cdr)
+            response = CONVERTERS.get(f"{type_name}_Response")
+            handle(request, lambda value: respond(response.from_dict(value)))
+
+        return on_request
+
+    def on_goal(self, request, answer):
+        answer({"accepted": True})
+
+    def on_result(self, request, answer):
+        self.results[request["goal_id"]["uuid"]] = answer
+
+    def on_cancel(self, request, answer):
+        if self.holds_cancels:
+            self.held.append((request, answer))
+            return
+        answer({"goals_canceling": [request["goal_info"]]})
+
+    def finish(self):
+        for answer in self.results.values():
+            answer({"status": 4, "result": {"sequence": [1]}})
+        self.results.clear()
+        response = CONVERTERS.get(f"{SET_BOOL}_Response").from_dict({})
+        for respond in self.waiting:
+            respond(response)
+        self.waiting.clear()
+
+
+async def begin(house, limits=None, **route):
+    house.start()
+    house.bridge.calls.replace(
+        call_routes(
+            service("/slow", timeout=60.0),
+            action("/walk", timeout=60.0, **route),
+            limits=limits or CallLimits(),
+        )
+    )
+    slow = Slow(house)
+    await asyncio.sleep(0)
+    house.node.spin()
+    return slow
+
+
+async def test_the_calls_of_one_user_leave_room_for_another(house):
+    """25 clients with 20 slow calls each: before, the operator's calls failed, and cancels too."""
+    slow = await begin(house)
+    crowd = clients(house, "mallory", 25)
+    operator = house.client("operator")
+    _, goal = await operator.call(GOAL, {"order": 3})
+    for client in crowd:
+        for number in range(20):
+            client.send(f"{CALL}/{number}", {"data": True})
+    await until(lambda: len(slow.waiting) == 125, "a quarter of the calls is under way")
+    assert await crowd[24].error(CALL) == (
+        "too_many",
+        "125 calls of the user 'mallory' are under way, as many as may be "
+        "(bridge.limits.calls_per_user)",
+    )
+    calls = [asyncio.ensure_future(operator.call(CALL, {"data": True})) for _ in range(20)]
+    await until(lambda: len(slow.waiting) == 145, "the operator's calls")
+    # Its own 20 calls are under way, too: cancelling is not one of them.
+    assert (await operator.error(CALL))[0] == "too_many"
+    status, answer = await operator.call(STOP, {"goal_id": goal["goal_id"]})
+    assert (status, answer) == ("ok", {"goals_canceling": [goal["goal_id"]]})
+    slow.finish()
+    await asyncio.gather(*calls)
+    await until(lambda: house.counters().under_way == 0, "all are answered")
+    assert (await asyncio.gather(operator.call(CALL), _later(slow)))[0][0] == "ok"
+
+
+async def _later(slow):
+    await until(lambda: slow.waiting, "the call")
+    slow.finish()
+
+
+async def test_who_cancels_much_keeps_nobody_from_cancelling(house):
+    slow = await begin(house, CallLimits(client=2, total=8))
+    operator = house.client("operator")
+    goal = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
+    slow.holds_cancels = True
+    for user in "abcde":  # more users than share the places of calls
+        (client,) = clients(house, user, 1)
+        own = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+        for number in range(2):
+            client.send(f"{STOP}/{number}", {"goal_id": own})
+        await until(lambda: len(slow.held) % 2 == 0 and slow.held, "they are under way")
+        assert (await client.error(STOP, {"goal_id": own})) == (
+            "too_many",
+            "2 calls that cancel goals of this client are under way, as many as may be "
+            "(bridge.limits.calls_per_client)",
+        )
+    assert len(slow.held) == 10
+    slow.holds_cancels = False
+    assert (await operator.call(STOP, {"goal_id": goal}))[0] == "ok"
+    for request, answer in slow.held:
+        answer({"goals_canceling": [request["goal_info"]]})
+
+
+async def test_the_clients_without_a_user_are_one_user(house):
+    slow = await begin(house, CallLimits(client=2, total=8))
+    crowd = [house.client(f"nobody{number}") for number in range(3)]
+    nobody = house.broker.ledger.accounts.of(Identity(None, "nobody"))
+    for client in crowd:
+        client.session.account = nobody
+    for client in crowd[:2]:
+        client.send(f"{CALL}/1", {"data": True})
+    await until(lambda: len(slow.waiting) == 2, "the calls")
+    code, text = await crowd[2].error(CALL)
+    assert code == "too_many"
+    assert text.startswith("2 calls of the clients without a user are under way")
+    slow.finish()
+
+
+async def test_the_goals_of_one_user_leave_room_for_another(house):
+    slow = await begin(house, CallLimits(client=3, total=16))
+    crowd = clients(house, "mallory", 3)
+    for client in crowd[:2]:
+        for _ in range(2):
+            assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
+    code, text = await crowd[2].error(GOAL, {"order": 3})
+    assert code == "too_many" and "4 goals of the user 'mallory'" in text
+    operator = house.client("operator")
+    for _ in range(3):
+        assert (await operator.call(GOAL, {"order": 3}))[0] == "ok"
+    assert "3 goals of this client" in (await operator.error(GOAL, {"order": 3}))[1]
+    await until(lambda: len(slow.results) == 7, "the results are asked for")
+    slow.finish()
+    await until(lambda: not house.bridge.calls._actions.places._total, "they end")
+    assert (await crowd[2].call(GOAL, {"order": 3}))[0] == "ok"
+
+
+async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(house, monkeypatch):
+    """10,118 short goals of another client made it so that its owner could not cancel it."""
+    monkeypatch.setattr(actions, "ENDED", 50)
+    slow = await begin(house)
+    for user in ("operator", "mallory"):
+        house.rules.deny(user, "publish", "r2d2/walk/_cancel_any")
+    operator, mallory = house.client("operator"), house.client("mallory")
+    goal = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: slow.results, "its result is asked for")
+    held, slow.results = slow.results, {}
+    ended = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
+    await until(lambda: slow.results, "its result is asked for")
+    slow.finish()
+    for _ in range(60):
+        assert (await mallory.call(GOAL, {"order": 3}))[0] == "ok"
+        await until(lambda: slow.results, "its result is asked for")
+        slow.finish()
+    table = house.bridge.calls._actions.ended
+    await until(lambda: len(table) == 50, "it is full")
+    assert (await mallory.error(STOP, {"goal_id": goal}))[0] == "not_authorized"
+    assert (await operator.call(STOP, {"goal_id": goal}))[0] == "ok"
+    # Of what has ended mallory has most: nothing of the operator's was forgotten for that.
+    assert (await operator.call(STOP, {"goal_id": ended}))[0] == "ok"
+    slow.results = held
+    slow.finish()
+
+
+async def test_the_results_of_one_user_leave_those_of_another(house, monkeypatch):
+    monkeypatch.setattr(actions, "RESULTS", 4)
+    slow = await begin(house)
+    operator, mallory = house.client("operator"), house.client("mallory")
+
+    async def result_of(client):
+        goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+        await until(lambda: slow.results, "its result is asked for")
+        slow.finish()
+        topic = f"r2d2/walk/_result/{goal}"
+        await until(lambda: house.retained(topic), "the result")
+        return topic
+
+    own = await result_of(operator)
+    others = [await result_of(mallory) for _ in range(6)]
+    assert house.retained(own) is not None
+    assert [house.retained(topic) is not None for topic in others] == [False] * 3 + [True] * 3
+
+
+async def test_kept_results_are_bounded_in_bytes(house, monkeypatch):
+    monkeypatch.setattr(actions, "RESULT_BYTES", 100)  # of 43 bytes or so each
+    slow = await begin(house)
+    client = house.client("alice")
+    for _ in range(5):
+        await client.call(GOAL, {"order": 3})
+        await until(lambda: slow.results, "its result is asked for")
+        slow.finish()
+        await until(lambda: not house.bridge.calls._actions.places._total, "it has ended")
+    assert len(list(house.broker.retained.find("r2d2/walk/_result/+"))) == 2
+
+
+async def test_what_cancels_is_small(house):
+    await begin(house)
+    client = house.client("alice")
+    code, text = await client.error(STOP, b'{"all": true}' + b" " * 2000)
+    assert code == "too_large" and "takes 1024 at most" in text
+
+
+async def test_errors_of_size_say_which_limit(house):
+    house.start(service("/arrays"), parameters("/arm/*"))
+    limits = CallLimits(input=InputLimits(payload=400_000, items=1000))
+    house.bridge.calls.board.limits = limits
+    asked = []
+    house.node.add_service("/arrays", ARRAYS, lambda cdr, respond: asked.append(cdr))
+    house.node.add_service("/arm/get_parameters", "rcl_interfaces/srv/GetParameters", asked.append)
+    await asyncio.sleep(0)
+    house.node.spin()
+    client = house.client("alice")
+    for topic, payload, expected in (
+        ("arrays/_call", {"string_values": ["a"] * 2000}, "than 1000 (bridge.limits.items)"),
+        ("arrays/_call", b"[" * 400_001, "at most 400000 are converted (bridge.limits.payload)"),
+        ("arm/_param/_set", {"a": [""] * 2000}, "than 1000 (bridge.limits.items)"),
+        ("arm/_param/a/set", [""] * 30_000, "takes 65536 at most"),
+        ("arm/_param/_set", {f"p{n}": 1 for n in range(201)}, "at most 200 are set at once"),
+    ):
+        code, text = await client.error(f"r2d2/{topic}", payload)
+        assert (code, expected in text) == ("too_large", True), text
+    assert asked == [] or len(asked) == 1  # the look at the parameters
+
+
+# the table
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from("abc"), st.integers(0, 30), st.integers(0, 20)), max_size=80
+    ),
+    st.integers(1, 12),
+    st.integers(1, 60) | st.just(math.inf),
+)
+def test_a_fair_table_takes_from_who_has_most(puts, entries, size):
+    table = FairTable(entries, size)
+    known = {}  # in the order of their coming
+    for user, key, weight in puts:
+        known.pop(key, None)
+        known[key] = user, weight, key
+        for dropped, value in table.put(user, key, key, weight):
+            assert value == dropped
+            gone, lost, _ = known.pop(dropped)
+            # Nobody loses anything to a user who has more of what there is too much of.
+            mine = [w for u, w, _ in known.values() if u == gone]
+            for other in "abc":
+                theirs = [w for u, w, _ in known.values() if u == other]
+                if len(known) + 1 > entries and sum(w for _, w, _ in known.values()) + lost <= size:
+                    assert len(theirs) <= len(mine) + 1
+        assert [key for key, _ in table.items()] == list(known)
+        assert len(table) == len(known) <= max(entries, 1)
+        assert sum(w for _, w, _ in known.values()) <= size or len(known) == 1
+    for key in list(known):
+        assert key in table and table.get(key) == key
+        table.remove(key)
+    assert len(table) == 0 and table._size == 0 and table._shares == {}
+
+
+# turns
+
+
+class Clock:
+    """A loop whose rounds are made by hand."""
+
+    time = staticmethod(lambda: 0.0)
+
+    def __init__(self):
+        self.soon = []
+
+    def call_soon(self, callback, *args):
+        self.soon.append((callback, args))
+
+    def round(self):
+        soon, self.soon = self.soon, []
+        for callback, args in soon:
+            callback(*args)
+
+
+class Who:
+    def __init__(self, user):
+        self.account = Account(user)
+
+
+LARGE = turns.LITTLE + 1
+
+
+def turn_house(memory=1 << 20):
+    clock = Clock()
+    ledger = Ledger(Limits(memory=memory), MemoryStore())
+    return clock, turns.Turns(Entries(clock, Faults()), ledger)
+
+
+def test_one_is_done_at_once_and_the_others_one_a_turn():
+    clock, queue = turn_house()
+    done = []
+    for user in "abc":
+        queue.do(Who(user), LARGE, lambda user=user: done.append(user))
+    assert done == ["a"]
+    seen = []
+    while clock.soon:
+        clock.round()
+        seen.append("".join(done))
+    # A round in between is for what others have sent meanwhile.
+    assert seen == ["a", "ab", "ab", "abc", "abc", "abc"]
+
+
+def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
+    clock, queue = turn_house()
+    done = []
+    first, second, other = Who("a"), Who("a"), Who("b")
+    queue.do(Who("c"), LARGE, lambda: None)
+    for number in range(3):
+        for name, who in (("first", first), ("second", second)):
+            queue.do(who, LARGE, lambda text=f"{name} {number}": done.append(text))
+    queue.do(other, LARGE, lambda: done.append("other 0"))
+    queue.do(first, 1, lambda: done.append("first, little"))
+    queue.do(Who("a"), 1, lambda: done.append("at once"))
+    assert done == ["at once"]
+    while clock.soon:
+        clock.round()
+    assert done[1:3] == ["first 0", "other 0"]
+    for name in ("first", "second"):
+        own = [text for text in done if text.startswith(name)]
+        assert own[:3] == [f"{name} {number}" for number in range(3)]
+    assert done[-1] == "first, little"
+    assert not queue.waits(first) and queue._ledger.queued_bytes == 0
+    assert first.account.bytes == 0
+
+
+def test_what_fails_lets_the_next_have_its_turn():
+    clock, queue = turn_house()
+    done = []
+
+    def fail():
+        raise RuntimeError("a fault")
+
+    queue.do(None, LARGE, fail)
+    queue.do(None, LARGE, fail)
+    queue.do(None, LARGE, lambda: done.append(1))
+    while clock.soon:
+        clock.round()
+    assert done == [1] and queue._entries.faults.count == 2
+
+
+def test_what_cannot_wait_makes_the_others_wait():
+    clock, queue = turn_house()
+    done = []
+    for _ in range(5):
+        queue.now(lambda: done.append("now"))
+    queue.do(None, LARGE, lambda: done.append("then"))
+    assert done == ["now"] * 5
+    clock.round()
+    clock.round()
+    assert done[5:] == ["then"]
+
+
+def test_what_waits_takes_memory_of_its_user():
+    clock, queue = turn_house(memory=800_000)
+    a, b = Who("a"), Who("b")
+    queue.do(a, LARGE, lambda: None)
+    count = 0
+    while queue.has_room(a, 10_000):
+        queue.do(a, 10_000, lambda: None)
+        count += 1
+    assert a.account.bytes == count * (10_000 + turns.OVERHEAD) == queue._ledger.queued_bytes
+    assert 10 < count < 60
+    assert queue.has_room(b, 10_000)
+    while clock.soon:
+        clock.round()
+    assert a.account.bytes == queue._ledger.queued_bytes == 0
