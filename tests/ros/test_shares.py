@@ -389,7 +389,7 @@ def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
     assert first.account.bytes == 0
 
 
-def test_what_fails_lets_the_next_have_its_turn():
+def test_what_fails_lets_the_next_have_its_turn(escaped):
     clock, queue = turn_house()
     done = []
 
@@ -402,6 +402,7 @@ def test_what_fails_lets_the_next_have_its_turn():
     while clock.soon:
         clock.round()
     assert done == [1] and queue._entries.faults.count == 2
+    escaped.clear()
 
 
 def test_what_cannot_wait_makes_the_others_wait():
