@@ -467,7 +467,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         "  services: [/reset, {ros: '/arm/**', type: 'std_srvs/srv/*'}, '!/arm/off']\n"
         "  actions: [{ros: /walk, keep_result: 1 min, cancel_on_disconnect: true}]\n"
         "  parameters: [/arm/*, '/**/use_*', '!/arm/key']\n"
-        "  limits: {calls: 9, calls_per_client: 3, payload: 2 MiB}"
+        "  limits: {calls: 9, calls_per_user: 5, calls_per_client: 3, payload: 2 MiB, items: 500}"
     ).bridge
     assert [
         (r.ros, r.is_pattern, r.topic("r2")) for r in bridge.services if not r.is_exclusion
@@ -482,7 +482,9 @@ def test_what_is_called_can_be_named_or_described() -> None:
         ("/**/use_*", True, False),
         ("!/arm/key", False, True),
     ]
-    assert bridge.limits == config.BridgeLimits(calls=9, calls_per_client=3, payload=2 << 20)
+    assert bridge.limits == config.BridgeLimits(
+        calls=9, calls_per_user=5, calls_per_client=3, payload=2 << 20, items=500
+    )
 
 
 @pytest.mark.parametrize(

@@ -62,8 +62,12 @@ def weigh_json(payload: bytes, most: int) -> int:
     weight = _weigh_marks(payload, payload.count(b'"') // 2)
     if weight <= most:
         return weight
-    # What was counted may be names, or within texts, which are now taken out; of those that are too
-    # many no more are looked at.
+    # At least so many of the quotes begin and end something, and no more of that are names.
+    strings = (payload.count(b'"') - payload.count(rb'\"')) // 2
+    weight = strings + (WEIGHT - 1) * (strings - payload.count(b":"))
+    if weight > most:
+        return weight
+    # What was counted may be names, or within texts, which are now taken out.
     parts = payload.replace(rb"\\", b"").replace(rb"\"", b"").split(b'"', 2 * most)
     outside = b"".join(parts[::2])
     names = outside.count(b":")
