@@ -63,7 +63,7 @@ def weigh_json(payload: bytes, most: int) -> int:
     if weight <= most:
         return weight
     # At least so many of the quotes begin and end something, and no more of that are names.
-    strings = (payload.count(b'"') - payload.count(rb'\"')) // 2
+    strings = (payload.count(b'"') - payload.count(rb"\"")) // 2
     weight = strings + (WEIGHT - 1) * (strings - payload.count(b":"))
     if weight > most:
         return weight
