@@ -103,6 +103,8 @@ class ClientProtocol:
         self._choked = False
         self._logging_in = False
         self._who: Identity | Refusal | None = None  # what came of it, not told yet
+        self._stopped = False  # the client takes in nothing until its next turn
+        self._waits: asyncio.TimerHandle | None = None  # for that, unless it comes before
         # How fast it publishes.
         self._little = min(LITTLE, network.portion)
         self._countdown = network.check_every  # of messages, to the next check
@@ -241,10 +243,13 @@ class ClientProtocol:
         if self._slow is not None:
             self._slow.cancel()
         self._ledger.now = self._loop.time()
+        if self._waits is not None:
+            self._waits.cancel()
         if not self._closing:
             self._closing = True
             held, self._held = bytes(self._held), _NOTHING
             try:
+                self._client.hurry()
                 self._client.receive(held)
             except Exception as error:
                 self._broker.fault("connection.last_chunk", error, self._client)
@@ -393,6 +398,8 @@ class ClientProtocol:
             self._read_on()
         elif self._sends_on:
             self._send_on()
+        elif self._stopped:
+            return
         elif self._held:
             portion = bytes(self._held[: self._network.portion])
             # An empty part would keep the whole.
@@ -405,7 +412,7 @@ class ClientProtocol:
             self._transport.resume_reading()
 
     def _send_on(self) -> None:
-        self._sends_on = False
+        self._sends_on = self._stopped = False
         self._ledger.now = self._loop.time()
         published = self._counters.publish_received
         self._client.send_on()
@@ -611,6 +618,27 @@ class ClientProtocol:
                 self._client,
             )
 
+    def stop_reading(self) -> None:
+        """Read nothing more until the client had its turn."""
+        self._stopped = True
+        self._pause_reading()
+
+    def wait(self, seconds: float) -> None:
+        """Let the client have a turn after so many seconds."""
+        if self._waits is not None:
+            self._waits.cancel()
+        self._waits = self._entries.later(
+            "connection.wait", seconds, self.proceed, served=self, failed=self.abort
+        )
+
+    def proceed(self) -> None:
+        """Let the others have their turn, then the client."""
+        if self._waits is not None:
+            self._waits.cancel()
+            self._waits = None
+        self._sends_on = True
+        self._read_later()
+
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined when they are small; to who is slow, in portions."""
         if not self._paused:
@@ -745,6 +773,15 @@ class _Gone:
         return Secured()
 
     def later(self) -> None:
+        """There is nothing to go on with."""
+
+    def stop_reading(self) -> None:
+        """There is nothing to be read."""
+
+    def wait(self, seconds: float) -> None:
+        """No time passes."""
+
+    def proceed(self) -> None:
         """There is nothing to go on with."""
 
     def write(self, chunks: list[bytes]) -> None:

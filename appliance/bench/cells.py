@@ -135,6 +135,21 @@ class LoadCell(Cell):
 
 
 @dataclass(frozen=True, slots=True)
+class FloodCell(LoadCell):
+    """A publisher that is faster than its subscriber; both brokers with their default queues."""
+
+    @contextlib.contextmanager
+    def ours(self, site: Site) -> Iterator[Side]:
+        with peers.appliance(site, [], os.environ, usual=True) as server:
+            yield LoadSide(server, self.load, self.tls)
+
+    @contextlib.contextmanager
+    def peer(self, site: Site, command: str) -> Iterator[Side]:
+        with peers.mosquitto(command, site, usual=True) as server:
+            yield LoadSide(server, self.load, self.tls)
+
+
+@dataclass(frozen=True, slots=True)
 class StoreCell(LoadCell):
     """This broker with the store in the way of every message, against itself without it."""
 
@@ -376,6 +391,7 @@ CELLS: tuple[Cell, ...] = (
     LoadCell("qos0-pipelined", "QoS 0, one pair, pipelined", {CPU: 3.0}, "qos0-pipelined"),
     LoadCell("qos1-inflight50", "QoS 1, one pair, 50 in flight", {CPU: 1.5}, "qos1-inflight50"),
     StoreCell("qos1-stored", "QoS 1, 50 in flight, stored", {"rate": 0.5}, "qos1-stored"),
+    FloodCell("flood", "QoS 1, faster than the subscriber", {"rate": 2.0}, "flood"),
     LoadCell("qos1-50pairs", "QoS 1, 50 pairs, one at a time each", {CPU: 1.0}, "qos1-50pairs"),
     LoadCell("qos0-fanout50", "QoS 0, one to 50 subscribers", {CPU: 1.0}, "qos0-fanout50"),
     LoadCell("qos1-100k", "QoS 1, 100 KB payload", {CPU: 1.0}, "qos1-100k"),

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import select
 import statistics
@@ -26,10 +27,12 @@ from pathlib import Path
 from appliance.bench.client import Client, LoadError, Target, allow_files, publish_packet
 
 STALL_SECONDS = 3.0  # nothing arrives for so long: the broker has lost messages, or stands still
+RUN_SECONDS = 3.0  # of a run, unless said otherwise
 DRAIN_SECONDS = 2.0  # what is still on the way after the last message was sent
 WARM_UP_SECONDS = 0.3
 RECEIVE_BYTES = 1 << 20
 RING_BYTES = 8 << 20  # the most that a publisher's packets, encoded beforehand, take
+BESIDE_SECONDS = 0.002  # between two round trips of the client beside a flood
 CPUCLOCK_SCHED = 2  # clock_getcpuclockid(3): nanoseconds of all threads of a process
 
 
@@ -45,6 +48,7 @@ class Load:
     payload: int = 64  # bytes
     topics: int = 1  # of each publisher, each in its turn; the subscriber has one wildcard for all
     stored: bool = False  # the subscribers' sessions outlive their connections
+    flood: int = 0  # messages in all, sent as fast as they are acknowledged; with a client beside
     idle: int = 0  # connections that only stay: measures memory, not messages
 
 
@@ -57,6 +61,7 @@ CELLS: dict[str, Load] = {
     "qos0-fanout50": Load(subscribers=50),
     "qos0-topics": Load(window=200, batch=100, topics=10_000),
     "qos1-100k": Load(qos=1, payload=100_000, window=10),
+    "flood": Load(qos=1, window=50, flood=200_000),
     "idle": Load(idle=500),
 }
 
@@ -74,6 +79,7 @@ class Result:
     cpu_us: float | None = None  # the broker's CPU time a delivered message, µs
     p50_us: float | None = None  # latency from sent to received, µs
     p99_us: float | None = None
+    beside_us: float | None = None  # 99 % of the round trips of a client beside the load, µs
     broker_busy: float | None = None  # CPU time / time; 1.0 is one core
     generator_busy: float | None = None
     memory_kib: float | None = None  # the broker's resident memory a connection, KiB
@@ -122,6 +128,11 @@ class Flow:
         self._send()
 
     @property
+    def missing(self) -> int:
+        """Messages that were sent and have not arrived."""
+        return self.sent * self.load.subscribers - self.deliveries
+
+    @property
     def on_the_way(self) -> int:
         """Messages neither delivered to all subscribers nor, with QoS 1, acknowledged."""
         done = self.deliveries // self.load.subscribers
@@ -138,6 +149,25 @@ class Flow:
         if room >= self.load.batch:
             self.sent += room
             self._marks.append((self.sent * self.load.subscribers, time.perf_counter()))
+            self._publisher.send(room)
+
+
+class Flood(Flow):
+    """A publisher that waits for its acknowledgements only, and not for the subscriber."""
+
+    @property
+    def on_the_way(self) -> int:
+        return self.sent - self.acknowledged
+
+    @property
+    def missing(self) -> int:
+        return self.load.flood - self.deliveries
+
+    def _send(self) -> None:
+        room = min(self.load.window - self.on_the_way, self.load.flood - self.sent)
+        if room > 0:
+            self.sent += room
+            self._marks.append((self.sent, time.perf_counter()))
             self._publisher.send(room)
 
 
@@ -235,6 +265,43 @@ class Subscriber(Client):
         self._acknowledgements = self._acknowledgements[self.write(self._acknowledgements) :]
 
 
+class Bystander(Client):
+    """Publishes to itself, one message after the other with a pause between."""
+
+    def __init__(self, target: Target, client_id: str) -> None:
+        super().__init__(target, client_id)
+        self.latencies: list[tuple[float, int]] = []
+        self._topic = f"bench/beside/{os.getpid()}"
+        self._packet = publish_packet(self._topic, bytes(64))
+        self._buffer = memoryview(bytearray(len(self._packet)))
+        self._filled = 0
+        self._sent_at = 0.0
+        self._next = 0.0
+
+    def subscribed(self) -> None:
+        """Connect to the end."""
+        self.connected()
+        self.subscribe(self._topic, 0)
+
+    def tick(self, now: float) -> None:
+        """Begin the next round trip, when it is time."""
+        if now >= self._next:
+            self._next = math.inf
+            self._sent_at = now
+            self.write(self._packet)
+
+    def receive(self) -> None:
+        self._filled += self.transport.recv_into(self._buffer[self._filled :])
+        if self._filled == len(self._packet):
+            self._filled = 0
+            now = time.perf_counter()
+            self.latencies.append((now - self._sent_at, 1))
+            self._next = now + BESIDE_SECONDS
+
+    def flush(self) -> None:
+        """A packet of this size is never sent in parts."""
+
+
 # --- Runs ---
 
 
@@ -287,15 +354,17 @@ class Run:
         self._clients: list[Client] = []
         self._publishers: list[Publisher] = []
         self._subscribers: list[tuple[Subscriber, str]] = []
-        self._flows: list[Flow] = []
+        self.flows: list[Flow] = []
         self._load = load
+        self.arrived_at = 0.0  # when the last message of a flood did
 
     def open(self) -> None:
         """Connect and subscribe everyone."""
         run = f"bench-{os.getpid()}"
         for pair in range(self._load.pairs):
-            topic, flow = f"bench/load/{pair:02d}", Flow(self._load)
-            self._flows.append(flow)
+            topic = f"bench/load/{pair:02d}"
+            flow = Flood(self._load) if self._load.flood else Flow(self._load)
+            self.flows.append(flow)
             for number in range(self._load.subscribers):
                 subscriber = Subscriber(self._target, f"{run}-s{pair}-{number}", flow, topic)
                 self._subscribers.append((subscriber, topic))
@@ -314,7 +383,7 @@ class Run:
 
     def start(self) -> None:
         """Send the first messages."""
-        for flow, publisher in zip(self._flows, self._publishers, strict=True):
+        for flow, publisher in zip(self.flows, self._publishers, strict=True):
             flow.start(publisher)
 
     def serve(self, until: float, drained: bool = False) -> None:
@@ -323,13 +392,13 @@ class Run:
         patience = self._patience
         progress, seen = clock(), self.deliveries
         while (now := clock()) < until:
-            if drained and not any(flow.on_the_way for flow in self._flows):
+            if drained and not any(flow.on_the_way for flow in self.flows):
                 return
             for descriptor, event in poll(patience):
                 events[descriptor](event)
             if now - progress > STALL_SECONDS / 2:
                 if self.deliveries == seen and now - progress > STALL_SECONDS:
-                    missing = sum(flow.on_the_way for flow in self._flows)
+                    missing = sum(flow.on_the_way for flow in self.flows)
                     raise LoadError(
                         f"nothing arrives: {missing} messages are on the way"
                         f" after {seen} deliveries (lost, or the broker stands still)"
@@ -340,23 +409,46 @@ class Run:
     @property
     def deliveries(self) -> int:
         """Messages delivered so far, over all subscribers."""
-        return sum(flow.deliveries for flow in self._flows)
+        return sum(flow.deliveries for flow in self.flows)
+
+    def add(self, client: Client) -> None:
+        """Serve one connection more."""
+        client.attach(self._poll, self._events)
+
+    def serve_flood(self, bystander: Bystander) -> None:
+        """Serve the connections until all has been acknowledged and has arrived, or nothing does.
+
+        What was lost does not arrive, so that the end is known only when the time is up.
+        """
+        poll, events, clock = self._poll.poll, self._events, time.perf_counter
+        patience = min(self._patience, BESIDE_SECONDS)
+        seen = 0
+        self.arrived_at = clock()
+        while any(flow.on_the_way or flow.missing for flow in self.flows):
+            for descriptor, event in poll(patience):
+                events[descriptor](event)
+            now = clock()
+            bystander.tick(now)
+            if (progress := sum(flow.acknowledged + flow.deliveries for flow in self.flows)) > seen:
+                seen, self.arrived_at = progress, now
+            elif now - self.arrived_at > STALL_SECONDS:
+                return
 
     def forget_latencies(self) -> None:
         """Leave the warm-up out of the figures."""
-        for flow in self._flows:
+        for flow in self.flows:
             flow.latencies = []
 
     def latencies(self) -> list[tuple[float, int]]:
         """Latencies since the warm-up: seconds, and of how many deliveries."""
-        return [sample for flow in self._flows for sample in flow.latencies]
+        return [sample for flow in self.flows for sample in flow.latencies]
 
     def drain(self) -> int:
         """Stop sending and wait for what is on the way; returns the deliveries that never came."""
-        for flow in self._flows:
+        for flow in self.flows:
             flow.stop()
         self.serve(time.perf_counter() + DRAIN_SECONDS, drained=True)
-        return sum(flow.sent * flow.load.subscribers - flow.deliveries for flow in self._flows)
+        return sum(flow.missing for flow in self.flows)
 
     def close(self) -> None:
         """Close every connection."""
@@ -396,6 +488,46 @@ def run_messages(cell: str, target: Target, load: Load, seconds: float, spin: bo
         cpu_us=1e6 * cpu / messages if target.pids and messages else None,
         p50_us=1e6 * percentile(latencies, 0.50),
         p99_us=1e6 * percentile(latencies, 0.99),
+        broker_busy=cpu / elapsed if target.pids else None,
+        generator_busy=generator / elapsed,
+    )
+
+
+def run_flood(cell: str, target: Target, load: Load, seconds: float, spin: bool) -> Result:
+    """Send a number of messages as fast as they are acknowledged, and count what arrives.
+
+    All that the cell says are meant for a run of RUN_SECONDS.
+    """
+    load = replace(load, flood=max(round(load.flood * seconds / RUN_SECONDS), load.window))
+    run = Run(target, load, spin)
+    bystander: Bystander | None = None
+    try:
+        bystander = Bystander(target, f"bench-{os.getpid()}-beside")
+        bystander.subscribed()
+        run.open()
+        run.add(bystander)
+        generator, cpu = time.process_time(), cpu_seconds(target.pids)
+        began = time.perf_counter()
+        run.start()
+        run.serve_flood(bystander)
+        elapsed = run.arrived_at - began
+        cpu, generator = cpu_seconds(target.pids) - cpu, time.process_time() - generator
+    finally:
+        run.close()
+        if bystander is not None:
+            bystander.close()
+    messages = run.deliveries
+    return Result(
+        cell=cell,
+        tls=target.tls is not None,
+        seconds=elapsed,
+        messages=messages,
+        lost=sum(flow.missing for flow in run.flows),
+        rate=messages / elapsed,
+        cpu_us=1e6 * cpu / messages if target.pids and messages else None,
+        p50_us=1e6 * percentile(run.latencies(), 0.50),
+        p99_us=1e6 * percentile(run.latencies(), 0.99),
+        beside_us=1e6 * percentile(bystander.latencies, 0.99),
         broker_busy=cpu / elapsed if target.pids else None,
         generator_busy=generator / elapsed,
     )
@@ -447,7 +579,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("cell", choices=CELLS, metavar="CELL", help=", ".join(CELLS))
     Target.add_options(parser)
-    parser.add_argument("--seconds", type=float, default=3.0, help="time to measure (default: 3)")
+    parser.add_argument("--seconds", type=float, default=RUN_SECONDS, help="time to measure")
     parser.add_argument("--no-pin", action="store_true", help="leave both to the scheduler")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     tuning = parser.add_argument_group("to change the cell")
@@ -474,6 +606,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         spin = not options.no_pin and pin(target.pids)
         if load.idle:
             result = run_idle(options.cell, target, load, options.seconds)
+        elif load.flood:
+            result = run_flood(options.cell, target, load, options.seconds, spin)
         else:
             result = run_messages(options.cell, target, load, options.seconds, spin)
     except (LoadError, OSError) as error:

@@ -52,6 +52,7 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
     "retained_bytes": "1 GiB",
     "memory": "1 GiB",
 }
+QUEUES = f"max_inflight_messages {INFLIGHT}\nmax_queued_messages 0"  # of mosquitto
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
 START_SECONDS = 20.0
 STOP_SECONDS = 10.0
@@ -127,8 +128,11 @@ def mosquitto_version(command: str) -> str:
 
 
 @contextlib.contextmanager
-def mosquitto(command: str, site: Site) -> Iterator[Server]:
-    """Run mosquitto; it is stopped in the end. Raises PeerError."""
+def mosquitto(command: str, site: Site, *, usual: bool = False) -> Iterator[Server]:
+    """Run mosquitto, with its usual queue and window or larger ones; it is stopped in the end.
+
+    Raises PeerError.
+    """
     directory = Path(tempfile.mkdtemp(prefix="mosquitto-", dir=site.directory))
     (directory / "acl").write_text(ACL)
     salt = secrets.token_bytes(12)
@@ -149,8 +153,7 @@ persistence false
 log_dest stderr
 log_type error
 log_type warning
-max_inflight_messages {INFLIGHT}
-max_queued_messages 0
+{"" if usual else QUEUES}
 listener {port} 127.0.0.1
 listener {tls_port} 127.0.0.1
 certfile {site.directory / "server.crt"}
@@ -170,8 +173,13 @@ def appliance(
     routes: Sequence[Mapping[str, object]],
     environment: Mapping[str, str],
     durability: str = "off",
+    *,
+    usual: bool = False,
 ) -> Iterator[Server]:
-    """Run this appliance, with a bridge when there are routes; stopped in the end. PeerError."""
+    """Run this appliance, with a bridge when there are routes; it is stopped in the end.
+
+    Its limits are raised, unless it is to have the usual ones. Raises PeerError.
+    """
     directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
     passwords = Passwords(directory / "users.passwd")
     passwords.set(USER, site.password)
@@ -193,7 +201,7 @@ def appliance(
                 "ca": str(site.ca),
                 "client_certificates": "off",
             },
-            "limits": {"inflight": INFLIGHT, **LIMITS},
+            "limits": {} if usual else {"inflight": INFLIGHT, **LIMITS},
             "store": {"durability": durability},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},

@@ -22,6 +22,7 @@ HEADINGS = {
     "rate": "messages/s",
     "p50_us": "p50 µs",
     "p99_us": "p99 µs",
+    "beside_us": "p99 µs of another client",
     "memory_kib": "KiB",
 }
 WIDTH_ELSEWHERE = 200  # of a file or a pipe, which wraps nothing

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import Protocol, TypeAlias
 
 from appliance.broker.accounts import Account
+from appliance.broker.backpressure import Congestion
 from appliance.broker.complaints import Complaints
 from appliance.broker.faults import Faults
 from appliance.broker.ledger import Ledger
@@ -554,6 +555,24 @@ class Broker:
             is_taken |= bool(asked) and share not in full
             is_taken |= any(not qos and session.link is not None for session, qos, _, _ in members)
         return frozenset(full), bool(full) and not is_taken
+
+    def congestions(self, route: Route, message: Message) -> list[Congestion]:
+        """Those readers of a QoS 1 or 2 message that have no room for it, but soon will.
+
+        Of a group that is one of these if nobody in it has room.
+        """
+        size = message.size
+        full = [
+            session
+            for session, qos, _, _ in route.targets
+            if qos and session.link is not None and session.is_full(size)
+        ]
+        for _, members in route.shares:
+            asked = [session for session, qos, _, _ in members if qos and session.link is not None]
+            if all(session.is_full(size) for session in asked):
+                full += asked
+        congestions = [session.congestion for session in full]
+        return [each for each in congestions if each is not None and each.patience()]
 
     def must_store(self, route: Route, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""

@@ -8,10 +8,17 @@ from __future__ import annotations
 import logging
 import math
 import uuid
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeAlias
 
-from appliance.broker.broker import Broker
+from appliance.broker.backpressure import (
+    MESSAGE_PATIENCE,
+    PUBLISHER_PATIENCE,
+    Allowance,
+    Congestion,
+)
+from appliance.broker.broker import LATE, Broker
 from appliance.broker.handshake import (
     agree,
     connack_properties,
@@ -20,7 +27,7 @@ from appliance.broker.handshake import (
     pending_will,
 )
 from appliance.broker.ledger import EFFORT_A_TURN
-from appliance.broker.message import Late, Message
+from appliance.broker.message import OVERHEAD, Late, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
 from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
 from appliance.broker.routing import Route
@@ -35,7 +42,7 @@ from appliance.mqtt.codec import (
     Property,
     quote,
 )
-from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, RawPublish
+from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, Event, RawPublish
 from appliance.mqtt.packets import (
     Auth,
     Connack,
@@ -62,8 +69,36 @@ PACKET_EFFORT = 5
 #: And of the end of a connection that broke the protocol.
 FAILURE_EFFORT = 50
 
+#: What is kept behind a message that waits, in packets and in bytes: more than most clients have on
+#: their way, so that what they acknowledge among it is not kept waiting, too.
+BEHIND = 64
+BEHIND_BYTES = 64 * 1024
+
+#: Seconds after which it is looked at the earliest how long a message may still wait.
+LOOK_AGAIN = 0.01
+
+#: What may have to wait behind a message: a packet, or a PUBLISH that was only taken apart.
+Arrived: TypeAlias = "Packet | RawPublish"
+
 #: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
 HOST_BURST = 100
+
+
+def _size(arrived: Arrived) -> int:
+    """Bytes that are counted for what waits behind a message."""
+    if isinstance(arrived, tuple):
+        return len(arrived[3]) + OVERHEAD
+    return (len(arrived.payload) if isinstance(arrived, Publish) else 0) + OVERHEAD
+
+
+def _late(arrived: Arrived) -> Arrived:
+    """The same as if it had been sent again: who does not carry out what is old is told by that."""
+    if isinstance(arrived, tuple):
+        first, topic_wire, packet_id, payload, head = arrived
+        return first | 8, topic_wire, packet_id, payload, head
+    if isinstance(arrived, Publish):
+        arrived.dup = True
+    return arrived
 
 
 def _reason(code: int, route: Route) -> str:
@@ -106,6 +141,15 @@ class Client:
         self._unfinished_maximum = 0
         self._version = 0
         self._closed = False
+        #: A message that waits for its readers, and what came behind it; each with when it came.
+        self._behind: deque[tuple[Arrived, float]] = deque()
+        self._behind_size = 0  # bytes
+        self._awaited: Sequence[Congestion] = ()
+        self._waits_since = 0.0
+        self._came_at = 0.0  # what had to wait and is tried again; 0 for what comes just now
+        self._allowance = Allowance(PUBLISHER_PATIENCE)
+        self._congested = broker.ledger.congested
+        self._hurries = False
         #: Whether `send_on` will be called anyway.
         self._later = False
 
@@ -123,7 +167,7 @@ class Client:
         connection = self.connection
         effort = counters.effort + EFFORT_A_TURN
         try:
-            for event in connection.receive_data(data):
+            for event in self._passing(data) if self._behind else connection.receive_data(data):
                 self._heard_at = now  # complete packets count, dripping bytes do not
                 if type(event) is tuple:
                     self._on_raw_publish(event)
@@ -144,9 +188,14 @@ class Client:
         except ProtocolError as error:
             counters.effort += FAILURE_EFFORT + connection.effort
             self.fail(error)
+        if self._behind and connection.paused and not self._later and self._work is None:
+            if self._has_place_behind():
+                self.receive(b"")
+                return
+            self.wire.stop_reading()
         if self._store.fresh:
             self._depend()
-        if connection.held != self._held:
+        if connection.held + self._behind_size != self._held:
             self._count_held()
 
     def _depend(self) -> None:
@@ -157,7 +206,7 @@ class Client:
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
         ledger = self._ledger
-        grown = self.connection.held - self._held
+        grown = self.connection.held + self._behind_size - self._held
         self._held += grown
         ledger.take(self.account, grown)
         ledger.input_bytes += grown
@@ -212,6 +261,8 @@ class Client:
             message.wire_head = head
         else:
             message = Late(message, math.inf)
+        if qos and self._congested and self._must_wait(event, message, route):
+            return
         if qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
             return
@@ -246,6 +297,8 @@ class Client:
         ):
             return
         packet_id = packet.packet_id or 0
+        if packet.qos and self._congested and self._must_wait(packet, message, route):
+            return
         if (
             route.allowed  # asked before anything that costs much
             and broker.features.check_payload_format
@@ -298,6 +351,114 @@ class Client:
         """Somebody has answered what a packet waits for."""
         if not self._closed:
             self.later()
+
+    # --- backpressure: see the module of that name ---------------------------------------------
+
+    def _must_wait(self, arrived: Arrived, message: Message, route: Route) -> bool:
+        """Let the message wait if readers have no room for it, and soon will."""
+        congestions = self.broker.congestions(route, message) if route.allowed else []
+        allowance = self._allowance
+        now = self._ledger.now
+        if self._awaited:
+            allowance.change(self._waits_since - now)
+        self._waits_since = now
+        if not congestions or allowance.used_up or self._hurries:
+            allowance.change(MESSAGE_PATIENCE)
+            self._stop_waiting()
+            return False
+        for congestion in self._awaited:
+            if congestion not in congestions:
+                congestion.forget(self)
+        self._awaited = congestions
+        seconds = allowance.left
+        for congestion in congestions:
+            congestion.wait(self)
+            seconds = min(seconds, congestion.left)
+        self.wire.wait(max(seconds, LOOK_AGAIN))
+        # It will come again, and is counted then.
+        self._counters.publish_received -= 1
+        self._counters.publish_bytes_received -= len(message.payload)
+        self._behind.appendleft((arrived, self._came_at or now))
+        self._behind_size += len(message.payload) + OVERHEAD
+        self.connection.pause()
+        return True
+
+    def _stop_waiting(self) -> None:
+        for congestion in self._awaited:
+            congestion.forget(self)
+        self._awaited = ()
+
+    def proceed(self) -> None:
+        """A reader that it waits for has room again."""
+        self.wire.proceed()
+
+    def _has_place_behind(self) -> bool:
+        """Whether more may come behind the message that waits.
+
+        Nothing comes behind what is no PUBLISH, which may change what is to be done with it.
+        """
+        behind = self._behind
+        return (
+            len(behind) < BEHIND
+            and self._behind_size < BEHIND_BYTES
+            and isinstance(behind[-1][0], tuple | Publish)
+            and self._ledger.queued_bytes < self._ledger.memory
+        )
+
+    def _passing(self, data: bytes) -> Iterator[Event]:
+        """What comes in while a message waits, and does not wait behind it.
+
+        These are acknowledgements, for which others wait, and pings.
+        """
+        connection = self.connection
+        if connection.paused and self._has_place_behind():
+            connection.resume()
+        for event in connection.receive_data(data):
+            if isinstance(event, int | Puback | Pubrec | Pubrel | Pubcomp | Pingreq):
+                yield event
+                continue
+            self._heard_at = self._ledger.now
+            self._behind.append((event, self._ledger.now))
+            self._behind_size += _size(event)
+            if not self._has_place_behind():
+                connection.pause()
+
+    def _try_again(self) -> None:
+        """Publish what waits, if anything, and what came behind it, as far as there is room."""
+        behind = self._behind
+        if not behind:
+            return
+        limit = self._counters.effort + EFFORT_A_TURN
+        try:
+            while behind and self._work is None:
+                if self._counters.effort > limit:
+                    self.later()
+                    break
+                left = len(behind) - 1
+                arrived, self._came_at = behind.popleft()
+                self._behind_size -= _size(arrived)
+                if self._ledger.now - self._came_at > LATE:
+                    arrived = _late(arrived)
+                if isinstance(arrived, tuple):
+                    self._on_raw_publish(arrived)
+                else:
+                    self._counters.effort += PACKET_EFFORT
+                    self._on_packet(arrived)
+                if len(behind) > left:
+                    break  # it waits again
+        except ProtocolError as error:
+            self.fail(error)
+        self._came_at = 0.0
+        if self._store.fresh:
+            self._depend()
+
+    def hurry(self) -> None:
+        """The connection is lost: what came over it is done without waiting for anybody."""
+        self._hurries = True
+        while self._behind and self._work is None:
+            self._try_again()
+        if self._work is None and self.connection.paused:
+            self.connection.resume()
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
@@ -693,8 +854,11 @@ class Client:
             self.session.take_turn()
             if self._work is not None:
                 self._go_on(self._work)
+            if self._work is None and not self._later:
+                self._try_again()
             if self._work is None and self.connection.paused:
-                self.connection.resume()
+                if not self._behind:
+                    self.connection.resume()
                 self.receive(b"")
 
     def _send(self, packet: Packet) -> None:
@@ -784,6 +948,8 @@ class Client:
 
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
+        if self._behind:
+            self._heard_at = now  # it is not read to the end
         if not self._silence or self._is_awaiting or now - self._heard_at <= self._silence:
             return False
         self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
@@ -800,6 +966,9 @@ class Client:
     def _shut(self) -> None:
         self._closed = True
         self._work = None
+        self._stop_waiting()
+        self._behind.clear()
+        self._behind_size = 0
         self.connection.close()
         self._ledger.take(self.account, -self._held)
         self._ledger.input_bytes -= self._held

@@ -71,10 +71,13 @@ class Ledger:
     queued_bytes: int = 0
     #: Among these, what came from clients and is not done with: parts of packets, topic aliases.
     input_bytes: int = 0
+    #: Connected readers whose queues are more than half full, and that publishers may wait for.
+    congested: dict[Session, None] = field(default_factory=dict)
     #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
     overflowed: list[Session] = field(default_factory=list)
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
+    half_queue: int = field(init=False)
     memory: int = field(init=False)
     #: As long as no more than this is in use, in bytes, nobody has to be asked who they are.
     plenty: int = field(init=False)
@@ -88,6 +91,8 @@ class Ledger:
     refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
+    #: Seconds that the broker has worked, and not waited for something to do.
+    busy: Callable[[], float] = field(default=lambda: 0.0)
 
     def __post_init__(self) -> None:
         self.use(self.limits)
@@ -96,6 +101,7 @@ class Ledger:
         """Measure by these limits from now on."""
         self.limits = limits
         self.queue_bytes = limits.queue_bytes
+        self.half_queue = limits.queue_bytes // 2
         # An eighth is set apart, so that those who hold much do not starve those who hold little.
         self.memory = limits.memory * 7 // 8
         self.reserve = limits.memory // 8 // limits.connections

@@ -371,6 +371,15 @@ class Wire(Protocol):
     def later(self) -> None:
         """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
 
+    def stop_reading(self) -> None:
+        """Read nothing more until the next `Client.send_on`."""
+
+    def wait(self, seconds: float) -> None:
+        """Call `Client.send_on` after so many seconds, if not before; read on until then."""
+
+    def proceed(self) -> None:
+        """What it waits for is there: call `Client.send_on` when others had their turn."""
+
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, one behind the other."""
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from appliance.broker.backpressure import Congestion
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Link
@@ -96,6 +97,7 @@ class Session:
         "batch",
         "bytes",
         "client_id",
+        "congestion",
         "connected_at",
         "ended_well",
         "ends_at",
@@ -151,6 +153,8 @@ class Session:
         self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
+        #: While publishers may have to wait for its client.
+        self.congestion: Congestion | None = None
         #: Retained messages of new subscriptions, by filter; they go before anything newer. They
         #: are looked up when their turn comes, so that a slow client's take no memory.
         self.replays: dict[str, Iterator[Delivery | None]] = {}
@@ -227,12 +231,12 @@ class Session:
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
-        # `_fits` and `_count`, written out here and in `_send`: two calls less a message.
+        # `fits` and `_count`, written out here and in `_send`: two calls less a message.
         ledger = self.ledger
         size = message.size
         if (
-            self.bytes + size <= ledger.queue_bytes and ledger.queued_bytes + size <= ledger.plenty
-        ) or self.fits(size):
+            self.bytes + size <= ledger.half_queue and ledger.queued_bytes + size <= ledger.plenty
+        ) or self._fits_tightly(size):
             if (
                 link is not None
                 and link.writable
@@ -288,6 +292,8 @@ class Session:
         message.settle()
         self._count(message)
         self.queue.append(delivery)
+        if self.congestion is None and 2 * len(self.queue) > self.ledger.limits.queue_messages:
+            self._congest()
         return True
 
     def _staged(self) -> None:
@@ -336,6 +342,8 @@ class Session:
             self._pump_queue(link)
         if self.latest or self.large:
             self._pump_latest(link)
+        if self.congestion is not None:
+            self._relieve(self.congestion)
         if self.unchecked and not (self.queue or self.latest or self.large or self.resends):
             self.unchecked = False
 
@@ -415,6 +423,8 @@ class Session:
                     self._settled(delivery)
                     self._drop(delivery[0])
             self.queue = kept
+            if self.congestion is not None:
+                self._relieve(self.congestion)
         return dropped
 
     def open_window(self, size: int) -> None:
@@ -462,6 +472,10 @@ class Session:
                 self.resends.append(packet_id)
             elif not (self.expiry and self.ledger.failing):
                 link.pubrel(packet_id)
+        if self.congestion is not None:
+            self.congestion.resume()
+        elif self._is_crowded():
+            self._congest()
         self.pump()
 
     def _send(self, link: Link, delivery: Delivery) -> None:
@@ -586,7 +600,10 @@ class Session:
         self.ledger.queued_bytes -= size
         if self.expiry:
             self.ledger.store.settled(self, delivery)
-        if self.queue or self.replays or self.resends:
+        congestion = self.congestion
+        if congestion is not None:
+            congestion.acknowledged(size)
+        if self.queue or self.replays or self.resends or congestion is not None:
             self.pump()
         return True
 
@@ -611,6 +628,9 @@ class Session:
         else:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
+            if self.congestion is not None:
+                self.congestion.acknowledged(delivery[0].size)
+                self._relieve(self.congestion)
             if self.expiry:
                 self._staged()
                 self.ledger.store.recorded(self, delivery, packet_id)
@@ -702,6 +722,41 @@ class Session:
             )
         )
 
+    # --- backpressure --------------------------------------------------------------------------
+
+    def is_full(self, size: int) -> bool:
+        """Whether a QoS 1 or 2 message of so many bytes finds no room in the queue, or only such
+        as others wait for."""
+        return (
+            len(self.queue) >= self.ledger.limits.queue_messages
+            or not self.fits(size)
+            or (self.congestion is not None and self.congestion.awaited)
+        )
+
+    def _is_crowded(self) -> bool:
+        """Whether the queue is more than half full."""
+        ledger = self.ledger
+        return 2 * len(self.queue) > ledger.limits.queue_messages or self.bytes > ledger.half_queue
+
+    def _fits_tightly(self, size: int) -> bool:
+        """`fits`, for a message with which the session takes more than half of what it may."""
+        if self.congestion is None and self.bytes + size > self.ledger.half_queue:
+            self._congest()
+        return self.fits(size)
+
+    def _congest(self) -> None:
+        if self.link is not None and self.identity is not None:
+            self.congestion = Congestion(self, self.ledger)
+
+    def _relieve(self, congestion: Congestion) -> None:
+        """Let publishers go on when half of the queue is free, and forget all when it is empty."""
+        if self._is_crowded():
+            return
+        congestion.wake()
+        if not self.queue:
+            congestion.end()
+            self.congestion = None
+
     def _take(self, size: int) -> None:
         self.bytes += size
         self.account.bytes += size
@@ -731,11 +786,18 @@ class Session:
             else:
                 kept.append(delivery)
         self.queue = kept
+        if self.congestion is not None:
+            self._relieve(self.congestion)
 
     # --- the session's end ---------------------------------------------------------------------
 
     def forget_transient(self) -> None:
-        """Drop what does not outlive the connection: QoS 0, and what is known of its topics."""
+        """Drop what does not outlive the connection: QoS 0, and what is known of its topics.
+
+        Nobody waits for a client that is not there.
+        """
+        if self.congestion is not None:
+            self.congestion.end()
         for waiting in (self.latest, self.large):
             for delivery in waiting.values():
                 self._uncount(delivery[0])
@@ -748,6 +810,9 @@ class Session:
 
     def clear(self) -> None:
         """Give back all that this session holds."""
+        if self.congestion is not None:
+            self.congestion.end()
+            self.congestion = None
         self._take(-self.bytes)
         self.will = None
         self.subscriptions.clear()

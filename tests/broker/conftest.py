@@ -174,6 +174,9 @@ class FakeWire:
         self.laters = 0
         #: Whether the network takes no more; then `caught_up` is the client's to be called.
         self.behind = False
+        #: Whether it is not read until its next turn, and for how long it waits for that at most.
+        self.stopped = False
+        self.waits: float | None = None
 
     def authenticate(self, connect: Connect) -> None:
         self.asked = connect
@@ -204,6 +207,16 @@ class FakeWire:
 
     def withhold(self, seconds: float) -> None:
         pass
+
+    def stop_reading(self) -> None:
+        self.stopped = True
+
+    def wait(self, seconds: float) -> None:
+        self.waits = seconds
+
+    def proceed(self) -> None:
+        self.laters += 1
+        self.waits = None
 
     def write(self, chunks: list[bytes]) -> None:
         assert not self.closed, "written to after the close"
@@ -236,6 +249,20 @@ class Peer:
             b"".join(p if isinstance(p, bytes) else p.encode(self.version) for p in packets)
         )
         self.broker.flush()
+
+    def go_on(self) -> None:
+        """Take the turn that was asked for, or is due."""
+        self.wire.laters = 0
+        self.wire.stopped = False
+        self.client.send_on()
+        self.broker.flush()
+
+    def wait(self) -> None:
+        """Let the time pass that what it published waits for its readers at most."""
+        while self.wire.waits is not None:
+            self.broker.ledger.now += self.wire.waits
+            self.wire.waits = None
+            self.go_on()
 
     def received(self) -> list[Packet]:
         """The packets that came since this was last asked."""
@@ -351,6 +378,7 @@ class Peer:
         """PUBLISH, and the exchange that its QoS asks for; returns the code of the answer."""
         packet_id = self.next_id() if qos else None
         self.send(Publish(topic, payload, qos, retain, False, packet_id, properties))
+        self.wait()
         if not qos:
             return 0
         answers = [p for p in self.received() if isinstance(p, Puback | Pubrec) or self._keep(p)]

@@ -1,0 +1,150 @@
+"""Backpressure: a publisher that is faster than its readers waits for them, within limits.
+
+When a QoS 1 or 2 message finds the queue of a connected reader full, it waits, and what its
+publisher sends behind it: both are acknowledged later, and the publisher is read later. So nothing
+is lost between two clients that both read. Rules say for how long; then `queue_full` decides.
+
+* A reader is waited for as long as its queue drains within PATIENCE at the pace of its
+  acknowledgements; the time in which the broker was busy does not count. Who reads nothing holds
+  its publishers for PATIENCE, once, until its queue was empty; who reads too slowly, for little
+  longer.
+* A publisher is held by all its readers together for no more than PUBLISHER_PATIENCE at once, and
+  in the long run MESSAGE_PATIENCE a message: readers that conspire slow it to 100 messages a
+  second, and no further.
+* Nobody else waits: other publishers, a publisher's messages of QoS 0 that came before, and what a
+  publisher acknowledges meanwhile, so that two that publish to each other drain each other's queue.
+
+What the appliance publishes itself (the bridge, wills, plugins) never waits.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from appliance.broker.ledger import Ledger
+    from appliance.broker.session import Session
+
+#: Seconds in which a full queue has to drain for its reader to be waited for.
+PATIENCE = 0.25
+
+#: Seconds that a publisher waits at most at once, whatever the number of its readers, and that each
+#: of its messages gives back.
+PUBLISHER_PATIENCE = 1.0
+MESSAGE_PATIENCE = 0.01
+
+
+class Waiting(Protocol):
+    """A publisher that waits."""
+
+    def proceed(self) -> None:
+        """Try again in a turn of its own."""
+
+
+class Allowance:
+    """Seconds that may be waited: spent by waiting, earned by what gets on.
+
+    Once used up it has to be half full again, so that nobody waits a little for every message.
+    """
+
+    __slots__ = ("_most", "left", "used_up")
+
+    def __init__(self, most: float) -> None:
+        self._most = self.left = most
+        self.used_up = False
+
+    def change(self, seconds: float) -> None:
+        """Earn so many seconds, or, below zero, spend them."""
+        self.left = min(max(self.left + seconds, 0.0), self._most)
+        if not self.left:
+            self.used_up = True
+        elif 2 * self.left >= self._most:
+            self.used_up = False
+
+
+class Congestion:
+    """A connected reader's queue, from when it is more than half full until it is empty."""
+
+    __slots__ = (
+        "_a_byte",
+        "_a_message",
+        "_allowance",
+        "_busy",
+        "_earned",
+        "_ledger",
+        "_looked_at",
+        "_session",
+        "_waiting",
+        "awaited",
+    )
+
+    def __init__(self, session: Session, ledger: Ledger) -> None:
+        self._session = session
+        self._ledger = ledger
+        self._a_message = PATIENCE / ledger.limits.queue_messages
+        self._a_byte = PATIENCE / ledger.limits.queue_bytes
+        self._allowance = Allowance(PATIENCE)
+        self._looked_at = ledger.now
+        self._busy = ledger.busy()
+        self._earned = 0.0  # since it was looked at
+        #: Those who wait, in the order in which they came.
+        self._waiting: dict[Waiting, None] = {}
+        #: Whether somebody waits for room and was not told yet that there is some.
+        self.awaited = False
+        ledger.congested[session] = None
+
+    def acknowledged(self, size: int) -> None:
+        """The reader has a message of so many bytes."""
+        by_size = size * self._a_byte
+        self._earned += by_size if by_size > self._a_message else self._a_message
+        if self._allowance.used_up and self._earned > PATIENCE / 2 and self.patience():
+            self._ledger.congested[self._session] = None
+
+    @property
+    def left(self) -> float:
+        """Seconds that publishers might wait for it when it was looked at last."""
+        return self._allowance.left
+
+    def patience(self) -> float:
+        """Seconds that publishers may wait for this reader from now on."""
+        now, busy = self._ledger.now, self._ledger.busy()
+        allowance = self._allowance
+        # The reader is not to blame for the time in which the broker had others to serve.
+        idle = max(now - self._looked_at - (busy - self._busy), 0.0)
+        allowance.change(self._earned - idle)
+        self._looked_at, self._busy = now, busy
+        self._earned = 0.0
+        if not allowance.used_up:
+            return allowance.left
+        self._ledger.congested.pop(self._session, None)
+        return 0.0
+
+    def wait(self, publisher: Waiting) -> None:
+        """Let a publisher wait, or go on waiting in its place, for `wake`."""
+        self._waiting[publisher] = None
+        self.awaited = True
+
+    def forget(self, publisher: Waiting) -> None:
+        """It does not wait any more."""
+        self._waiting.pop(publisher, None)
+        if not self._waiting:
+            self.awaited = False
+
+    def wake(self) -> None:
+        """There is room again: let those who wait try, in their order."""
+        if self.awaited:
+            self.awaited = False
+            for publisher in self._waiting:
+                publisher.proceed()
+
+    def resume(self) -> None:
+        """The reader has come back, to what is left of the patience with it."""
+        self._looked_at, self._busy = self._ledger.now, self._ledger.busy()
+        self._earned = 0.0
+        if not self._allowance.used_up:
+            self._ledger.congested[self._session] = None
+
+    def end(self) -> None:
+        """The queue is empty, or its reader gone: nobody waits for it."""
+        self._ledger.congested.pop(self._session, None)
+        self.wake()

@@ -1,0 +1,624 @@
+"""Publishers that are faster than their readers: who waits for whom, how long, and who does not.
+
+The clients here are driven in steps of a fake clock: in each one they read what came, acknowledge
+as much as they please, and publish as far as their window goes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from appliance.broker.backpressure import (
+    MESSAGE_PATIENCE,
+    PATIENCE,
+    PUBLISHER_PATIENCE,
+    Allowance,
+    Congestion,
+)
+from appliance.broker.broker import Broker
+from appliance.broker.client import BEHIND
+from appliance.broker.message import Message
+from appliance.broker.ports import InsideLink, Limits
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import (
+    Disconnect,
+    Packet,
+    Pingreq,
+    Pingresp,
+    Puback,
+    Pubcomp,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Suback,
+    Subscribe,
+    Subscription,
+)
+from appliance.mqtt.reason import ReasonCode
+
+from .conftest import FakeStore, Join, Peer, lasting
+
+STEP = 0.001  # seconds
+ALL = 1_000_000
+
+
+class Actor:
+    """A client that reads, acknowledges `pace` messages a step, and publishes."""
+
+    def __init__(
+        self,
+        peer: Peer,
+        topics: Sequence[str] = (),
+        count: int = 0,
+        *,
+        qos: int = 1,
+        window: int = 50,
+        pace: int = ALL,
+    ) -> None:
+        self.peer = peer
+        self.topics = topics
+        self.count = count
+        self.qos = qos
+        self.window = window
+        self.pace = pace
+        self.sent = 0
+        self.acknowledged = 0
+        self.codes: set[int] = set()
+        self.got: list[bytes] = []
+        #: Steps in which something of it was acknowledged.
+        self.moved: list[int] = []
+        self.due: float | None = None
+        self._owed: deque[Packet] = deque()
+        #: What goes out at once, of exchanges of QoS 2.
+        self._steps: list[Packet] = []
+
+    def act(self, step: int) -> None:
+        for packet in self.peer.received():
+            if isinstance(packet, Publish):
+                self.got.append(packet.payload)
+                if packet.packet_id is not None:
+                    kind = Puback if packet.qos == 1 else Pubrec
+                    self._owed.append(kind(packet.packet_id))
+            elif isinstance(packet, Pubrec) and packet.reason_code < 0x80:
+                self._steps.append(Pubrel(packet.packet_id))
+            elif isinstance(packet, Pubrel):
+                self._steps.append(Pubcomp(packet.packet_id))
+            elif isinstance(packet, Puback | Pubcomp | Pubrec):
+                self.codes.add(packet.reason_code)
+                self.acknowledged += 1
+                self.moved.append(step)
+        if self.peer.wire.stopped or self.peer.wire.laters:
+            return  # it is not read
+        answers = [self._owed.popleft() for _ in range(min(self.pace, len(self._owed)))]
+        room = min(self.window - (self.sent - self.acknowledged), self.count - self.sent)
+        room = room if self.topics else 0
+        steps, self._steps = self._steps, []
+        self.peer.send(*steps, *answers, *(self._next() for _ in range(room)))
+
+    def _next(self) -> Publish:
+        topic = self.topics[self.sent % len(self.topics)]
+        self.sent += 1
+        packet_id = self.peer.next_id() if self.qos else None
+        return Publish(topic, b"%d" % (self.sent - 1), self.qos, False, False, packet_id)
+
+    def has_all(self) -> bool:
+        """Whether all it is to publish is acknowledged."""
+        return self.acknowledged == self.count
+
+    @property
+    def done(self) -> bool:
+        return self.acknowledged == self.count and not self._owed
+
+
+def play(
+    broker: Broker, *actors: Actor, until: Callable[[], bool] | None = None, steps: int = 20_000
+) -> int:
+    """Let them act until all are done, or so many steps; returns how many steps that took."""
+    promised = sum(actor.window for actor in actors if actor.qos == 2)
+    for step in range(steps):
+        broker.ledger.now += STEP
+        before = [len(actor.got) for actor in actors]
+        for actor in actors:
+            actor.act(step)
+            take_turn(actor)
+        # A QoS 2 message that there was room for at its PUBREC is kept at its PUBREL.
+        most = broker.limits.queue_messages + promised
+        assert all(len(session.queue) <= most for session in broker.sessions.values())
+        if until is not None:
+            if until():
+                return step
+        elif all(actor.done for actor in actors) and before == [len(a.got) for a in actors]:
+            return step
+    return steps
+
+
+def take_turn(actor: Actor) -> None:
+    """The turn that it asked for, or for which it is time."""
+    wire, now = actor.peer.wire, actor.peer.broker.now
+    if wire.waits is not None:
+        if actor.due is None:
+            actor.due = now + wire.waits
+    else:
+        actor.due = None
+    if wire.laters or (actor.due is not None and actor.due <= now):
+        wire.waits = actor.due = None
+        actor.peer.go_on()
+
+
+def numbers(count: int) -> list[bytes]:
+    return [b"%d" % number for number in range(count)]
+
+
+COUNT = 3000
+
+
+# --- nothing is lost between two that read
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("window", [20, 50, 5000], ids="{} in flight".format)
+def test_a_flood_loses_nothing(join: Join, broker: Broker, version: int, qos: int, window: int):
+    if version == 5 and qos == 2:
+        window = 20  # Receive Maximum
+    reader = join("reader", version=version)
+    reader.subscribe("a", qos)
+    publisher = Actor(join("publisher", version=version), ["a"], COUNT, qos=qos, window=window)
+    slower = Actor(reader, pace=7)
+    play(broker, publisher, slower)
+    assert slower.got == numbers(COUNT)
+    assert publisher.codes == {0} and broker.counters.publish_dropped == 0
+    assert broker.counters.publish_received == COUNT
+    assert not broker.ledger.congested and not publisher.peer.client._behind
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_messages=10, inflight=1)])
+@pytest.mark.parametrize("policy", ["refuse", "drop-oldest", "disconnect"])
+def test_every_policy_is_for_those_who_do_not_read(join: Join, broker: Broker, policy: str):
+    broker.limits = Limits(queue_messages=10, queue_full=policy)
+    broker.use(broker.limits, broker.features)
+    reader = join("reader", properties={Property.RECEIVE_MAXIMUM: 1})
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 500)
+    receiver = Actor(reader, pace=1)
+    play(broker, publisher, receiver)
+    assert receiver.got == numbers(500)
+
+
+@pytest.mark.parametrize("limits", [Limits(queue_bytes=100_000, inflight=20)])
+def test_a_queue_that_is_full_of_bytes_is_waited_for_as_well(join: Join, broker: Broker):
+    """Large messages fill it while they are in flight, with nothing that is queued."""
+    reader = join("reader")
+    reader.subscribe("a", 1)
+    publisher = join("publisher", version=4)
+    receiver = Actor(reader, pace=1)
+    sender = Actor(publisher)
+    for number in range(40):
+        publisher.send(Publish("a", b"%d" % number + bytes(30_000), 1, False, False, number + 1))
+        sender.count = number + 1
+        play(broker, sender, receiver, until=sender.has_all)
+    play(broker, receiver, steps=100)
+    assert [payload.rstrip(b"\0") for payload in receiver.got] == numbers(40)
+    assert not broker.counters.publish_dropped
+
+
+def test_a_message_with_properties_waits_like_any_other(join: Join, broker: Broker):
+    reader = join("reader")
+    reader.subscribe("a", 1)
+    publisher = join("publisher")
+    sender, receiver = Actor(publisher), Actor(reader, pace=20)
+    properties = {Property.CONTENT_TYPE: "text/plain"}
+    for start in range(0, 3000, 20):
+        publisher.send(
+            *(
+                Publish("a", b"%d" % (start + n), 1, False, False, n + 1, dict(properties))
+                for n in range(20)
+            )
+        )
+        sender.count = start + 20
+        play(broker, sender, receiver, until=sender.has_all)
+    play(broker, receiver, steps=200)
+    assert receiver.got == numbers(3000) and not broker.counters.publish_dropped
+
+
+@pytest.mark.parametrize("topic_filter", ["#", "+/x", "$share/group/+/x"])
+def test_many_topics_and_wildcards_and_groups(join: Join, broker: Broker, topic_filter: str):
+    readers = [join(f"reader{n}", version=4) for n in range(2 if "share" in topic_filter else 1)]
+    for reader in readers:
+        reader.subscribe(topic_filter, 1)
+    topics = [f"{number}/x" for number in range(2000)]
+    publisher = Actor(join("publisher", version=4), topics, 4000)
+    receivers = [Actor(reader, pace=6) for reader in readers]
+    play(broker, publisher, *receivers)
+    assert sorted(int(payload) for each in receivers for payload in each.got) == list(range(4000))
+    assert not broker.counters.publish_dropped
+
+
+def test_many_publishers_to_one_reader_take_turns(join: Join, broker: Broker):
+    reader = join("reader", version=4)
+    reader.subscribe("+", 1)
+    publishers = [
+        Actor(join(f"publisher{n}", version=4), [f"{n}"], 400, window=20) for n in range(30)
+    ]
+    receiver = Actor(reader, pace=20)
+    play(broker, *publishers, receiver)
+    assert len(receiver.got) == 30 * 400 and not broker.counters.publish_dropped
+    ends = [publisher.moved[-1] for publisher in publishers]
+    assert min(ends) > 0.5 * max(ends), "nobody is done long before the others"
+
+
+def test_the_store_may_be_behind(join: Join, broker: Broker, store: FakeStore):
+    """PUBACK and what a persistent session is sent wait for commits, three steps each."""
+    reader = join("reader", **lasting(5))
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4, **lasting(4)), ["a"], COUNT)
+    receiver = Actor(reader)
+    clock = 0
+
+    def commit() -> bool:
+        nonlocal clock
+        clock += 1
+        if clock % 3 == 0:
+            store.commit()
+        store.holding = True
+        return publisher.done and len(receiver.got) == COUNT
+
+    play(broker, publisher, receiver, until=commit)
+    assert receiver.got == numbers(COUNT)
+    assert not broker.counters.publish_dropped
+    store.commit()
+
+
+# --- nobody waits for himself
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("size", [1, 2, 3], ids=["to itself", "two", "a ring of three"])
+def test_who_publish_to_each_other_do_not_wait_for_each_other(
+    join: Join, broker: Broker, qos: int, size: int
+):
+    """What they acknowledge is taken in, while what they publish waits."""
+    actors = []
+    for number in range(size):
+        peer = join(f"client{number}", version=4)
+        peer.subscribe(f"{number}", qos)
+        actors.append(Actor(peer, [f"{(number + 1) % size}"], COUNT, qos=qos, pace=10))
+    steps = play(broker, *actors)
+    assert all(actor.got == numbers(COUNT) for actor in actors)
+    assert not broker.counters.publish_dropped
+    assert steps < 2000, "nobody waited for a time to be up"
+
+
+def test_a_ring_of_clients_that_send_without_end_goes_on(join: Join, broker: Broker):
+    """More is on the way than is looked at: then it is the time that ends the waiting."""
+    actors = []
+    for number in range(3):
+        peer = join(f"client{number}", version=4)
+        peer.subscribe(f"{number}", 1)
+        actors.append(Actor(peer, [f"{(number + 1) % 3}"], 20_000, window=10_000, pace=10))
+    play(broker, *actors)
+    assert all(actor.acknowledged == 20_000 for actor in actors)
+    for actor in actors:
+        received = [int(payload) for payload in actor.got]
+        assert received == sorted(set(received)), "in order, and none twice"
+
+
+# --- who does not read
+
+
+def longest_pause(actor: Actor) -> float:
+    """Seconds in which nothing of the actor was acknowledged."""
+    return max(later - earlier for earlier, later in itertools.pairwise(actor.moved)) * STEP
+
+
+def test_who_stops_reading_is_waited_for_once(join: Join, broker: Broker):
+    """… and not again until it has read all that waited for it."""
+    reader = join("reader", version=4)
+    reader.subscribe("#", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 20_000)
+    steps = play(broker, publisher, until=lambda: publisher.done)
+    pauses = [later - earlier for earlier, later in itertools.pairwise(publisher.moved)]
+    paused = [pause for pause in pauses if pause > 2]
+    assert len(paused) == 1 and 0.2 < paused[0] * STEP <= PATIENCE
+    assert steps * STEP < 20_000 / 50 * STEP + PATIENCE + 0.1
+    assert broker.counters.publish_dropped == 20_000 - 1000 - 20
+    assert not broker.ledger.congested, "it costs others nothing more"
+    # It reads again: all that was kept, and then it is waited for as before.
+    publisher.count = 23_000
+    receiver = Actor(reader)
+    play(broker, receiver, steps=100)
+    receiver.pace = 10
+    play(broker, publisher, receiver)
+    assert receiver.got[-3000:] == numbers(23_000)[-3000:]
+
+
+@pytest.mark.parametrize("pace", [1, 2, 3])
+def test_who_reads_too_slowly_is_waited_for_a_little_longer(join: Join, broker: Broker, pace: int):
+    """A pace of 4 a step is the least with which a queue of 1,000 drains in 250 ms."""
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 20_000)
+    receiver = Actor(reader, pace=pace)
+    steps = play(broker, publisher, receiver, until=lambda: publisher.done)
+    assert longest_pause(publisher) <= PATIENCE * 4 / (4 - pace)
+    # Without any waiting these were 400 steps.
+    assert steps * STEP < 0.4 + PATIENCE * 4 / (4 - pace) + 0.1
+    assert broker.counters.publish_dropped > 10_000
+
+
+def test_who_recovers_is_waited_for_again(join: Join, broker: Broker):
+    """A reader that stood still for a moment loses what came then, and nothing later."""
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], ALL)
+    receiver = Actor(reader, pace=0)
+    play(broker, publisher, receiver, steps=600)
+    assert broker.counters.publish_dropped
+    receiver.pace = 30
+    play(broker, publisher, receiver, steps=200)
+    dropped = broker.counters.publish_dropped
+    play(broker, publisher, receiver, steps=1000)
+    assert broker.counters.publish_dropped == dropped
+
+
+def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: Broker):
+    """With many floods at a time each reader gets its part of the processor only."""
+    broker.ledger.busy = lambda: 0.95 * broker.now
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], COUNT)
+    receiver = Actor(reader, pace=1)
+    play(broker, publisher, receiver)
+    assert receiver.got == numbers(COUNT) and not broker.counters.publish_dropped
+
+
+def test_readers_that_conspire_cannot_stop_a_publisher(
+    join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever they invent, to be waited for without end: each message gives it time back."""
+    monkeypatch.setattr(Congestion, "patience", lambda self: PATIENCE)
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], ALL)
+    play(broker, publisher, steps=10_000)
+    assert longest_pause(publisher) <= PUBLISHER_PATIENCE + 5 * STEP
+    seconds = 10_000 * STEP - 2 * PUBLISHER_PATIENCE
+    assert publisher.acknowledged - 1020 > seconds / MESSAGE_PATIENCE
+
+
+def test_to_come_back_is_not_to_read(join: Join, broker: Broker):
+    """What was left of the patience with a reader is left when it comes back."""
+    reader = join("reader", **lasting(5))
+    reader.subscribe("a", 1)
+    reader.lose()
+    publisher = Actor(join("publisher", version=4), ["a"], 2000)
+    play(broker, publisher)
+    steps = []
+    for _ in range(5):
+        reader = join("reader", **lasting(5))
+        publisher.count += 100
+        steps.append(play(broker, publisher))
+        reader.lose()
+    assert PATIENCE / STEP <= steps[0] < PATIENCE / STEP + 10 and max(steps[1:]) < 10
+    receiver = Actor(join("reader", **lasting(5)), pace=20)
+    publisher.count = ALL
+    play(broker, publisher, receiver, steps=200)
+    dropped = broker.counters.publish_dropped
+    play(broker, publisher, receiver, steps=500)
+    assert broker.counters.publish_dropped == dropped
+
+
+def test_an_allowance_that_is_used_up_has_to_be_half_full_again():
+    allowance = Allowance(1.0)
+    allowance.change(-0.9)
+    assert not allowance.used_up
+    allowance.change(-0.2)
+    assert allowance.used_up and allowance.left == 0
+    allowance.change(0.4)
+    assert allowance.used_up
+    allowance.change(0.1)
+    assert not allowance.used_up
+    allowance.change(7)
+    assert allowance.left == 1.0
+
+
+def test_who_leaves_is_not_waited_for(join: Join, broker: Broker):
+    reader = join("reader", **lasting(5))
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 1100)
+    play(broker, publisher, until=lambda: publisher.peer.wire.waits is not None)
+    reader.lose()
+    assert publisher.peer.wire.laters, "at once"
+    play(broker, publisher)
+    assert broker.counters.publish_dropped == 1100 - 1000 - 20
+    assert not broker.ledger.congested
+
+
+def test_an_absent_reader_is_not_waited_for(join: Join, broker: Broker):
+    """queue_full decides for it at once, as it always did."""
+    reader = join("reader", **lasting(5))
+    reader.subscribe("a", 1)
+    reader.lose()
+    publisher = Actor(join("publisher"), ["a"], 2000, window=20)
+    assert play(broker, publisher) < 200
+    assert publisher.codes == {0, ReasonCode.QUOTA_EXCEEDED}
+
+
+# --- everybody else goes on
+
+
+def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
+    """Of 50 readers one is slow: the others have everything, and another publisher goes on."""
+    readers = [join(f"reader{number}", version=4) for number in range(50)]
+    for reader in readers:
+        reader.subscribe("a", 1)
+    readers[0].subscribe("b", 0)
+    other_reader = join("other reader", version=4)
+    other_reader.subscribe("b", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 1500)
+    receivers = [Actor(reader, pace=ALL if index else 0) for index, reader in enumerate(readers)]
+    waits = publisher.peer.wire
+    play(broker, publisher, *receivers, until=lambda: waits.waits is not None)
+    other = Actor(join("other", version=4), ["b"], 500)
+    other_receiver = Actor(other_reader)
+    assert play(broker, other, other_receiver) < 0.2 / STEP
+    assert waits.waits is not None, "it still waits"
+    assert other_receiver.got == numbers(500)
+    play(broker, publisher, *receivers)
+    assert all(receiver.got == numbers(1500) for receiver in receivers[1:])
+
+
+@pytest.fixture
+def waiting(join: Join, broker: Broker) -> Peer:
+    """A publisher that waits, with a message to "a"; packet ids from 10,000 on are free."""
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], 1020)
+    play(broker, publisher, until=lambda: publisher.done)
+    publisher.peer.send(Publish("a", b"waits", 1, False, False, 10_000))
+    assert publisher.peer.received() == []
+    assert publisher.peer.wire.waits is not None and publisher.peer.wire.waits <= PATIENCE
+    return publisher.peer
+
+
+def test_pings_and_acknowledgements_do_not_wait(waiting: Peer, broker: Broker, join: Join):
+    waiting.send(Pingreq(), Publish("b", b"behind", 1, False, False, 10_001), Pingreq())
+    assert waiting.received() == [Pingresp(), Pingresp()]
+    waiting.wait()
+    assert waiting.received() == [Puback(10_000), Puback(10_001)]
+
+
+def test_what_may_change_the_message_waits_behind_it(waiting: Peer):
+    """A SUBSCRIBE that comes later has not the message; a DISCONNECT is not the end of it."""
+    waiting.send(
+        Subscribe(10_001, [Subscription("a", 1)]),
+        Publish("b", b"behind", 1, False, False, 10_002),
+        Disconnect(),
+    )
+    assert waiting.received() == [] and waiting.wire.stopped, "nothing is read behind it"
+    waiting.wait()
+    packets = waiting.received()
+    assert [type(packet) for packet in packets] == [Puback, Suback, Puback]
+    assert waiting.wire.closed
+
+
+def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
+    waiting.send(*(Publish("b", b"", 1, False, False, 10_001 + n) for n in range(BEHIND - 2)))
+    assert not waiting.wire.stopped
+    waiting.send(Publish("b", b"", 1, False, False, 10_100))
+    assert waiting.wire.stopped and len(waiting.client._behind) == BEHIND
+    waiting.send(Publish("b", b"", 1, False, False, 10_101), Pingreq())
+    assert waiting.received() == [], "what comes all the same is kept as bytes"
+    assert broker.ledger.input_bytes >= BEHIND * 512
+    waiting.wait()
+    assert len(waiting.received()) == BEHIND + 2
+    assert broker.ledger.input_bytes == 0
+
+
+def test_a_large_message_behind_it_is_the_last(waiting: Peer):
+    waiting.send(
+        Publish("b", bytes(100_000), 1, False, False, 10_001),
+        Publish("b", b"", 1, False, False, 10_002),
+    )
+    assert waiting.wire.stopped and len(waiting.client._behind) == 2
+    waiting.wait()
+    assert waiting.received() == [Puback(10_000), Puback(10_001), Puback(10_002)]
+
+
+def test_a_lost_connection_ends_the_waiting(waiting: Peer, broker: Broker, join: Join):
+    """What came over it is delivered: who publishes and leaves does not wait for the PUBACK."""
+    other = join("other")
+    other.subscribe("#", 1)
+    waiting.send(
+        Publish("b", b"behind", 1, False, False, 10_001),
+        Disconnect(),
+    )
+    waiting.client.hurry()
+    waiting.client.receive(b"")
+    waiting.lose()
+    assert other.payloads() == [b"waits", b"behind"]
+    assert "publisher" not in broker.sessions
+
+
+def test_a_publisher_that_is_cut_off_is_forgotten(waiting: Peer, broker: Broker):
+    (congested,) = broker.ledger.congested
+    waiting.client.close(ReasonCode.ADMINISTRATIVE_ACTION, "")
+    broker.flush()
+    assert congested.congestion is not None and not congested.congestion._waiting
+    assert broker.ledger.input_bytes == 0
+
+
+def test_wrong_bytes_behind_it_end_the_connection(waiting: Peer, broker: Broker):
+    waiting.send(b"\x00\x00")
+    assert waiting.wire.closed and not waiting.client._behind
+    waiting.go_on()
+
+
+def test_keep_alive_is_for_those_who_are_read(join: Join, broker: Broker):
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4, keep_alive=1), ["a"], 1021)
+    play(broker, publisher, until=lambda: publisher.peer.wire.waits is not None)
+    broker.tick(broker.now + 2)
+    assert not publisher.peer.wire.closed
+    publisher.peer.wait()
+    broker.tick(broker.now + 2)
+    assert publisher.peer.wire.closed, "it is silent now"
+
+
+def test_what_the_appliance_publishes_itself_never_waits(join: Join, broker: Broker):
+    """The bridge has queues of its own, and ROS does not wait."""
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    bridge = broker.attach("_bridge", InsideLink())
+    codes = [broker.publish(Message("a", b"", 1), bridge) for _ in range(1200)]
+    broker.flush()
+    assert codes == [0] * 1020 + [ReasonCode.QUOTA_EXCEEDED] * 180
+
+
+@pytest.mark.parametrize("properties", [None, {Property.CONTENT_TYPE: "text/plain"}])
+def test_what_has_waited_is_old_for_who_does_not_carry_out_what_is_old(
+    waiting: Peer, broker: Broker, properties: dict[Property, str] | None
+):
+    """Such as a route to ROS; for clients it is as any other."""
+    ages = {}
+
+    class Route(InsideLink):
+        def publish(self, message, qos, packet_id, dup, retain, subscription_ids) -> None:
+            ages[message.payload] = message.age
+
+    bridge = broker.attach("_bridge", Route())
+    broker.subscribe(bridge, Subscription("#", 0))
+    waiting.send(Publish("b", b"behind", 1, False, False, 10_001, properties), Publish("b", b"0"))
+    waiting.wait()
+    waiting.send(Publish("b", b"later", 1, False, False, 10_002, properties))
+    assert ages == {b"waits": math.inf, b"behind": math.inf, b"0": math.inf, b"later": 0}
+    broker.detach(bridge)
+
+
+def test_qos_0_waits_behind_what_came_before(waiting: Peer, join: Join):
+    other = join("other")
+    other.subscribe("#", 0)
+    waiting.send(Publish("b", b"behind"))
+    assert other.payloads() == []
+    waiting.wait()
+    assert other.payloads() == [b"waits", b"behind"]
+
+
+def test_a_session_that_moves_to_another_connection_is_waited_for(join: Join, broker: Broker):
+    """A reader that is taken over in the middle of a flood."""
+    reader = join("reader", version=4, **lasting(4))
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], COUNT)
+    receiver = Actor(reader, pace=5)
+    play(broker, publisher, receiver, steps=150)
+    again = Actor(join("reader", version=4, **lasting(4)), pace=5)
+    play(broker, publisher, again)
+    got = set(receiver.got) | set(again.got)
+    missing = COUNT - len(got)
+    assert missing <= 1, "the message that waited at that moment"
+    assert broker.sessions["reader"].congestion is None
