@@ -7,7 +7,7 @@ import re
 import secrets
 import socket
 import string
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,10 +120,12 @@ def initialise(
     user: str = "operator",
     demo: bool = False,
     configuration: str = CONFIGURATION,
+    names: Sequence[str] = (),
 ) -> Iterator[Step | Credentials]:
     """Makes what is missing in `directory`, telling each step as it is done.
 
-    `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none.
+    `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none;
+    `names` are DNS names for the server's certificate beside those that this computer knows.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
     made until then is good and stays.
@@ -141,7 +143,7 @@ def initialise(
     if robot and not made and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")
     yield Step(file, made, f"configuration of robot {settings.robot!r}")
-    yield from _certificates(settings)
+    yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
     yield Step(settings.broker.acl, made, "access rules")
@@ -191,7 +193,7 @@ def _filter(part: str) -> str:
     return "+" if "*" in part else part
 
 
-def _certificates(settings: config.Settings) -> Iterator[Step]:
+def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[Step]:
     tls = settings.broker.tls
     directory = tls.certificate.parent
     authority, readme = directory / "ca.crt", directory / "README.md"
@@ -205,10 +207,11 @@ def _certificates(settings: config.Settings) -> Iterator[Step]:
             "files that this command makes (server.crt, server.key, ca.crt in one directory)"
         )
     made = not authority.exists()
-    if made:
-        certs.create_authority(directory, settings.robot)
-    yield Step(authority, made, "this appliance's own CA, for every client")
     names, addresses = certs.local_names()
+    names += [name for name in more_names if name not in names]
+    if made:
+        certs.create_authority(directory, settings.robot, names, addresses)
+    yield Step(authority, made, "this appliance's own CA, for every client")
     certs.issue_server(directory, names, addresses)
     known = ", ".join([*names, *map(str, addresses)])
     yield Step(tls.certificate, True, f"the server's certificate, for {known}")

@@ -216,7 +216,7 @@ class MosquittoProcess(BrokerProcess):
         super().__init__(directory)
         self.passwords = dict(users)
         names, addresses = certs.local_names()
-        certs.create_authority(directory / "certs", "mosquitto")
+        certs.create_authority(directory / "certs", "mosquitto", names, addresses)
         certs.issue_server(directory / "certs", names, addresses)
         (directory / "acl.conf").write_text(acl.replace("{robot}", ROBOT))
         passwords = directory / "users.passwd"

@@ -28,7 +28,7 @@ from .files import CertificateError, issued_by, load_certificates, load_key
 from .identity import username_of
 from .listing import Ending, Listed, endings, listed
 from .registry import Issued
-from .renewal import keep_server_certificate
+from .renewal import keep_server_certificate, server_outside, server_revoked
 from .requests import REQUEST_SIZE
 
 __all__ = [
@@ -59,6 +59,8 @@ __all__ = [
     "renew",
     "revoke",
     "server_context",
+    "server_outside",
+    "server_revoked",
     "sign",
     "username_of",
     "write_bundle",

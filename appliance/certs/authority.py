@@ -30,6 +30,7 @@ from appliance.owners import acting_as_caller
 
 from . import readme, registry
 from .addresses import DNS_NAME, Address
+from .constraints import constraints, misleading, outside
 from .files import (
     CertificateError,
     issued_by,
@@ -64,9 +65,15 @@ _RESERVED: Final = ("server", "all", "ca")
 _SERIAL: Final = re.compile(r"(?:0x)?((?:[0-9A-Fa-f]{2}:?){8,20})")
 
 
-def create_authority(directory: Path, name: str | None = None) -> None:
+def create_authority(
+    directory: Path,
+    name: str | None = None,
+    names: Sequence[str] = (),
+    addresses: Sequence[Address] = (),
+) -> None:
     """Makes `ca.crt` and `ca.key`. `name`, by default the host's, is for people who look at it.
 
+    It may sign for private names and addresses, and for these, see `constraints`.
     CertificateError when either file is there.
     """
     certificate_file, key_file = directory / "ca.crt", directory / "ca.key"
@@ -86,6 +93,7 @@ def create_authority(directory: Path, name: str | None = None) -> None:
         _builder(subject, subject, key.public_key(), now, now + AUTHORITY_VALID)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
+        .add_extension(constraints(names, addresses), critical=False)
         .add_extension(
             x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier),
             critical=False,
@@ -117,14 +125,28 @@ def issue_server(
     alternatives += [x509.IPAddress(address) for address in dict.fromkeys(addresses)]
     if not alternatives:
         raise CertificateError("a server's certificate needs a name or an address")
-    first = names[0] if names else str(addresses[0])
+    # An address as the common name would be taken for a DNS name.
+    first = names[0] if names else "server"
     with _opened(directory, ca_key) as authority:
+        refused = outside(authority.certificate, [*names, *addresses])
+        if refused:
+            raise CertificateError(may_not_sign(directory, refused))
         authority.certify(
             directory / "server",
             first[:_MAX_COMMON_NAME],
             "server",
             x509.SubjectAlternativeName(alternatives),
         )
+
+
+def may_not_sign(directory: Path, subjects: Sequence[str]) -> str:
+    """What to say of names and addresses that are outside of the authority's constraints."""
+    return (
+        f"{directory / 'ca.crt'} may sign for private names and addresses, and those that this "
+        f"computer had when it was made; not for {', '.join(subjects)}. For these make a new "
+        f"authority: move ca.crt, ca.key, server.crt and server.key away, `appliance init --name "
+        f"{subjects[0]}`, and give the new ca.crt to all clients"
+    )
 
 
 def issue_client(directory: Path, name: str, ca_key: Path | None = None) -> None:
@@ -164,7 +186,8 @@ def sign(
 def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
     """Makes `server.crt`, or `clients/NAME.crt`, anew for the same key and names.
 
-    CertificateError when it is not there, was revoked or is someone else's.
+    A server's that was revoked gets a new key. CertificateError when it is not there, is a client's
+    that was revoked, or is someone else's.
     """
     if name == "server":
         path = directory / "server"
@@ -179,9 +202,10 @@ def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
     with _opened(directory, ca_key) as authority:
         before = load_certificates(certificate_file)[0]
         kind: Kind = "server" if name == "server" else "client"
-        authority.certify(
-            path, common_name(before) or name, kind, _alternatives(before), before.public_key()
-        )
+        key: CertificatePublicKeyTypes | None = before.public_key()
+        if name == "server" and authority.is_compromised(before.public_key()):
+            key = None  # the key is here, so a new one is made
+        authority.certify(path, common_name(before) or name, kind, _alternatives(before), key)
 
 
 def revoke(directory: Path, what: str, ca_key: Path | None = None) -> list[Issued]:
@@ -269,13 +293,18 @@ class _Authority:
                     f"{certificate_file} is not of this appliance's authority; move it away first"
                 )
             self._check_same_key(certificate_file, before, key)
+        if kind == "client" and misleading(self.certificate, common_name):
+            raise CertificateError(
+                f"{common_name!r} looks like a DNS name, for which this authority may not sign; "
+                f"write {common_name.replace('.', '-')}"
+            )
         new: ec.EllipticCurvePrivateKey | None = None
         if key is None:
             own = self._own_key(key_file)
             if own is None:
                 own = new = ec.generate_private_key(ec.SECP256R1())
             key = own.public_key()
-        elif self._is_compromised(key):
+        elif self.is_compromised(key):
             raise CertificateError(
                 f"the key of {path.name!r} was revoked with its certificate; a new key is needed"
             )
@@ -292,7 +321,7 @@ class _Authority:
     def _check_same_key(
         self, file: Path, before: x509.Certificate, key: CertificatePublicKeyTypes | None
     ) -> None:
-        if key is None or key == before.public_key() or self._is_compromised(before.public_key()):
+        if key is None or key == before.public_key() or self.is_compromised(before.public_key()):
             return
         raise CertificateError(
             f"{file} is of another key; revoke it first, or give this client another name"
@@ -305,9 +334,9 @@ class _Authority:
         key = load_key(file)
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise CertificateError(f"{file} must be an elliptic curve key, as made here")
-        return None if self._is_compromised(key.public_key()) else key
+        return None if self.is_compromised(key.public_key()) else key
 
-    def _is_compromised(self, key: CertificatePublicKeyTypes) -> bool:
+    def is_compromised(self, key: CertificatePublicKeyTypes) -> bool:
         """Whether a certificate of this key was revoked: who has that device has the key."""
         revoked = {entry.key for entry in self.entries if entry.revoked is not None}
         return fingerprint(key) in revoked

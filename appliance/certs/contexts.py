@@ -459,6 +459,12 @@ def _warnings(loaded: LoadedTls, now: datetime) -> Iterator[str]:
     end = min(certificate.not_valid_after_utc for certificate in loaded.chain)
     if now <= end < now + EXPIRES_SOON:
         yield f"{files.certificate} expires on {end:%Y-%m-%d}; renew it"
+    date = loaded.revocations.date(loaded.chain[0])
+    if date is not None:
+        yield (
+            f"{files.certificate} was revoked on {date:%Y-%m-%d}: clients that look at the list "
+            "refuse it; `appliance cert renew server` makes one with a new key"
+        )
     for authority in loaded.authorities:
         end = authority.not_valid_after_utc
         if now <= end < now + EXPIRES_SOON:

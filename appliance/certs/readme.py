@@ -14,7 +14,8 @@ _README: Final = """\
 Made on this computer. None of it belongs into a repository, a chat or a ticket, except `ca.crt`.
 
 - `ca.crt`: the certificate of this appliance's own authority, by which clients know the robot.
-  **Everyone** may have it, and every client needs it.
+  **Everyone** may have it, and every client needs it. It may sign for private names and addresses,
+  and those that this computer had when it was made; not for other sites.
 - `ca.key`: its key. Whoever has it can pose as the robot, and as any client. **Nobody** gets it.
   It is only needed to make and revoke certificates: you may keep it elsewhere until then
   (`--ca-key FILE`). The server's certificate then does not renew itself.

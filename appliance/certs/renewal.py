@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -12,9 +14,12 @@ from cryptography import x509
 from appliance.clock import is_unset
 
 from .addresses import Address, local_names
-from .authority import issue_server, issued
+from .authority import issue_server, issued, may_not_sign
+from .constraints import outside
 from .contexts import EXPIRES_SOON, TlsFiles
 from .files import issued_by, load_certificates, usable_time
+
+log = logging.getLogger("appliance.certs")
 
 #: Names, and addresses, in one certificate. Those of before stay, as long as there is room: an
 #: interface that is down now comes up again.
@@ -38,7 +43,13 @@ def keep_server_certificate(files: TlsFiles) -> str:
         return ""
     certificate = load_certificates(files.certificate)[0]
     authority = load_certificates(directory / "ca.crt")[0]
-    names, addresses = (found[:_MOST] for found in local_names())
+    names, addresses = local_names()
+    names, addresses = names[:_MOST], addresses[:_MOST]
+    refused = outside(authority, [*names, *addresses])
+    if refused:
+        _tell_outside(may_not_sign(directory, refused))
+        names = [name for name in names if name not in refused]
+        addresses = [address for address in addresses if str(address) not in refused]
     old_names, old_addresses = _subjects(certificate)
     reason = ""
     if any(e.serial == certificate.serial_number and e.revoked for e in issued(directory)):
@@ -58,6 +69,36 @@ def keep_server_certificate(files: TlsFiles) -> str:
             list(dict.fromkeys([*addresses, *old_addresses]))[:_MOST],
         )
     return reason
+
+
+def server_outside(files: TlsFiles) -> str:
+    """What to say when the authority may not sign for all that this computer is called."""
+    directory = files.certificate.parent
+    if not _is_ours(files, directory):
+        return ""
+    names, addresses = local_names()
+    refused = outside(load_certificates(directory / "ca.crt")[0], [*names, *addresses])
+    return may_not_sign(directory, refused) if refused else ""
+
+
+def server_revoked(files: TlsFiles) -> str:
+    """What to say when the server's certificate, one of ours, was revoked; else empty."""
+    directory = files.certificate.parent
+    if not _is_ours(files, directory):
+        return ""
+    serial = load_certificates(files.certificate)[0].serial_number
+    if not any(entry.serial == serial and entry.revoked for entry in issued(directory)):
+        return ""
+    return (
+        f"{files.certificate} was revoked: clients that look at ca.crl refuse it. The running "
+        "appliance makes one with a new key, if it has ca.key; `appliance cert renew server` does, "
+        "too (--ca-key FILE)"
+    )
+
+
+@functools.cache
+def _tell_outside(text: str) -> None:
+    log.warning("%s", text)
 
 
 def _is_ours(files: TlsFiles, directory: Path) -> bool:

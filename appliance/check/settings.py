@@ -145,6 +145,9 @@ def _certificates(settings: Settings) -> Iterator[Finding]:
     revoked = len(loaded.revocations)
     if revoked:
         yield Finding("ok", str(loaded.files.revocations), f"revoked certificates: {revoked}")
+    outside = certs.server_outside(loaded.files)
+    if outside:
+        yield Finding("warning", "tls", outside)
     yield from _own_authority(tls.ca, certificate, str(tls.certificate))
 
 

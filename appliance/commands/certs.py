@@ -105,6 +105,9 @@ def cert_revoke(
     what: Annotated[
         str, typer.Argument(metavar="NAME|SERIAL|FILE", help="As `cert list` shows them.")
     ],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before the server's own is revoked.")
+    ] = False,
     ca_key: CaKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
@@ -112,9 +115,24 @@ def cert_revoke(
     with _directory(config) as directory:
         from appliance import certs
 
+        servers = [each for each in certs.listed(directory) if each.purpose == "server"]
+        if not yes and any(what in (e.name, e.serial_text, str(e.file)) for e in servers):
+            _ask_about_the_server()
         for entry in certs.revoke(directory, what, ca_key):
             typer.echo(f"revoked  {entry.name}  {entry.serial_text}")
         typer.echo(f"made  {shown(directory / 'ca.crl')}")
+
+
+def _ask_about_the_server() -> None:
+    question = (
+        "This is the server's own certificate: clients that look at ca.crl will not connect until "
+        "there is one with a new key. The running appliance makes it by itself if it has ca.key, "
+        "else `appliance cert renew server --ca-key FILE` does."
+    )
+    if not sys.stdin.isatty():
+        raise CommandError(f"{question} To revoke it, give the option --yes")
+    typer.echo(question)
+    typer.confirm("Revoke it?", abort=True)
 
 
 @cert_app.command("renew")

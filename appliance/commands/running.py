@@ -24,6 +24,13 @@ def init(
         bool,
         typer.Option("--demo", help="With routes for the demo robot, and the password in a file."),
     ] = False,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DNS_NAME",
+            help="Under which clients reach it too, beside this computer's own. Repeatable.",
+        ),
+    ] = None,
 ) -> None:
     """Make certificates, a first user, access rules and appliance.yaml; keep what is there."""
     from appliance.access import AccessFileError
@@ -34,7 +41,7 @@ def init(
 
     try:
         with acting_for(directory / "appliance.yaml"):
-            for step in initialise(directory, robot=robot, user=user, demo=demo):
+            for step in initialise(directory, robot=robot, user=user, demo=demo, names=name or []):
                 if isinstance(step, Step):
                     verb = "made" if step.made else "kept"
                     typer.echo(f"{verb}  {shown(step.path)}: {step.text}")

@@ -66,6 +66,10 @@ def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator
     is_ours = (directory / "ca.key").exists()
     for each in found:
         yield _ending(each, is_ours)
+    revoked = certs.server_revoked(files)
+    if revoked:
+        advice = "appliance cert renew server"
+        yield Finding("problem", "the server's certificate", revoked, advice)
     if (directory / "issued.jsonl").exists():
         yield from _clients(directory)
 

@@ -15,7 +15,8 @@ from appliance import certs
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A directory with an authority, a server's certificate and a client's; nobody changes it."""
     directory = tmp_path_factory.mktemp("appliance") / "certs"
-    certs.create_authority(directory, "r2d2")
+    names, addresses = certs.local_names()  # with which the certificate renews itself
+    certs.create_authority(directory, "r2d2", [*NAMES, *names], [*ADDRESSES, *addresses])
     certs.issue_server(directory, NAMES, ADDRESSES)
     certs.issue_client(directory, "tablet")
     return directory

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import ipaddress
 import os
+import re
 import shutil
 import socket
 import ssl
@@ -12,7 +14,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from authorities import ADDRESSES, NAMES
+from authorities import ADDRESSES, NAMES, Company
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
@@ -25,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from appliance import certs
-from appliance.certs import CertificateError, addresses, authority, files
+from appliance.certs import CertificateError, addresses, authority, files, load_key
 from appliance.clock import RELEASED
 
 
@@ -143,7 +145,7 @@ def test_an_authority_is_never_replaced(own: Path) -> None:
 def test_renewing_keeps_the_key(own: Path, file: str) -> None:
     key, certificate = (own / f"{file}.key").read_bytes(), load(own / f"{file}.crt")
     if file == "server":
-        certs.issue_server(own, ["c3po"], [])
+        certs.issue_server(own, ["c3po.local"], [])
     else:
         certs.issue_client(own, "tablet")
     assert (own / f"{file}.key").read_bytes() == key
@@ -158,7 +160,7 @@ def test_renewing_keeps_the_key(own: Path, file: str) -> None:
 
 def test_a_certificate_of_someone_else_is_not_replaced(own: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    certs.create_authority(other)
+    certs.create_authority(other, None, NAMES)
     certs.issue_server(other, NAMES, [])
     shutil.copy(other / "server.crt", own / "server.crt")
     with pytest.raises(CertificateError, match="not of this appliance's authority"):
@@ -170,7 +172,7 @@ def test_a_certificate_does_not_outlive_its_authority(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(authority, "AUTHORITY_VALID", timedelta(days=100))
-    certs.create_authority(tmp_path)
+    certs.create_authority(tmp_path, None, NAMES)
     certs.issue_server(tmp_path, NAMES, [])
     ca, server = load(tmp_path / "ca.crt"), load(tmp_path / "server.crt")
     assert server.not_valid_after_utc == ca.not_valid_after_utc
@@ -216,7 +218,7 @@ def test_a_clock_that_was_never_set(
     for module in (authority, files):
         monkeypatch.setattr(module, "datetime", Clock)
     authority._tell_unset.cache_clear()
-    certs.create_authority(tmp_path)
+    certs.create_authority(tmp_path, None, NAMES)
     certs.issue_server(tmp_path, NAMES, ADDRESSES)
     monkeypatch.undo()
     [told] = caplog.messages
@@ -524,3 +526,117 @@ def test_a_certificate_of_ones_own_with_an_rsa_key(own: Path) -> None:
     client = ssl.create_default_context(cafile=own / "server.crt")
     client.verify_flags &= ~ssl.VERIFY_X509_STRICT
     assert handshake(server_context(own), client)[0] == "TLSv1.3"
+
+
+# For which names it may sign
+
+
+def verified(directory: Path, leaf: Path, *options: str) -> str:
+    """What OpenSSL says of a certificate of the authority; empty when it is good."""
+    found = subprocess.run(
+        ["openssl", "verify", *options, "-CAfile", directory / "ca.crt", leaf],
+        capture_output=True,
+        text=True,
+    )
+    return found.stdout + found.stderr if found.returncode else ""
+
+
+def forged(directory: Path, alternatives: list[x509.GeneralName]) -> Path:
+    """A server's certificate that was made with the authority's key, and without our checks."""
+    company = Company()
+    company.key = load_key(directory / "ca.key")  # type: ignore[assignment]
+    company.certificate = load(directory / "ca.crt")
+    path = directory / "forged"
+    company.issue(path, "forged", server=True, alternatives=alternatives)
+    return path.with_name("forged.crt")
+
+
+def public(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text))
+    except ValueError:
+        return x509.DNSName(text)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+@pytest.mark.parametrize(
+    ("name", "may"),
+    [
+        ("robot.local", True),
+        ("a.b.home.arpa", True),
+        ("localhost", True),
+        ("r2d2", True),
+        ("r2d2.acme.example", True),
+        ("x.r2d2.acme.example", True),
+        ("10.1.2.3", True),
+        ("192.168.7.8", True),
+        ("169.254.1.1", True),
+        ("fe80::1", True),
+        ("fd12::1", True),
+        ("127.0.0.1", True),
+        ("203.0.113.7", True),
+        ("2001:db8:1:2::77", True),
+        ("acme.example", False),
+        ("www.example.com", False),
+        ("notlocal", False),
+        ("8.8.8.8", False),
+        ("203.0.113.8", False),
+        ("2001:db8:1:3::1", False),
+        ("172.32.0.1", False),
+    ],
+)
+def test_the_authority_may_sign_for_its_own_alone(tmp_path: Path, name: str, may: bool) -> None:
+    names = ["r2d2", "r2d2.acme.example"]
+    addresses: list[certs.Address] = [
+        ipaddress.IPv4Address("203.0.113.7"),
+        ipaddress.IPv6Address("2001:db8:1:2::5"),
+    ]
+    certs.create_authority(tmp_path, "r2d2", names, addresses)
+    said = verified(tmp_path, forged(tmp_path, [public(name)]), "-purpose", "sslserver")
+    assert (said == "") is may, said
+    assert "permitted subtree violation" in said or may
+    subject = public(name).value
+    given = ([subject], []) if isinstance(subject, str) else ([], [subject])
+    if may:
+        certs.issue_server(tmp_path, *given)
+        assert verified(tmp_path, tmp_path / "server.crt", "-purpose", "sslserver") == ""
+    else:
+        with pytest.raises(CertificateError, match=f"not for {re.escape(name)}.*new authority"):
+            certs.issue_server(tmp_path, *given)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_clients_that_are_called_as_hosts_are(tmp_path: Path) -> None:
+    """OpenSSL takes a common name with a dot for a DNS name, where no other is said."""
+    certs.create_authority(tmp_path, "r2d2")
+    for name in ("tablet", "bob@acme.example", "tablet.local"):
+        certs.issue_client(tmp_path, name)
+        assert verified(tmp_path, tmp_path / f"clients/{name}.crt") == ""
+    with pytest.raises(CertificateError, match=r"looks like a DNS name.*write bob-smith"):
+        certs.issue_client(tmp_path, "bob.smith")
+
+
+def test_an_authority_of_before_signs_for_all(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        add = x509.CertificateBuilder.add_extension
+
+        def without(self, value, critical):
+            is_one = isinstance(value, x509.NameConstraints)
+            return self if is_one else add(self, value, critical)
+
+        patch.setattr(x509.CertificateBuilder, "add_extension", without)
+        certs.create_authority(tmp_path, "r2d2")
+    certs.issue_server(tmp_path, ["www.example.com"], [])
+    certs.issue_client(tmp_path, "bob.smith")
+
+
+def test_a_server_that_was_revoked_is_renewed_with_a_new_key(own: Path) -> None:
+    before = (own / "server.key").read_bytes()
+    certs.revoke(own, "server")
+    files = certs.TlsFiles(own / "server.crt", own / "server.key", own / "ca.crt")
+    assert "was revoked" in certs.server_revoked(files)
+    [warning] = certs.TlsContexts(files, {"x": certs.TlsPolicy("optional")}).warnings()
+    assert "server.crt was revoked on " in warning
+    certs.renew(own, "server")
+    assert (own / "server.key").read_bytes() != before
+    assert certs.server_revoked(files) == ""

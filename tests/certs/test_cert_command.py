@@ -413,3 +413,29 @@ def test_nothing_secret_in_ps(here: Path) -> None:
         timeout=30,
     ).stdout
     assert "--password-file" in help_text and "--password " not in help_text
+
+
+# The server's own
+
+
+def test_the_servers_own_is_not_revoked_without_a_question(here: Path, capsys) -> None:
+    before = everything(here)
+    [serial] = [each.serial_text for each in certs.listed(here) if each.purpose == "server"]
+    for what in ("server", serial, str(here / "server.crt")):
+        assert run("cert", "revoke", what) == 1
+        assert "cert renew server" in (said := capsys.readouterr().err) and "--yes" in said
+    assert everything(here) == before
+    assert run("cert", "revoke", "server", "--yes") == 0
+    key = (here / "server.key").read_bytes()
+    assert run("cert", "renew", "server") == 0
+    assert (here / "server.key").read_bytes() != key
+    capsys.readouterr()
+
+
+def test_names_are_given_when_the_authority_is_made(tmp_path: Path, capsys) -> None:
+    home = tmp_path / "robot"
+    assert run("init", "--dir", str(home), "--name", "r2d2.acme.example") == 0
+    capsys.readouterr()
+    [certificate] = certs.load_certificates(home / "certs/server.crt")
+    found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "r2d2.acme.example" in found.get_values_for_type(x509.DNSName)

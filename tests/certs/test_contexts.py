@@ -368,7 +368,7 @@ def test_a_reload_is_all_or_nothing(
     message: str,
 ) -> None:
     before = contexts.context("here")
-    certs.issue_server(own, ["localhost", "new"], [])
+    certs.issue_server(own, ["localhost", "new.local"], [])
     harm(own)
     with pytest.raises(CertificateError, match=message):
         contexts.reload()
