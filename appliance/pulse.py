@@ -35,7 +35,8 @@ class Pulse:
         self._time = time
         #: Whether the last message is on its way, and whether one has gone through.
         self._is_sent = self._came_through = False
-        self._told = ""
+        #: What was last found to be wrong; None before it was asked for the first time.
+        self._problem: str | None = None
 
     def is_there(self) -> bool:
         """Whether a message has gone through a turn since this was last asked, and the clock goes.
@@ -47,9 +48,9 @@ class Pulse:
             problem = "the broker's clock stands still"
         elif not self._came_through:
             problem = "no message has gone through a turn"
-        if problem and problem != self._told and self._is_sent:
+        if problem and self._problem not in (None, problem):
             log.error("no sign of life for the watchdog: %s", problem)
-        self._told = problem
+        self._problem = problem
         self._came_through = False
         if not self._is_sent:
             self._is_sent = True

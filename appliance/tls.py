@@ -152,7 +152,8 @@ class TlsTransport:
         self._entries.faults.caught(entry, error)
         if not self._handshake.done():
             self._handshake.set_result(ConnectionAbortedError("a fault in the appliance"))
-        self.abort()
+        if hasattr(self, "_tcp"):
+            self.abort()
 
     @contained("tls.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

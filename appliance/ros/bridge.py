@@ -295,7 +295,8 @@ class Bridge:
     def _join(self) -> None:
         self._node.start(self._look, self._failed, self._entries)
 
-    def _join_later(self, delay: float = LONGEST_RETRY) -> None:
+    def _join_later(self) -> None:
+        delay, self._retry = self._retry, min(2 * self._retry, LONGEST_RETRY)
         self._retry_timer = self._entries.later(
             "bridge.join", delay, self._join, failed=self._join_later
         )
@@ -508,14 +509,13 @@ class Bridge:
         now = self._loop.time()
         if since is not None and now - since > LONGEST_RETRY:
             self._retry = RETRY
-        delay, self._retry = self._retry, min(2 * self._retry, LONGEST_RETRY)
         if reason != before:
             log.warning(
                 "there is no bridge to ROS: %s (it is tried again, at least every %g s)",
                 reason,
                 LONGEST_RETRY,
             )
-        self._join_later(delay)
+        self._join_later()
 
     # Any thread
 

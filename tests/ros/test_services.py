@@ -242,6 +242,19 @@ async def test_a_call_without_a_way_back_is_not_carried_out(house, caplog):
     assert (await strange.call(CALL, {"data": True}, "answers/a/b"))[0] == "ok"
 
 
+@pytest.mark.parametrize("size", [100, 40_000], ids=str)
+async def test_a_way_back_that_no_topic_can_be_is_none(house, size):
+    """Its own topic for answers would be longer than a string can be: refused, and no fault."""
+    house.start(service("/switch"))
+    switch = Switch(house)
+    client = house.client("a" * size)
+    client.send(f"{CALL}/{'t' * (65_500 - min(size, 60))}", {"data": True})
+    await asyncio.sleep(0.01)
+    assert house.counters().errors == {"no_response_topic": 1}
+    assert not switch.asked and not house.broker.faults.count
+    assert (await house.client("bob").call(CALL, {"data": True}))[0] == "ok"
+
+
 async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(house):
     house.start(service("/switch"))
     switch = Switch(house)

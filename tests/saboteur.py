@@ -1,0 +1,213 @@
+"""Lets an entry of the appliance fail, once, when it is next passed: for `test_containment.py`.
+
+What goes through `appliance.entries` and `Faults.run` is reached by the entry's name alone. Where
+an entry has a `try` of its own, INLINE says what is called in there, and by whom.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance import entries
+from appliance.broker.faults import Faults
+from appliance.ros import ros2
+
+PACKAGE = Path(__file__).parents[1] / "appliance"
+
+#: The calls whose first argument is an entry's name.
+NAMED = {
+    "_abandon",
+    "_contained",
+    "_tell_fault",
+    "at",
+    "caught",
+    "contained",
+    "every",
+    "fault",
+    "from_thread",
+    "later",
+    "reader",
+    "run",
+    "shield",
+    "signal",
+    "soon",
+    "task",
+    "when_done",
+}
+ENTRY = re.compile(r"[a-z_]+(\.[a-z_]+)?")
+
+#: By entry: the module and class (or none) of what is called in its `try`, and the caller.
+INLINE = {
+    "actions.look": ("ros.actions", "Action", "look", "look"),
+    "app.certificates": ("app", "", "keep_server_certificate", ""),
+    "app.reload": ("app", "App", "reload", "_try_reload"),
+    "bridge.look": ("ros.flows", "Flow", "look", ""),
+    "bridge.message": ("broker.broker", "Broker", "publish", "ros/bridge.py:_publish"),
+    "bridge.receive": ("ros.to_ros", "ToRos", "receive", "_receive"),
+    "broker.delivery": ("broker.session", "Session", "deliver", "publish_to"),
+    "broker.end": ("broker.client", "Client", "fault", "fault"),
+    "broker.will": ("broker.broker", "Broker", "_publish_late", "_publish_will"),
+    "calls.handle": ("ros.services", "ServiceRoutes", "_type", "_handle"),
+    "calls.look": ("ros.services", "ServiceRoutes", "look", "look"),
+    "client.cut_off": ("broker.broker", "Broker", "disconnect", "cut_off"),
+    "clock.keep_alive": ("broker.client", "Client", "tick", "tick"),
+    "clock.session": ("broker.broker", "Broker", "_fall_due", "tick"),
+    "commands.stop": ("ros.commands", "_Stop", "cdr", "_publish_stop"),
+    "commit.release": ("broker.output", "Output", "release", "_committed"),
+    "commit.resume": ("broker.client", "Client", "resume", "_recover"),
+    "connection.begin": ("tls", "", "accept", "begin"),
+    "connection.certificate": ("wire", "ClientProtocol", "check_certificate", ""),
+    "connection.chunk": ("broker.client", "Client", "receive", "data_received"),
+    "connection.last_chunk": ("broker.client", "Client", "receive", "connection_lost"),
+    "connection.last_turn": ("broker.client", "Client", "send_on", "_leave"),
+    "connection.login": ("broker.client", "Client", "accept", "_log_in"),
+    "connection.turn": ("wire", "ClientProtocol", "take_turn", "_run_turns"),
+    "control.command": ("app", "App", "_answer_skipped", ""),
+    "control.connection": ("control", "Control", "_answer", "_serve"),
+    "flush": ("broker.output", "Output", "flush", "broker/broker.py:flush"),
+    "flush.wait": ("broker.output", "Output", "wait", "_hold_back"),
+    "listener.admit": ("listeners", "Listeners", "admit", "_accept"),
+    "listener.open": ("listeners", "_Door", "open", "_open_doors"),
+    "session.replay": ("broker.retained", "Retained", "find_in_steps", "_find_retained"),
+    "session.send": ("broker.output", "Output", "publish", "_send"),
+    "tls.chunk": ("tls", "TlsTransport", "_read", "data_received"),
+}
+
+
+def all_entries() -> set[str]:
+    """The names of all entries that stand in the sources."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            # `self._post(faults.caught, "entry", …)`: on the loop's thread.
+            arguments = node.args[1:2] if name == "_post" else node.args[:1]
+            if name in NAMED or name == "_post":
+                found |= {
+                    each.value
+                    for each in arguments
+                    if isinstance(each, ast.Constant)
+                    and isinstance(each.value, str)
+                    and ENTRY.fullmatch(each.value)
+                }
+    return found
+
+
+class SabotageError(Exception):
+    """What nobody expected."""
+
+
+class Saboteur:
+    """`arm` lets entries fail when they are next passed, each once."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._armed: set[str] = set()
+        self._patch_entries(monkeypatch)
+        places: dict[tuple[str, str, str], dict[str, str]] = {}
+        for entry, (module, kind, name, by) in INLINE.items():
+            places.setdefault((module, kind, name), {})[entry] = by
+        for place, callers in places.items():
+            self._patch_inline(monkeypatch, place, callers)
+
+    def arm(self, *names: str) -> None:
+        self._armed = set(names)
+
+    def strike(self, entry: str) -> None:
+        if entry in self._armed:
+            self._armed.discard(entry)
+            raise SabotageError(entry)
+
+    def _first(self, entry: str, callback: Callable[..., object], *args: Any, **more: Any) -> Any:
+        self.strike(entry)
+        return callback(*args, **more)
+
+    def _patch_entries(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        run, task, repeat = entries.Entries.run, entries.Entries.task, entries.Repeated.__init__
+        once, shield = Faults.run, entries._Shield.__init__
+        first = self._first
+
+        def entered(own, entry, served, failed, callback, args):
+            run(own, entry, served, failed, partial(first, entry, callback), args)
+
+        def begun(own, entry, work, **more):
+            async def begin() -> Any:
+                try:
+                    self.strike(entry)
+                except SabotageError:
+                    work.close()
+                    raise
+                return await work
+
+            return task(own, entry, begin(), **more)
+
+        def repeated(own, all_entries, entry, interval, callback, delay):
+            repeat(own, all_entries, entry, interval, partial(first, entry, callback), delay)
+
+        def ran(own, entry, work, *args, otherwise):
+            return once(own, entry, partial(first, entry, work), *args, otherwise=otherwise)
+
+        class Struck:
+            def __init__(self, entry: str, told: object) -> None:
+                self._entry, self._told = entry, told
+
+            def __getattr__(self, name: str) -> object:
+                return partial(first, self._entry, getattr(self._told, name))
+
+        def shielded(own, entry, faults, told):
+            shield(own, entry, faults, Struck(entry, told))
+
+        contained = ros2.Ros2Node._contained
+
+        def of_the_node(own, entry, callback):
+            return contained(own, entry, partial(first, entry, callback))
+
+        monkeypatch.setattr(ros2.Ros2Node, "_contained", of_the_node)
+        monkeypatch.setattr(entries.Entries, "run", entered)
+        monkeypatch.setattr(entries.Entries, "task", begun)
+        monkeypatch.setattr(entries.Repeated, "__init__", repeated)
+        monkeypatch.setattr(entries._Shield, "__init__", shielded)
+        monkeypatch.setattr(Faults, "run", ran)
+        for name in ("wire", "tls", "websocket"):
+            module = importlib.import_module(f"appliance.{name}")
+            for kind in vars(module).values():
+                if isinstance(kind, type) and kind.__module__ == module.__name__:
+                    for method in vars(kind).values():
+                        self._patch_contained(monkeypatch, method)
+
+    def _patch_contained(self, monkeypatch: pytest.MonkeyPatch, method: object) -> None:
+        """`@contained` knows its method, and the entry's name, by its closure."""
+        code, closure = getattr(method, "__code__", None), getattr(method, "__closure__", None)
+        if not closure or code.co_filename != entries.__file__:
+            return
+        cells = dict(zip(code.co_freevars, closure, strict=True))
+        entry, own = cells["entry"].cell_contents, cells["method"].cell_contents
+        monkeypatch.setattr(cells["method"], "cell_contents", partial(self._first, entry, own))
+
+    def _patch_inline(
+        self, monkeypatch: pytest.MonkeyPatch, place: tuple[str, str, str], callers: dict[str, str]
+    ) -> None:
+        module, kind, name = place
+        owner: Any = importlib.import_module(f"appliance.{module}")
+        owner = getattr(owner, kind) if kind else owner
+        own = getattr(owner, name)
+
+        def struck(*args: Any, **more: Any) -> Any:
+            for entry in self._armed & callers.keys():
+                file, _, caller = callers[entry].rpartition(":")
+                code = sys._getframe(1).f_code
+                if not caller or (code.co_name == caller and code.co_filename.endswith(file)):
+                    self.strike(entry)
+            return own(*args, **more)
+
+        monkeypatch.setattr(owner, name, struck)
