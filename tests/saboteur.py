@@ -52,11 +52,12 @@ INLINE = {
     "app.reload": ("app", "App", "reload", "_try_reload"),
     "bridge.look": ("ros.flows", "Flow", "look", ""),
     "bridge.message": ("broker.broker", "Broker", "publish", "ros/bridge.py:_publish"),
-    "bridge.receive": ("ros.to_ros", "ToRos", "receive", "_receive"),
+    "bridge.receive": ("ros.to_ros", "ToRos", "receive", "_hand_over"),
     "broker.delivery": ("broker.session", "Session", "deliver", "publish_to"),
     "broker.end": ("broker.client", "Client", "fault", "fault"),
     "broker.will": ("broker.broker", "Broker", "_publish_late", "_publish_will"),
-    "calls.handle": ("ros.services", "ServiceRoutes", "_type", "_handle"),
+    "calls.handle": ("ros.requests", "Requests", "ask", "_ask"),
+    "calls.take": ("ros.services", "ServiceRoutes", "_type", "_handle"),
     "calls.look": ("ros.services", "ServiceRoutes", "look", "look"),
     "client.cut_off": ("broker.broker", "Broker", "disconnect", "cut_off"),
     "clock.keep_alive": ("broker.client", "Client", "tick", "tick"),
@@ -69,7 +70,7 @@ INLINE = {
     "connection.chunk": ("broker.client", "Client", "receive", "data_received"),
     "connection.last_chunk": ("broker.client", "Client", "receive", "connection_lost"),
     "connection.last_turn": ("broker.client", "Client", "send_on", "_leave"),
-    "connection.login": ("broker.client", "Client", "accept", "_log_in"),
+    "connection.login": ("wire", "ClientProtocol", "_read_on", "_log_in"),
     "connection.turn": ("wire", "ClientProtocol", "take_turn", "_run_turns"),
     "control.command": ("app", "App", "_answer_skipped", ""),
     "control.connection": ("control", "Control", "_answer", "_serve"),
@@ -79,7 +80,7 @@ INLINE = {
     "listener.open": ("listeners", "_Door", "open", "_open_doors"),
     "session.replay": ("broker.retained", "Retained", "find_in_steps", "_find_retained"),
     "session.send": ("broker.output", "Output", "publish", "_send"),
-    "tls.chunk": ("tls", "TlsTransport", "_read", "data_received"),
+    "tls.chunk": ("tls", "TlsTransport", "_take", "data_received"),
 }
 
 

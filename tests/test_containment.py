@@ -41,7 +41,6 @@ from appliance.mqtt.packets import (
     Connect,
     Disconnect,
     Packet,
-    Pingreq,
     Puback,
     Publish,
     Suback,
@@ -512,14 +511,6 @@ async def _slow_websocket(site: Site, patch: pytest.MonkeyPatch) -> None:
     caller._task = asyncio.ensure_future(caller._unpack())
 
 
-@reach("websocket.turn")
-async def _many_frames(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller = await site.dial("websocket")
-    site.hands.append(caller)
-    await caller.say(Connect("victim"))
-    caller.writer.write(Framed.frame(Pingreq().encode(5)) * 20_000)
-
-
 @reach("websocket.eof", "websocket.lost", "tls.eof", "connection.eof")
 async def _leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
     for kind in ("plain", "tls", "websocket"):
@@ -753,7 +744,23 @@ async def _first_command(site: Site, patch: pytest.MonkeyPatch) -> None:
     await caller.say(Publish("r2d2/cmd_vel", b'{"linear": {"x": 1.0}}', 1, packet_id=3))
 
 
-@reach("calls.call", "calls.end", "calls.timeout", "calls.answer", "calls.handle")
+@reach("turns.work", "turns.pause", "turns.next")
+async def _large_to_ros(site: Site, patch: pytest.MonkeyPatch) -> None:
+    text = bytes(5000)
+    site.app._publish(
+        "r2d2/down", b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
+    )
+
+
+@reach("plugins.line", "plugins.wake")
+async def _asks_plugins(site: Site, patch: pytest.MonkeyPatch) -> None:
+    access: Any = site.broker.access
+    with pytest.MonkeyPatch.context() as asked:
+        asked.setattr(access, "decide", lambda *question: Decision(False, "", pending=True))
+        assert access.waits(("nobody", "asks", "this"), lambda: None)
+
+
+@reach("calls.take", "calls.call", "calls.end", "calls.timeout", "calls.answer", "calls.handle")
 async def _call(site: Site, patch: pytest.MonkeyPatch) -> None:
     caller, _ = await site.victim()
     await caller.say(Publish("r2d2/srv/slow/_call/1", b"{}", 1, packet_id=3))

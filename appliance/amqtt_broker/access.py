@@ -17,6 +17,7 @@ from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Access, Action, Decision, Identity, Question
+from appliance.entries import Entries
 
 from .guard import Guard, name, redacted
 from .logins import Answers
@@ -116,15 +117,17 @@ class PluginAccess:
         else:
             self._line[wake] = None
             if self._line_timer is None:
-                loop = asyncio.get_running_loop()
-                self._line_timer = loop.call_later(LINE_INTERVAL, self._wake_line)
+                entries = Entries(asyncio.get_running_loop(), self._broker.faults)
+                self._line_timer = entries.later(
+                    "plugins.line", LINE_INTERVAL, self._wake_line, failed=self._wake_line
+                )
         return True
 
     def _wake_line(self) -> None:
         self._line_timer = None
         line, self._line = self._line, {}
         for wake in line:
-            wake()
+            self._broker.faults.run("plugins.wake", wake, otherwise=None)
 
     def changed(self) -> None:
         """Let what was decided be decided again."""
@@ -211,7 +214,7 @@ class PluginAccess:
             self._keep(question, decision)
         finally:
             for wake in self._waiting.pop(question, {}):
-                wake()
+                self._broker.faults.run("plugins.wake", wake, otherwise=None)
 
     async def _ask_all(
         self, session: AmqttSession, action: Action, topic: str

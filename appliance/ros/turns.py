@@ -106,10 +106,10 @@ class Turns:
             self._ledger.counters.effort += int((thread_time() - begun) * 1e6)
             # What came meanwhile is read in the next round, and is answered before the one after.
             if not was_busy:
-                self._entries.soon("turns.pause", self._pause)
+                self._entries.soon("turns.pause", self._pause, failed=self._pause)
 
     def _pause(self) -> None:
-        self._entries.soon("turns.next", self._next)
+        self._entries.soon("turns.next", self._next, failed=self._pause)
 
     def _run(self, work: Callable[[], T]) -> T | None:
         return self._entries.faults.run("turns.work", work, otherwise=None)
