@@ -455,6 +455,8 @@ class Client:
     def hurry(self) -> None:
         """The connection is lost: what came over it is done without waiting for anybody."""
         self._hurries = True
+        if not self._behind:
+            return  # what else it waits for, as the end of its login, it waits for still
         while self._behind and self._work is None:
             self._try_again()
         if self._work is None and self.connection.paused:

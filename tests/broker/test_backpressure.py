@@ -544,6 +544,17 @@ def test_a_lost_connection_ends_the_waiting(waiting: Peer, broker: Broker, join:
     assert "publisher" not in broker.sessions
 
 
+def test_a_connection_lost_in_the_login_brings_nothing_in(broker: Broker):
+    """Nothing that came behind CONNECT is looked at, as nobody knows who sent it."""
+    stranger = Peer(broker)
+    stranger.say_connect("stranger", **lasting(5))
+    stranger.client.hurry()
+    stranger.send(Subscribe(1, [Subscription("a", 1)]))
+    stranger.lose()
+    stranger.let_in()
+    assert stranger.received() == [] and not broker.sessions
+
+
 def test_a_publisher_that_is_cut_off_is_forgotten(waiting: Peer, broker: Broker):
     (congested,) = broker.ledger.congested
     waiting.client.close(ReasonCode.ADMINISTRATIVE_ACTION, "")
