@@ -70,7 +70,8 @@ class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
     `context` is asked at each connection for its TLS settings, so that these can be replaced; None
-    is for connections without TLS.
+    is for connections without TLS. `anonymous` is whether it lets in who gives no user name, None
+    for what holds everywhere.
     """
 
     host: str
@@ -79,6 +80,7 @@ class ListenerSettings:
     protocol: Literal["mqtt", "websocket"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
+    anonymous: bool | None = None
 
     @property
     def place(self) -> tuple[str, int, Path | None]:
@@ -204,7 +206,7 @@ class Listeners:
             if self.broker.journal is not None:
                 self.broker.journal.refused(address, refusal)
             return
-        protocol = ClientProtocol(self.network, address, host)
+        protocol = ClientProtocol(self.network, address, host, listener.anonymous)
         self.network.open.add(protocol)
         context = None
         if listener.context is not None:

@@ -36,9 +36,10 @@ PUBLISH_BURST = 1.0
 #: Closed connections that are listened to at a time, see `Farewell`.
 FAREWELLS = 256
 
-#: Who sent this CONNECT, from this address, over this TLS connection, if it is one?
+#: Who sent this CONNECT, from this address, over this TLS connection, if it is one; and does its
+#: listener let in who gives no user name (None: as everywhere)?
 Authenticate: TypeAlias = Callable[
-    [Connect, str, "ssl.SSLObject | None"], Awaitable["Identity | Refusal"]
+    [Connect, str, "ssl.SSLObject | None", "bool | None"], Awaitable["Identity | Refusal"]
 ]
 
 

@@ -76,8 +76,11 @@ class ClientProtocol:
     It is an `asyncio.Protocol` without being derived from it, which makes it faster when compiled.
     """
 
-    def __init__(self, network: Network, address: str, host: str) -> None:
+    def __init__(
+        self, network: Network, address: str, host: str, anonymous: bool | None = None
+    ) -> None:
         self.address = address
+        self._anonymous = anonymous  # what its listener says of clients without a user name
         #: The part of it that all connections of one computer share; empty for a Unix socket.
         self.host = host
         self._network = network
@@ -545,7 +548,9 @@ class ClientProtocol:
 
     async def _log_in(self, connect: Connect) -> None:
         try:
-            self._who = await self._network.authenticate(connect, self.address, self._tls)
+            self._who = await self._network.authenticate(
+                connect, self.address, self._tls, self._anonymous
+            )
             self._logging_in = False
             if self._network.is_busy():  # crowds come at once, when the robot's network is back
                 self._read_later()

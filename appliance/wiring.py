@@ -108,6 +108,7 @@ def listener_settings(settings: Settings, tls: TlsContexts | None) -> list[Liste
             listener.protocol,
             listener.bind.path,
             listener.mode,
+            listener.anonymous,
         )
         for index, listener in enumerate(settings.broker.listeners)
     ]

@@ -68,7 +68,11 @@ class House:
         return self.listeners.network
 
     async def _ask(
-        self, connect: Connect, address: str, tls: ssl.SSLObject | None
+        self,
+        connect: Connect,
+        address: str,
+        tls: ssl.SSLObject | None,
+        anonymous: bool | None,
     ) -> Identity | Refusal:
         await self.gate.wait()
         if connect.client_id in self.refused:

@@ -232,11 +232,19 @@ class FileAccess:
         return self._acl.decide(identity, action, topic)
 
     async def authenticate(
-        self, username: str | None, password: bytes | None, client_id: str, address: str
+        self,
+        username: str | None,
+        password: bytes | None,
+        client_id: str,
+        address: str,
+        anonymous: bool | None = None,
     ) -> Identity | Refusal:
-        """Who the client is, or why it is refused. From where it comes counts for guesses only."""
+        """Who the client is, or why it is refused. From where it comes counts for guesses only.
+
+        `anonymous` is what its listener says of clients without a user name, None for nothing.
+        """
         if username is None:
-            if self._in_force.anonymous:
+            if self._in_force.anonymous if anonymous is None else anonymous:
                 return Identity(None, client_id)
             return Refusal(ReasonCode.NOT_AUTHORIZED, "no user name, and anonymous is off")
         if password is None:

@@ -64,7 +64,12 @@ class Files(Access, Protocol):
         """The names of all users."""
 
     async def authenticate(
-        self, username: str | None, password: bytes | None, client_id: str, address: str
+        self,
+        username: str | None,
+        password: bytes | None,
+        client_id: str,
+        address: str,
+        anonymous: bool | None = None,
     ) -> Identity | Refusal:
         """Who the client is, or why it is refused."""
 
@@ -312,7 +317,11 @@ class ApplianceBroker(amqtt.broker.Broker):
     # --- logins --------------------------------------------------------------------------------
 
     async def authenticate(
-        self, connect: Connect, address: str, ssl_object: ssl.SSLObject | None = None
+        self,
+        connect: Connect,
+        address: str,
+        ssl_object: ssl.SSLObject | None = None,
+        anonymous: bool | None = None,
     ) -> Identity | Refusal:
         """Who sent the CONNECT, or why it is refused.
 
@@ -321,6 +330,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         needs none, as anonymous clients are let in, comes in. Others come in when at least one
         plugin says yes and none says no, under the user name that they gave if a plugin vouches
         for it. With a yes of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
+        `anonymous` is what its listener says of such clients, None for nothing.
         """
         username, password = connect.username, connect.password
         plugins = self.plugins_manager
@@ -334,12 +344,14 @@ class ApplianceBroker(amqtt.broker.Broker):
             return self._by_certificate(owner, connect, address, ssl_object)
         known = not plugins._auth_plugins or username in self._files.users()
         if known or username is None:
-            who = await self._files.authenticate(username, password, connect.client_id, address)
+            who = await self._files.authenticate(
+                username, password, connect.client_id, address, anonymous
+            )
             if isinstance(who, Identity):
                 # The password is none of the plugins' business here.
                 self._admit(who, address, lambda: login_of(connect, address, None, ssl_object))
                 return who
-            if known:
+            if known or anonymous is False:  # its listener has the last word about that
                 return who
         try:
             text = None if password is None else password.decode()
@@ -347,6 +359,8 @@ class ApplianceBroker(amqtt.broker.Broker):
             return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
         login = login_of(connect, address, text, ssl_object)
         who = await self._logins.ask(login, address)
+        if anonymous is False and isinstance(who, Identity) and who.username is None:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, "no plugin knows the user, nor do the files")
         if isinstance(who, Identity):
             self._admit(who, address, lambda: login)
         return who

@@ -63,6 +63,14 @@ def _listeners(settings: Settings) -> Iterator[Finding]:
         else:
             text = "without TLS: everyone on the network can read passwords and messages"
             yield Finding("warning", subject, text)
+        if not settings.broker.lets_in_anonymous(listener):
+            continue
+        if listener.anonymous:
+            text = "clients without a user name come in here, with what the ACL gives to everyone"
+            yield Finding("warning", subject, text)
+        if not listener.tls and not listener.bind.loopback:
+            text = "anonymous and without TLS: whoever is on the network is in, and reads along"
+            yield Finding("warning", subject, text)
     if settings.broker.anonymous:
         text = "clients without a user name come in, and may do what the ACL gives to everyone"
         yield Finding("warning", "broker.anonymous", text)

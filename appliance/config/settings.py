@@ -94,7 +94,8 @@ def _section() -> Any:
 class Listener(_Section):
     """One address that clients connect to, with or without TLS; `mode` is for a Unix socket.
 
-    What is None of `client_certificates`, `min_version` and `ciphers` is as `broker.tls` says.
+    What is None of `client_certificates`, `min_version` and `ciphers` is as `broker.tls` says, and
+    `anonymous` as `broker.anonymous`.
     """
 
     bind: Address
@@ -104,6 +105,7 @@ class Listener(_Section):
     min_version: TlsVersion | None = None
     ciphers: str | None = None
     mode: Mode = 0o660
+    anonymous: bool | None = None
 
     @property
     def is_mqtts(self) -> bool:
@@ -227,6 +229,10 @@ class Broker(_Section):
         dict[str, dict[str, Any]], BeforeValidator(check_plugins), Field(repr=False)
     ] = {}
     plugin_answers: PluginAnswers = _section()
+
+    def lets_in_anonymous(self, listener: Listener) -> bool:
+        """Whether clients that give no user name come in by that listener."""
+        return self.anonymous if listener.anonymous is None else listener.anonymous
 
     def client_certificates(self, listener: Listener) -> Literal["off", "optional", "required"]:
         """Whether that listener asks its clients for one."""
