@@ -9,11 +9,12 @@ import math
 import socket
 import ssl
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
 
 from appliance.addresses import network
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.mqtt.reason import ReasonCode
@@ -44,14 +45,20 @@ CHECKED_A_TURN = 16
 #: Seconds that one address may open connections ahead of `limits.connection_rate`.
 CONNECTION_BURST = 5.0
 
+#: What stands for the address of Unix sockets.
+UNIX = b""
+
 #: Addresses that are remembered before those are looked for that can be forgotten.
 ADDRESSES = 1024
 
 #: Seconds that clients get at the stop to read what was written to them.
 STOP_TIMEOUT = 1.0
 
+#: Connections that have not logged in, or are closing, beside as many clients as there may be.
+GUESTS = 256
+
 #: Files that the process opens beside its connections.
-OTHER_FILES = FAREWELLS + 256
+OTHER_FILES = GUESTS + FAREWELLS + 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +108,16 @@ class Listeners:
     ) -> None:
         self.broker = broker
         self.admission = admission
+        self._addresses = _Addresses(admission)
         self.network = Network(
             broker,
             authenticate,
             exchange,
-            self._ended,
+            self._addresses,
             connect_timeout=admission.connect_timeout,
             publish_rate=admission.publish_rate,
             certificates=certificates,
         )
-        self._addresses = _Addresses(admission)
         self._doors: list[_Door] = []
         self._handshakes: set[ClientProtocol] = set()
         self._stall: asyncio.TimerHandle | None = None
@@ -194,11 +201,10 @@ class Listeners:
         else:
             host, port = cast("tuple[str, int]", peer)[:2]
             address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        limit = self.admission.connections
-        if len(self.network.open) >= limit:
-            refusal = f"{limit} connections, as many as allowed (broker.limits.connections)"
-        elif listener.path is None:
-            refusal = self._addresses.admit(host, now)
+        if listener.path is None:
+            refusal = self._addresses.come(host, now)
+        if not refusal:
+            refusal = self._make_room()
         if refusal:
             connection.close()
             counters.connections_refused += 1
@@ -208,6 +214,7 @@ class Listeners:
             return
         protocol = ClientProtocol(self.network, address, host, listener.anonymous)
         self.network.open.add(protocol)
+        self._addresses.came(protocol)
         context = None
         if listener.context is not None:
             context = listener.context()
@@ -229,9 +236,21 @@ class Listeners:
             if self._stall is not None:
                 self._open_doors()
 
-    def _ended(self, member: Member) -> None:
-        if member.host:
-            self._addresses.leave(member.host)
+    def _make_room(self) -> str:
+        """Let there be room for a connection more; or why there cannot be.
+
+        Who has logged in does not count: among users the broker decides who makes room, when it
+        knows who comes. Of the others the one goes that has waited longest, out of the address
+        with most of them: as many strangers as may come from everywhere keep nobody out.
+        """
+        limit = self.admission.connections
+        if len(self.network.open) < max(limit, self.broker.ledger.accounts.connections + GUESTS):
+            return ""
+        guest = self._addresses.oldest_guest()
+        if guest is None:
+            return f"{limit} connections, as many as allowed (broker.limits.connections)"
+        guest.make_room()
+        return ""
 
     @property
     def crowded(self) -> bool:
@@ -369,13 +388,21 @@ class _Door:
 class _Neighbour:
     """What is known of one address."""
 
-    connections: int = 0
+    #: Connections that have not logged in yet, or are closing, in the order of their coming.
+    guests: dict[Member, None] = field(default_factory=dict)
+    #: And those that have, by their users.
+    clients: dict[Account, int] = field(default_factory=dict)
     #: When the connections that it opened are paid for at the rate allowed.
     paid_at: float = 0.0
 
 
 class _Addresses:
-    """How many connections each address has, and how fast it opens new ones."""
+    """How many connections each address has, and how fast it opens new ones: the `Doorkeeper`.
+
+    Those of one user, and those before their login, are counted for themselves: who knows a
+    password keeps nobody out who shares its address. All Unix sockets are one address, without a
+    limit.
+    """
 
     def __init__(self, admission: Admission) -> None:
         self.use(admission)
@@ -387,17 +414,17 @@ class _Addresses:
         self._limit = admission.connections_per_address
         self._rate = admission.connection_rate
 
-    def admit(self, host: str, now: float) -> str:
-        """Count a new connection; or, uncounted, why it is not allowed."""
+    def come(self, host: str, now: float) -> str:
+        """Count a new connection's coming; or, uncounted, why it is not allowed."""
         where = network(host)
         neighbour = self._known.get(where)
         if neighbour is None:
             if len(self._known) >= self._many:
                 self._forget_idle(now)
             neighbour = self._known[where] = _Neighbour()
-        if neighbour.connections >= self._limit:
+        if len(neighbour.guests) >= self._limit:
             return (
-                f"its address has {neighbour.connections} connections "
+                f"its address has {len(neighbour.guests)} connections that have not logged in "
                 "(broker.limits.connections_per_address)"
             )
         paid_at = max(neighbour.paid_at, now) + 1 / self._rate
@@ -407,18 +434,53 @@ class _Addresses:
                 "(broker.limits.connection_rate)"
             )
         neighbour.paid_at = paid_at
-        neighbour.connections += 1
         return ""
 
-    def leave(self, host: str) -> None:
-        """A connection from there ended."""
-        self._known[network(host)].connections -= 1
+    def _of(self, member: Member) -> _Neighbour:
+        where = network(member.host) if member.host else UNIX
+        return self._known.setdefault(where, _Neighbour())
+
+    def came(self, member: Member) -> None:
+        """A new connection is there."""
+        self._of(member).guests[member] = None
+
+    def admit(self, member: Member, account: Account) -> str:
+        """See `Doorkeeper.admit`."""
+        neighbour = self._of(member)
+        count = neighbour.clients.get(account, 0)
+        if member.host and count >= self._limit:
+            return (
+                f"its address has {count} connections of its user "
+                "(broker.limits.connections_per_address)"
+            )
+        neighbour.guests.pop(member, None)
+        neighbour.clients[account] = count + 1
+        return ""
+
+    def leaves(self, member: Member) -> None:
+        """See `Doorkeeper`."""
+        self._of(member).guests[member] = None
+
+    def ended(self, member: Member) -> None:
+        """See `Doorkeeper`."""
+        neighbour = self._of(member)
+        neighbour.guests.pop(member, None)
+        count = neighbour.clients.get(member.account, 0)
+        if count > 1:
+            neighbour.clients[member.account] = count - 1
+        else:
+            neighbour.clients.pop(member.account, None)
+
+    def oldest_guest(self) -> Member | None:
+        """Of the address that has most of them, the guest that came first."""
+        most = max(self._known.values(), key=lambda each: len(each.guests), default=None)
+        return next(iter(most.guests), None) if most is not None else None
 
     def _forget_idle(self, now: float) -> None:
         self._known = {
             where: neighbour
             for where, neighbour in self._known.items()
-            if neighbour.connections or neighbour.paid_at > now
+            if neighbour.guests or neighbour.clients or neighbour.paid_at > now
         }
         # Each is looked at once for every two that come: the work stays in proportion.
         self._many = max(ADDRESSES, 2 * len(self._known))

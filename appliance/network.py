@@ -58,6 +58,8 @@ class Member(Turn, Protocol):
 
     #: What all connections of one computer share; empty for a Unix socket.
     host: str
+    #: The user it has logged in as, or that of strangers.
+    account: Account
 
     def check_certificate(self) -> None:
         """Close the connection when the client's certificate is not, or no longer, accepted."""
@@ -68,9 +70,25 @@ class Member(Turn, Protocol):
     def abort(self) -> None:
         """Close at once."""
 
+    def make_room(self) -> None:
+        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+
+
+class Doorkeeper(Protocol):
+    """Who lets connections in, and knows how many may be there."""
+
+    def admit(self, member: Member, account: Account) -> str:
+        """A connection logs in as that user: why it may not, or nothing."""
+
+    def leaves(self, member: Member) -> None:
+        """It is told its last bytes."""
+
+    def ended(self, member: Member) -> None:
+        """It has ended, once."""
+
 
 class Network:
-    """All connections, and what they share; `ended` is told of each that ends, once.
+    """All connections, and what they share; the doorkeeper is told what becomes of each.
 
     `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
     """
@@ -80,7 +98,7 @@ class Network:
         broker: Broker,
         authenticate: Authenticate,
         exchange: Callable[[str, str | None], Exchange | None],
-        ended: Callable[[Member], None],
+        doorkeeper: Doorkeeper,
         *,
         connect_timeout: float,
         publish_rate: float,
@@ -98,7 +116,7 @@ class Network:
         self.tasks: set[asyncio.Task[None]] = set()
         #: Bytes in the output of all clients, as far as they are counted.
         self.output = 0
-        self._ended = ended
+        self.doorkeeper = doorkeeper
         #: For how many clients a large chunk waits, by its id: in all, and of each account.
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
@@ -230,7 +248,7 @@ class Network:
         """A connection ended."""
         if member in self.open:
             self.open.discard(member)
-            self._ended(member)
+            self.doorkeeper.ended(member)
         self._tell_when_all_closed()
 
     def part(self, connection: socket.socket) -> None:

@@ -8,16 +8,18 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import psutil
 
 from appliance import certs
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.certs.settings import tls_files
 from appliance.clock import RELEASED, is_unset
-from appliance.config import Settings, format_size
+from appliance.config import Settings, about_size
 from appliance.listeners import Listeners
 from appliance.reload import Reload
 from appliance.ros.bridge import Bridge
@@ -25,8 +27,11 @@ from appliance.ros.figures import Meter
 from appliance.ros.status import RouteStatus
 from appliance.store import SqliteStore
 
-#: The share of `broker.limits.memory` from which on it is told that little is left.
+#: The part of a limit from which on it is told that little is left, and who has most.
 NEARLY_FULL = 0.8
+
+#: How many of those who have most of something are told.
+HOLDERS = 3
 
 
 @dataclass(slots=True)
@@ -93,6 +98,7 @@ class Status:
             "messages": self._messages(),
             "store": self._store(),
             "memory": self._memory(),
+            "short": list(self._short()),
             "ros": ros,
             "routes": routes,
             "reload": self._reload(),
@@ -180,6 +186,51 @@ class Status:
             "limit": ledger.memory,
         }
 
+    def _short(self) -> Iterator[dict[str, Any]]:
+        """What is nearly used up, by all together or by the user who has most, and who has it."""
+        broker = self._parts.broker
+        ledger, limits, own = broker.ledger, broker.limits, broker.limits.user
+        accounts, quotas, store = ledger.accounts, ledger.quotas, broker.store
+        figures: list[tuple[str, int, int, int | None, Callable[[Account], int]]] = [
+            (
+                "connections",
+                accounts.connections,
+                limits.connections,
+                own.connections,
+                _CONNECTIONS,
+            ),
+            ("sessions", accounts.sessions, limits.sessions, own.sessions, _SESSIONS),
+            ("memory", ledger.queued_bytes, ledger.memory, quotas.memory.own, _MEMORY),
+            (
+                "retained_messages",
+                accounts.retained,
+                limits.retained_messages,
+                quotas.retained.own,
+                _RETAINED,
+            ),
+            (
+                "retained_bytes",
+                accounts.retained_bytes,
+                limits.retained_bytes,
+                quotas.retained_bytes.own,
+                _RETAINED_BYTES,
+            ),
+            ("stored", store.bytes, store.size, quotas.stored.own, _STORED),
+        ]
+        for what, used, limit, most, held in figures:
+            holders = accounts.holders(held, HOLDERS)
+            is_short = limit and used >= NEARLY_FULL * limit
+            if holders and most:
+                is_short = is_short or holders[0][1] >= NEARLY_FULL * most
+            if is_short:
+                yield {
+                    "what": what,
+                    "used": used,
+                    "limit": limit,
+                    "of_user": most,
+                    "holders": [{"user": name, "held": size} for name, size in holders],
+                }
+
     def _ros(self, settings: Settings) -> dict[str, Any]:
         bridge = self._parts.bridge
         if bridge is None:
@@ -238,12 +289,8 @@ class Status:
         yield from self._parts.warnings()
         if told["store"] is not None and told["store"]["failing"]:
             yield f"{told['store']['path']} cannot be written; see the log"
-        memory = told["memory"]
-        if memory["queued"] > NEARLY_FULL * memory["limit"]:
-            yield (
-                f"{memory['queued'] / memory['limit']:.0%} of broker.limits.memory "
-                f"({format_size(memory['limit'])}) is used: new messages are refused when it is all"
-            )
+        for short in told["short"]:
+            yield _shortage(short)
         problem = told["ros"].get("problem")
         if problem and told["ros"]["state"] == "joined":
             yield f"ROS: {problem}"
@@ -270,6 +317,33 @@ def _endings(settings: Settings) -> list[certs.Ending]:
         return certs.endings(tls_files(settings.broker))
     except certs.CertificateError:  # what is in force goes on; the next reload says why
         return []
+
+
+#: What an account holds of each of what is shared.
+_CONNECTIONS: Callable[[Account], int] = attrgetter("connections")
+_SESSIONS: Callable[[Account], int] = attrgetter("sessions")
+_MEMORY: Callable[[Account], int] = attrgetter("bytes")
+_RETAINED: Callable[[Account], int] = attrgetter("retained")
+_RETAINED_BYTES: Callable[[Account], int] = attrgetter("retained_bytes")
+_STORED: Callable[[Account], int] = attrgetter("stored")
+
+#: Those that are counted in bytes.
+_SIZES = ("memory", "retained_bytes", "stored")
+
+
+def _shortage(short: dict[str, Any]) -> str:
+    """In words what is nearly used up, and who has most of it."""
+    what = short["what"]
+
+    def amount(number: int) -> str:
+        return about_size(number) if what in _SIZES else str(number)
+
+    whole = "broker.store.size" if what == "stored" else f"broker.limits.{what}"
+    text = f"{amount(short['used'])} of {amount(short['limit'])} {what} in use ({whole}"
+    if short["of_user"] is not None:
+        text += f"; one user may have {amount(short['of_user'])}: broker.limits.user.{what}"
+    most = ", ".join(f"{each['user']} {amount(each['held'])}" for each in short["holders"])
+    return f"{text}){f', most of it: {most}' if most else ''}"
 
 
 def name_of(route: RouteStatus) -> str:

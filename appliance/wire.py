@@ -83,6 +83,10 @@ class ClientProtocol:
         self._anonymous = anonymous  # what its listener says of clients without a user name
         #: The part of it that all connections of one computer share; empty for a Unix socket.
         self.host = host
+        #: Who is charged for what waits here: nobody in particular until the login.
+        self.account = network.broker.ledger.accounts.strangers
+        #: What was accepted, until there is a transport for it.
+        self._accepted: socket.socket | None = None
         self._network = network
         self._broker = network.broker
         self._ledger = network.broker.ledger
@@ -95,8 +99,6 @@ class ClientProtocol:
         # Input: what was received and waits, and what it waits for.
         self._held = _NOTHING
         self._frame = 0  # bytes of a WebSocket frame that is not complete
-        #: Who is charged for what waits here: nobody in particular until the login.
-        self._account = self._ledger.accounts.strangers
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
         self._in_turn = False
@@ -151,6 +153,7 @@ class ClientProtocol:
         # say nothing, and who it was and why is what the log is asked for.
         network = self._network
         protocol = cast(asyncio.Protocol, WebSocket(self, network) if websocket else self)
+        self._accepted = connection
         try:
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -162,13 +165,16 @@ class ClientProtocol:
                 timeout = network.connect_timeout
                 await tls.accept(connection, context, protocol, timeout, network, network.part)
         except (OSError, asyncio.TimeoutError) as error:
-            self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
+            if self in self._network.open:  # else it had to make room
+                self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
             self._forget()
         except Exception as error:
             self._broker.faults.caught("connection.begin", error, self)
             connection.close()
             self._forget()
+        finally:
+            self._accepted = None
 
     def fault(self, entry: str, error: Exception) -> None:
         """End this connection, as something that nobody expected escaped while it was served."""
@@ -293,6 +299,15 @@ class ClientProtocol:
             except Exception as error:
                 self._broker.faults.caught("connection.abort", error, self)
         self._forget()
+
+    def make_room(self) -> None:
+        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+        if not self._closing:
+            self.complain("makes room for others", "it has not logged in (broker.limits)")
+        if self._transport is None and self._accepted is not None:
+            with contextlib.suppress(OSError):  # so the handshake fails
+                self._accepted.shutdown(socket.SHUT_RDWR)
+        self.abort()
 
     # --- bytes in ------------------------------------------------------------------------------
 
@@ -436,8 +451,8 @@ class ClientProtocol:
         ledger = self._ledger
         grown = size - self._frame
         self._frame = size
-        ledger.take(self._account, grown)
-        if grown > 0 and size > ledger.reserve and not ledger.fits(self._account, 0):
+        ledger.take(self.account, grown)
+        if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
             reason = (
                 f"no memory for {size} bytes of a WebSocket frame "
                 "(broker.limits.memory, broker.limits.user.memory)"
@@ -473,7 +488,7 @@ class ClientProtocol:
         self._waiting_size -= left
         self._begun = 0
         if len(chunk) > WRITE_PORTION:
-            self._network.unshare(self._account, chunk)
+            self._network.unshare(self.account, chunk)
         else:
             self._unshared -= len(chunk)
         return memoryview(chunk)[begun:] if begun else chunk
@@ -488,9 +503,9 @@ class ClientProtocol:
         counted = self._unshared
         if self._paused and self._transport is not None:
             counted += self._transport.get_write_buffer_size()
-        network.count_output(self._account, counted - self._counted)
+        network.count_output(self.account, counted - self._counted)
         self._counted = counted
-        limit = OUTPUT_LOW_WATER if network.is_much(self._account) else OUTPUT_HIGH_WATER
+        limit = OUTPUT_LOW_WATER if network.is_much(self.account) else OUTPUT_HIGH_WATER
         size = self._output_size()
         if size > limit and self._slow is None:
             self._client.output.writable = False
@@ -585,14 +600,18 @@ class ClientProtocol:
         """Seconds of the event loop's clock."""
         return self._loop.time()
 
-    def accepted(self, account: Account) -> None:
-        """The client has logged in as this user, and may be silent now."""
+    def admit(self, account: Account) -> str:
+        """The client has logged in as this user, and may be silent now; or why it may not."""
+        refusal = self._network.doorkeeper.admit(self, account)
+        if refusal:
+            return refusal
         self._timeout.cancel()
-        self._network.count_output(self._account, -self._counted)
+        self._network.count_output(self.account, -self._counted)
         self._network.count_output(account, self._counted)
-        self._ledger.take(self._account, -self._frame)
+        self._ledger.take(self.account, -self._frame)
         self._ledger.take(account, self._frame)
-        self._account = account
+        self.account = account
+        return ""
 
     def holds(self, size: int) -> None:
         """A chunk is not little that may be the last byte of a large packet."""
@@ -666,7 +685,7 @@ class ClientProtocol:
             self._waiting.append(chunk)
             self._waiting_size += len(chunk)
             if len(chunk) > WRITE_PORTION:
-                self._network.share(self._account, chunk)
+                self._network.share(self.account, chunk)
             else:
                 self._unshared += len(chunk)
         self._write_on()
@@ -727,6 +746,7 @@ class ClientProtocol:
         if self._transport is None or self._closing:
             return
         self._closing = True
+        self._network.doorkeeper.leaves(self)
         self._timeout.cancel()
         self._timeout = self._entries.later("connection.cut", CLOSE_TIMEOUT, self._transport.abort)
         if self._waiting:
@@ -767,8 +787,9 @@ class _Gone:
         """No time passes."""
         return 0.0
 
-    def accepted(self, account: Account) -> None:
+    def admit(self, account: Account) -> str:
         """Nobody waits for it."""
+        return ""
 
     def holds(self, size: int) -> None:
         """Nothing more comes."""

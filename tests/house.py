@@ -50,6 +50,7 @@ class House:
         self.gate.set()
         self.refused: set[str] = set()
         self.callers: list[Caller] = []
+        self.strangers: list[socket.socket] = []
         self.listeners = self.make()
 
     def make(
@@ -119,6 +120,8 @@ class House:
         """The end of a test: nobody is there any more, and nothing is left of them."""
         for caller in self.callers:
             caller.hang_up()
+        for stranger in self.strangers:
+            stranger.close()
         await self.listeners.stop()
         assert not self.network.open
         assert not self.broker.clients

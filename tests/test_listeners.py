@@ -24,7 +24,8 @@ from house import Caller, House, make_contexts
 from waiting import PATIENCE, until
 
 from appliance import config, farewell, listeners, network, sockets, wire, wiring
-from appliance.broker.ports import Limits
+from appliance.broker.accounts import Accounts
+from appliance.broker.ports import Features, Limits
 from appliance.listeners import Admission, ListenerSettings
 from appliance.mqtt.packets import (
     Connack,
@@ -209,14 +210,13 @@ async def test_a_slow_login_is_part_of_the_time_to_connect(house: House):
 
 @both
 async def test_connections_over_the_limit_are_refused(house: House, tls, caplog):
+    house.broker.use(Limits(connections=2), Features())
     await house.start(connections=2)
     first, second = await house.join("1", tls=tls), await house.join("2", tls=tls)
     for _ in range(20):
-        with pytest.raises((OSError, asyncio.IncompleteReadError)):
-            await house.join("3", tls=tls)
-    assert len(house.network.open) == 2
-    await until(lambda: house.broker.counters.connections_refused == 20)
-    assert 1 <= caplog.text.count("broker.limits.connections") < 10  # not once each
+        assert await _is_refused(house, tls=tls)
+    assert house.broker.counters.connects_refused == 20
+    assert "(broker.limits.connections)" in caplog.text
     first.hang_up()
     await until(lambda: len(house.network.open) == 1)
     third = await house.join("3", tls=tls)
@@ -688,24 +688,77 @@ async def test_another_ones_unix_socket_is_not_removed(house: House, tmp_path):
 # --- limits of connections -----------------------------------------------------------------------
 
 
-async def _is_refused(house: House) -> bool:
+async def _is_refused(house: House, user: str | None = None, *, tls: bool = False) -> bool:
     try:
-        (await house.join("one-more")).hang_up()
+        caller = await house.dial(tls)
+        await caller.say(Connect("one-more", username=user))
+        answer = await caller.hear()
+        caller.hang_up()
+        assert isinstance(answer, Connack)
+        return answer.reason_code == ReasonCode.QUOTA_EXCEEDED
     except (OSError, asyncio.IncompleteReadError):
         return True
-    return False
 
 
 async def test_connections_from_one_address(house: House, caplog):
     await house.start(connections_per_address=2)
     callers = [await house.join(f"c{n}") for n in range(2)]
     assert await _is_refused(house)
-    assert house.broker.counters.connections_refused == 1
-    assert "refused: its address has 2 connections" in caplog.text
+    assert house.broker.counters.connects_refused == 1
+    assert "refused: its address has 2 connections of its user" in caplog.text
     assert "broker.limits.connections_per_address" in caplog.text
     callers[0].hang_up()
     await until(lambda: len(house.network.open) == 1)
     assert not await _is_refused(house)
+
+
+async def _say_who(caller: Caller, client_id: str, user: str) -> None:
+    await caller.say(Connect(client_id, username=user))
+    answer = await caller.hear()
+    assert isinstance(answer, Connack) and answer.reason_code == ReasonCode.SUCCESS
+
+
+async def test_what_a_user_has_from_one_address_keeps_no_other_out(house: House):
+    await house.start(connections_per_address=2)
+    for number in range(2):
+        await _say_who(await house.dial(), f"m{number}", "mallory")
+    assert await _is_refused(house, "mallory")
+    await until(lambda: len(house.network.open) == 2)
+    await _say_who(await house.dial(), "alice", "alice")
+
+
+async def test_what_a_user_has_of_all_connections_keeps_no_other_out(house: House):
+    house.broker.use(Limits(connections=3), Features())
+    await house.start(connections=3)
+    crowd = [await house.dial() for _ in range(3)]
+    for number, caller in enumerate(crowd):
+        await _say_who(caller, f"m{number}", "mallory")
+    assert await _is_refused(house, "mallory")
+    await _say_who(await house.dial(), "alice", "alice")
+    farewell = await crowd[2].hear()
+    assert isinstance(farewell, Disconnect) and farewell.reason_code == ReasonCode.QUOTA_EXCEEDED
+    await crowd[0].say(Pingreq())
+    assert isinstance(await crowd[0].hear(), Pingresp)
+
+
+@both
+async def test_strangers_keep_nobody_out(house: House, monkeypatch, caplog, tls):
+    """Neither those who say nothing, nor those in the middle of their TLS handshake."""
+    monkeypatch.setattr(listeners, "GUESTS", 4)
+    monkeypatch.setattr(listeners, "HANDSHAKES", 1000)
+    await house.start(connections=2)
+    for _ in range(3):  # more than there is room for
+        for _ in range(4):
+            sock = socket.socket()
+            sock.setblocking(False)
+            house.strangers.append(sock)
+            await asyncio.get_running_loop().sock_connect(sock, house.ports[tls])
+        await until(lambda: house.network.open)
+        (await house.join("alice", tls=tls)).hang_up()
+        await until(lambda: not house.broker.clients)
+    assert len(house.network.open) <= 5
+    assert "makes room for others" in caplog.text
+    await until(lambda: len(house.network.tasks) <= 5)
 
 
 async def test_new_connections_from_one_address(house: House, caplog):
@@ -724,38 +777,80 @@ async def test_new_connections_from_one_address(house: House, caplog):
     assert not await _is_refused(house)
 
 
+class Neighbour:
+    """A connection, as far as the addresses look at it."""
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self.account = Accounts().strangers
+
+
+def come(addresses: listeners._Addresses, host: str, now: float) -> Neighbour | None:
+    """A connection that has not logged in; None when it is refused."""
+    if addresses.come(host, now):
+        return None
+    member = Neighbour(host)
+    addresses.came(member)
+    return member
+
+
 def test_what_counts_as_one_address():
     addresses = listeners._Addresses(Admission(9, 9, 1, 100))
-    assert not addresses.admit("192.0.2.1", 0)
-    assert addresses.admit("192.0.2.1", 0)
-    assert addresses.admit("::ffff:192.0.2.1", 0)  # the same, on a listener for both
-    assert not addresses.admit("192.0.2.2", 0)
-    assert not addresses.admit("::ffff:192.0.2.3", 0)
-    assert not addresses.admit("2001:db8:1:2::1", 0)
-    assert addresses.admit("2001:db8:1:2:ffff::5", 0)  # the same network of 64 bits
-    assert not addresses.admit("2001:db8:1:3::1", 0)
-    assert not addresses.admit("fe80::1%eth0", 0)
-    addresses.leave("2001:db8:1:2::1")
-    assert not addresses.admit("2001:db8:1:2:ffff::5", 0)
+    assert come(addresses, "192.0.2.1", 0)
+    assert not come(addresses, "192.0.2.1", 0)
+    assert not come(addresses, "::ffff:192.0.2.1", 0)  # the same, on a listener for both
+    assert come(addresses, "192.0.2.2", 0)
+    assert come(addresses, "::ffff:192.0.2.3", 0)
+    member = come(addresses, "2001:db8:1:2::1", 0)
+    assert member is not None
+    assert not come(addresses, "2001:db8:1:2:ffff::5", 0)  # the same network of 64 bits
+    assert come(addresses, "2001:db8:1:3::1", 0)
+    assert come(addresses, "fe80::1%eth0", 0)
+    addresses.ended(member)
+    assert come(addresses, "2001:db8:1:2:ffff::5", 0)
+
+
+def test_each_user_is_counted_for_itself():
+    addresses, accounts = listeners._Addresses(Admission(9, 9, 2, 1000)), Accounts()
+    members = []
+    for user, allowed in (("mallory", [1, 1, 0]), ("alice", [1, 1, 0]), (None, [1, 1, 0])):
+        account = accounts.of_user(user)
+        for may in allowed:
+            member = come(addresses, "192.0.2.1", 0)
+            assert member is not None
+            assert (not addresses.admit(member, account)) == may
+            if may:
+                member.account = account
+                members.append(member)
+            else:
+                addresses.ended(member)
+    for member in members:
+        addresses.leaves(member)
+    assert addresses.oldest_guest() is members[0]
+    for member in members:
+        addresses.ended(member)
+    addresses._forget_idle(1000.0)
+    assert not addresses._known
 
 
 def test_idle_addresses_are_forgotten():
     addresses = listeners._Addresses(Admission(9, 9, 10, 10))
     for number in range(100_000):
         host = f"2001:db8:{number >> 16:x}:{number & 0xFFFF:x}::1"
-        assert not addresses.admit(host, number * 0.001)
-        addresses.leave(host)
+        member = come(addresses, host, number * 0.001)
+        assert member is not None
+        addresses.ended(member)
     assert len(addresses._known) <= 2 * listeners.ADDRESSES
     # And those that are not idle stay: 500 connections, each of an address that has had its share.
     for number in range(500):
         for _ in range(10):
-            addresses.admit(f"10.0.{number >> 8}.{number & 255}", 200.0)
+            come(addresses, f"10.0.{number >> 8}.{number & 255}", 200.0)
     for number in range(10_000):
-        host = f"2001:db8:{number:x}::1"
-        addresses.admit(host, 200.0 + number)
-        addresses.leave(host)
+        member = come(addresses, f"2001:db8:{number:x}::1", 200.0 + number)
+        assert member is not None
+        addresses.ended(member)
     for number in range(500):
-        assert addresses.admit(f"10.0.{number >> 8}.{number & 255}", 20_000.0)
+        assert not come(addresses, f"10.0.{number >> 8}.{number & 255}", 20_000.0)
 
 
 def test_files_that_may_be_open(monkeypatch, caplog):

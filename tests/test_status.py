@@ -13,9 +13,12 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 
 from appliance import cli, config
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Identity, InsideLink, Limits
 from appliance.config import reading
 from appliance.mqtt.packets import Publish
-from appliance.status import Status, topic_shown
+from appliance.status import Status, _shortage, topic_shown
+from appliance.store import MemoryStore
 
 
 def run(*arguments: str) -> int:
@@ -141,3 +144,30 @@ def test_what_ros_routes_carry_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rates == {"from_ros_a_second": 12.5, "to_ros_a_second": 20.0}
     asked._parts.bridge = None
     assert set(Status._ros_rates(asked).values()) == {0.0}  # type: ignore[arg-type]
+
+
+def test_who_has_most_is_told_when_little_is_left() -> None:
+    class Access:
+        epoch = 0
+
+        def decide(self, *args: object) -> None:
+            raise AssertionError("nobody asks")
+
+    broker = Broker(Access(), MemoryStore(), Limits(sessions=10))  # type: ignore[arg-type]
+    asked = SimpleNamespace(_parts=SimpleNamespace(broker=broker))
+
+    def come(user: str, number: int) -> None:
+        who = Identity(user, f"{user}-{number}")
+        broker.connect(InsideLink(), who, clean_start=True, expiry=60, will=None)
+
+    come("alice", 0)
+    for number in range(6):
+        come("mallory", number)
+    assert not list(Status._short(asked))  # type: ignore[arg-type]
+    for number in range(4):
+        come(f"user-{number}", 0)
+    (short,) = Status._short(asked)  # type: ignore[arg-type]
+    assert _shortage(short) == (
+        "10 of 10 sessions in use (broker.limits.sessions), most of it: "
+        "user 'mallory' 5, user 'alice' 1, user 'user-0' 1"
+    )

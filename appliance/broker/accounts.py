@@ -55,7 +55,7 @@ class Account:
     def __str__(self) -> str:
         if self.is_inside:
             return "the appliance"
-        return "anonymous clients" if self.username is None else f"user {quote(self.username)}"
+        return "the anonymous user" if self.username is None else f"user {quote(self.username)}"
 
     @property
     def connections(self) -> int:
@@ -217,16 +217,13 @@ class Accounts:
 
 
 class Quotas:
-    """What of everything a user may hold, out of the limits in force."""
+    """What of all that cannot be taken back a user may hold, out of the limits in force."""
 
-    __slots__ = ("connections", "memory", "retained", "retained_bytes", "sessions", "stored")
+    __slots__ = ("memory", "retained", "retained_bytes", "stored")
 
     def __init__(self, limits: Limits, memory: int, stored: int) -> None:
         """`memory` and `stored` are what users may use of those in all, in bytes."""
         user = limits.user
-        #: Connections and sessions can be taken back: the only limit is one that is configured.
-        self.connections = limits.connections if user.connections is None else user.connections
-        self.sessions = limits.sessions if user.sessions is None else user.sessions
         self.memory = Quota.of(memory, user.memory)
         self.retained = Quota.of(limits.retained_messages, user.retained_messages)
         self.retained_bytes = Quota.of(limits.retained_bytes, user.retained_bytes)

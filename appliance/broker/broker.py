@@ -220,9 +220,9 @@ class Broker:
         Raises:
             ProtocolError: 0x97, nobody has more than this one would have.
         """
-        accounts, limits, quotas = self.ledger.accounts, self.limits, self.ledger.quotas
+        accounts, limits, own = self.ledger.accounts, self.limits, self.limits.user
         if session is None or session.link is None:
-            if account.connections >= quotas.connections:
+            if own.connections is not None and account.connections >= own.connections:
                 raise _has_all(account, account.connections, "connections", "user.connections")
             if accounts.connections >= limits.connections:
                 holder = accounts.largest(lambda each: each.connections)
@@ -230,7 +230,7 @@ class Broker:
                     raise _has_all(account, account.connections, "connections", "connections")
                 self._take_back(holder, next(reversed(holder.present)), account, "connections")
         if session is None:
-            if account.sessions >= quotas.sessions:
+            if own.sessions is not None and account.sessions >= own.sessions:
                 raise _has_all(account, account.sessions, "sessions", "user.sessions")
             if accounts.sessions >= limits.sessions:
                 holder = accounts.largest(lambda each: each.sessions)

@@ -786,6 +786,9 @@ class Client:
         identity = Identity(username, assigned or packet.client_id)
         try:
             agreement = agree(packet, self.broker.limits)
+            refusal = self.wire.admit(self._ledger.accounts.of(identity))
+            if refusal:
+                raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, refusal)
             session, present = self.broker.connect(
                 self.output,
                 identity,
@@ -797,7 +800,6 @@ class Client:
             self._connect = packet
             self.refuse(error.code, str(error))
             return
-        self.wire.accepted(session.account)
         session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)

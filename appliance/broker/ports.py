@@ -359,8 +359,11 @@ class Wire(Protocol):
     def now(self) -> float:
         """Seconds of a clock that never goes back, finer than the broker's."""
 
-    def accepted(self, account: Account) -> None:
-        """The client has logged in as that user: the time limit for that is over."""
+    def admit(self, account: Account) -> str:
+        """The client logs in as that user: why it may not from where it is, or nothing.
+
+        With that the time limit for the login is over.
+        """
 
     def holds(self, size: int) -> None:
         """So many bytes came and wait for more: the next chunk, however small, may be costly."""

@@ -130,9 +130,6 @@ def _reload(told: dict[str, Any] | None) -> str:
 
 
 def _size(value: float) -> str:
-    """About so many bytes."""
-    for unit in ("B", "KiB", "MiB"):
-        if value < 1024:
-            return f"{value:.3g} {unit}"
-        value /= 1024
-    return f"{value:.3g} GiB"
+    from appliance.config import about_size
+
+    return about_size(value)

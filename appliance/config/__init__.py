@@ -17,6 +17,7 @@ from appliance.config.printing import (
 )
 from appliance.config.quantities import (
     Bind,
+    about_size,
     format_duration,
     format_size,
     parse_bind,
@@ -61,6 +62,7 @@ __all__ = [
     "Settings",
     "Tls",
     "TopicRoute",
+    "about_size",
     "describe",
     "find",
     "format_duration",

@@ -49,6 +49,15 @@ def format_size(value: int) -> str:
     return _in_units(value, SIZE_UNITS)
 
 
+def about_size(value: float) -> str:
+    """About so many bytes: `1.5 MiB`."""
+    for unit in ("B", "KiB", "MiB"):
+        if value < 1024:
+            return f"{value:.3g} {unit}"
+        value /= 1024
+    return f"{value:.3g} GiB"
+
+
 def format_duration(seconds: float) -> str:
     """The shortest exact way to write so many seconds, to the millisecond: `5 min`."""
     return _in_units(round(seconds * 1000), DURATION_UNITS)

@@ -187,8 +187,9 @@ class FakeWire:
     def now(self) -> float:
         return 0.0
 
-    def accepted(self, account: Account) -> None:
+    def admit(self, account: Account) -> str:
         assert not self.closed
+        return ""
 
     def holds(self, size: int) -> None:
         pass

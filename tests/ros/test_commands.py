@@ -85,8 +85,8 @@ class Wire:
     def holds(self, size):
         """Of a packet that is not whole."""
 
-    def accepted(self, account):
-        pass
+    def admit(self, account):
+        return ""
 
     def later(self):
         pass
