@@ -174,6 +174,7 @@ class Reload:
         if parts.bridge is not None:
             parts.bridge.replace(wiring.routes(settings))
             parts.bridge.calls.replace(wiring.call_routes(settings))
+            parts.bridge.forget_leftovers()
         if before.log != settings.log:
             logs.setup(settings.log.level, settings.log.levels, settings.log.format)
         parts.broker.rules_changed()

@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import timedelta
 from typing import Protocol, TypeAlias
 
 from appliance.broker.accounts import Account
@@ -310,6 +311,7 @@ class Broker:
         if session.link is not link:
             return
         session.link = None
+        session.is_told_full = False
         session.ended_well = not publish_will
         session.forget_transient()
         self._hand_over(session)
@@ -332,6 +334,21 @@ class Broker:
         if will is not None and not will.delay:
             self._publish_will(session)
         self.store.session_saved(session)
+
+    def _tell_filled(self, session: Session) -> None:
+        if session.ends_at is None:  # it is back, or has ended
+            return
+        away = timedelta(seconds=round(self.now - (session.ends_at - session.expiry)))
+        policy = self.limits.queue_full
+        what = "the oldest are dropped" if policy == "drop-oldest" else "more are dropped"
+        log.warning(
+            "%s has been away for %s, and its queue is full: %d messages wait, %s "
+            "(broker.limits.queue_messages, queue_bytes, queue_full)",
+            session,
+            away,
+            len(session.queue),
+            what,
+        )
 
     def _tell_departure(self, session: Session) -> None:
         for told in tuple(self.departures):
@@ -641,6 +658,8 @@ class Broker:
         self.complaints.tell(self.now, key, f"%s {message}", session, *args)
 
     def _tell_full(self, session: Session) -> None:
+        if session.link is None:
+            return  # that is told at the next tick, once: it is not slow, but away
         self.complain(
             session,
             "takes its messages too slowly, its queue is full (%d messages, %d bytes)",
@@ -779,6 +798,9 @@ class Broker:
         self.ledger.now = faults.now = now
         faults.run("clock.complaints", self.complaints.tick, now, otherwise=None)
         faults.run("clock.retained", self.retained.expire, now, otherwise=None)
+        filled, self.ledger.filled = self.ledger.filled, []
+        for session in filled:
+            faults.run("clock.full", self._tell_filled, session, otherwise=None)
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
             try:

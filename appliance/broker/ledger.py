@@ -75,6 +75,8 @@ class Ledger:
     congested: dict[Session, None] = field(default_factory=dict)
     #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
     overflowed: list[Session] = field(default_factory=list)
+    #: Sessions of absent clients whose queues are full, which is to be told.
+    filled: list[Session] = field(default_factory=list)
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     half_queue: int = field(init=False)

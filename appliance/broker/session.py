@@ -105,6 +105,7 @@ class Session:
         "expiry",
         "identity",
         "inflight",
+        "is_told_full",
         "large",
         "latest",
         "ledger",
@@ -140,6 +141,8 @@ class Session:
         #: Whether its last connection ended with a DISCONNECT that its will is not for.
         self.ended_well = False
         self.ends_at: float | None = None
+        #: Whether the log says that its queue is full, while its client is away.
+        self.is_told_full = False
         self.will: PendingWill | None = None
         self.will_at: float | None = None
         self.subscriptions: dict[str, Subscription] = {}
@@ -254,6 +257,7 @@ class Session:
             return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
         if ledger.limits.queue_full == "disconnect" and link is not None:
             ledger.overflowed.append(self)
+        self._is_full()
         self._drop(message)
         return False
 
@@ -310,6 +314,7 @@ class Session:
         while self.queue and not (
             len(self.queue) < ledger.limits.queue_messages and self.fits(message.size)
         ):
+            self._is_full()
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
@@ -562,6 +567,12 @@ class Session:
         if waiting is not None:
             self._uncount(waiting[0])
             self._drop(waiting[0])
+
+    def _is_full(self) -> None:
+        """Have it told, once an absence: nobody else knows what its client is missing."""
+        if self.link is None and not self.is_told_full:
+            self.is_told_full = True
+            self.ledger.filled.append(self)
 
     def _drop(self, message: Message) -> None:
         """Count a message that the client was too slow for."""

@@ -82,18 +82,26 @@ def store_prune(
         list[str] | None,
         typer.Option(metavar="ID", help="Of this client only; else its whole session. Repeatable."),
     ] = None,
+    retained: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILTER", help="Retained messages: r2d2/old, or r2d2/#. Repeatable."),
+    ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Delete sessions, or what has waited too long for them, while the appliance is stopped."""
-    if older_than is None and not client:
-        raise typer.BadParameter("say what: --older-than, --client, or both")
+    """Delete sessions, what has waited too long for them, or retained messages, while the appliance
+    is stopped.
+
+    Retained messages of routes that are gone are taken back by the appliance itself.
+    """
+    if older_than is None and not client and not retained:
+        raise typer.BadParameter("say what: --older-than, --client, both, or --retained")
     path, file = _store_path(config)
     import sqlite3
 
     from appliance.config import parse_duration
     from appliance.owners import OwnerError, acting_for
     from appliance.store import StoreError
-    from appliance.store.inspection import prune
+    from appliance.store.inspection import prune, prune_retained
 
     try:
         age = None if older_than is None else parse_duration(older_than)
@@ -101,10 +109,16 @@ def store_prune(
         raise typer.BadParameter(f"--older-than {error}") from None
     try:
         with acting_for(file, path):
-            sessions, messages = prune(path, age, client or [])
+            if retained:
+                count = prune_retained(path, retained)
+                typer.echo(f"{count} retained messages deleted")
+            if age is not None or client:
+                sessions, messages = prune(path, age, client or [])
+                typer.echo(f"{sessions} sessions and {messages} messages deleted")
+    except ValueError as error:
+        raise typer.BadParameter(f"--retained {error}") from None
     except (OwnerError, StoreError, sqlite3.Error) as error:
         raise CommandError(str(error)) from None
-    typer.echo(f"{sessions} sessions and {messages} messages deleted")
 
 
 def _store_path(config: Path | None) -> tuple[Path, Path | None]:

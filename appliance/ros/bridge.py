@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from time import time_ns
 from typing import Literal, TypeAlias
@@ -36,6 +36,7 @@ from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.lease import Leases
+from appliance.ros.leftovers import Owners, is_of_route
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payloads import CONTENT_TYPE
@@ -120,6 +121,8 @@ class Bridge:
         #: The types whose schemas are told.
         self._told: set[str] = set()
         self._session: Session | None = None
+        #: What leftovers are being looked for with.
+        self._owners: Owners | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._turns = Turns(entries, broker.ledger)
@@ -286,6 +289,7 @@ class Bridge:
         self._subscribe()
         self.calls.start()
         self._forget_schemas(self._session)
+        self.forget_leftovers()
         self._announce()
         self._meter_timer = self._entries.every("bridge.meter", METER_INTERVAL, self._meter)
         if self._diagnostics is not None:
@@ -492,6 +496,37 @@ class Bridge:
             self._broker.publish(Message(topic, b"", 0, True), session)
         self._broker.flush()
 
+    def forget_leftovers(self) -> None:
+        """Take back what routes have retained that there are no more, of this run and others."""
+        self._owners = Owners((route.settings for route in self._routes), self.calls.routes)
+        self._sweep(self._owners, self._broker.retained.find_in_steps("#"), 0)
+
+    def _sweep(
+        self, owners: Owners, steps: Iterator[tuple[str, Message] | None], count: int
+    ) -> None:
+        session = self._session
+        if session is None or owners is not self._owners:  # the routes have changed again
+            return
+        retained = self._broker.retained
+        left = []
+        has_more = False
+        for found in steps:
+            if found is None:  # so that others have their turn
+                has_more = True
+                break
+            topic, message = found
+            is_ours = retained.owner(topic).is_inside and is_of_route(message)
+            if is_ours and not owners.has(topic):
+                left.append(topic)
+        for topic in left:  # not while they are gone through
+            self._broker.publish(Message(topic, b"", 0, True), session)
+        count += len(left)
+        if has_more:
+            self._entries.soon("bridge.sweep", self._sweep, owners, steps, count)
+        elif count:
+            log.info("retained messages of routes that are gone, taken back: %d", count)
+        self._broker.flush()
+
     def _joined(self) -> None:
         log.info("on ROS as %s", self._node.name)
         self.problem = None
@@ -594,6 +629,7 @@ class Bridge:
             return False
         self._followed = routes
         self._topics = None
+        self._post(self.forget_leftovers)  # what was on its way is behind us then
         has_changed = False
         while self._leaving:
             has_changed = True

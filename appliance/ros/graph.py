@@ -92,6 +92,11 @@ class Calls:
                 self.board, self._requests, converters, node, entries, post
             )
 
+    @property
+    def routes(self) -> CallRoutes:
+        """Those that there are now."""
+        return self._routes
+
     def replace(self, routes: CallRoutes) -> None:
         """Have these routes from now on; one that was there before does not notice."""
         self._routes = routes

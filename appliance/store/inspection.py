@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
 from appliance.store.clock import KEY, Clocks, boot_id, stamp_of
 from appliance.store.database import Rows
@@ -184,6 +185,42 @@ def _now(rows: Rows) -> float:
     return clocks.wall if stamp is None else stamp.later(clocks)
 
 
+def prune_retained(path: Path, filters: list[str]) -> int:
+    """Delete the retained messages of the topics that a filter matches; returns how many.
+
+    Raises:
+        ValueError: one is no topic filter.
+        StoreError: an appliance is running, or there is no database.
+        sqlite3.Error, OSError: it cannot be written.
+    """
+    for topic_filter in filters:
+        check_filter(topic_filter)
+    rows = read(path)
+    topics = {key: cast(str, row[1]) for key, row in rows[Table.MESSAGE].items()}
+    chosen = [
+        key
+        for key, row in rows[Table.RETAINED].items()
+        if any(matches(each, topics.get(cast(int, row[1]), "")) for each in filters)
+    ]
+    batch = Batch(0, 1 << 62)
+    for key in chosen:
+        batch.remove(Table.RETAINED, key)
+    with _locked(path), contextlib.closing(connect(path)) as connection:
+        write(connection, batch)
+    return len(chosen)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    descriptor = database.lock(path)
+    if descriptor is None:
+        raise StoreError(f"{path} is in use: stop the appliance first")
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[int, int]:
     """Delete what waits for sessions for longer than so many seconds; without that, sessions.
 
@@ -202,10 +239,7 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
     missing = set(client_ids) - {row[1] for row in chosen.values()}
     if missing:
         raise StoreError(f"no session of {', '.join(map(repr, sorted(missing)))} is kept")
-    descriptor = database.lock(path)
-    if descriptor is None:
-        raise StoreError(f"{path} is in use: stop the appliance first")
-    try:
+    with _locked(path):
         batch = Batch(0, 1 << 62)
         messages = rows[Table.MESSAGE]
         limit = None if older_than is None else _now(rows) - older_than
@@ -227,6 +261,4 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
         # Messages that nothing refers to any more go at the appliance's next start.
         with contextlib.closing(connect(path)) as connection:
             write(connection, batch)
-    finally:
-        os.close(descriptor)
     return (len(chosen) if limit is None else 0), gone

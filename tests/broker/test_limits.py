@@ -552,3 +552,31 @@ def test_a_keep_alive_over_the_limit(broker: Broker, version, asked):
     peer.say_connect("id", keep_alive=asked)
     peer.let_in()
     assert bytes(peer.wire.written) == b"\x20\x02\x00\x02"
+
+
+@pytest.mark.parametrize("policy", ["refuse", "drop-oldest", "disconnect"])
+def test_an_absent_clients_full_queue_is_told_once(
+    join: Join, broker: Broker, caplog: pytest.LogCaptureFixture, policy: str
+):
+    broker.use(Limits(queue_full=policy, **SMALL), broker.features)
+    subscriber = join("subscriber", **lasting(5, 100_000))
+    subscriber.subscribe("a", 1)
+    subscriber.client.lost()
+    broker.tick(broker.now + 3723)
+    publisher = join("publisher")
+    fill(publisher, 3)
+    broker.tick(broker.now + 1)
+    assert "queue is full" not in caplog.text
+    fill(publisher, 8)
+    broker.tick(broker.now + 1)
+    (line,) = [each for each in caplog.messages if "queue is full" in each]
+    assert "client 'subscriber'" in line and "away for 1:02:0" in line
+    assert ("oldest are dropped" in line) is (policy == "drop-oldest")
+    fill(publisher, 8)
+    broker.tick(broker.now + 1)
+    assert caplog.text.count("queue is full") == 1
+    # At the next absence it is news again.
+    join("subscriber", **lasting(5, 100_000)).client.lost()
+    fill(publisher, 8)
+    broker.tick(broker.now + 1)
+    assert caplog.text.count("queue is full") == 2

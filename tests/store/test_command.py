@@ -84,6 +84,12 @@ def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -
     assert "1 sessions and 0 messages" in store(process, "prune", "--client", "first").stdout
     assert set(entries(process)) == {"second"}
     assert store(process, "prune").returncode == 2
+    assert store(process, "prune", "--retained", "r2d2/#/x").returncode == 2
+    assert "0 retained" in store(process, "prune", "--retained", "elsewhere/#").stdout
+    assert "1 retained messages deleted" in store(process, "prune", "--retained", "+/a").stdout
+    left = [json.loads(line) for line in store(process, "export").stdout.splitlines()]
+    topics = [each["retained"]["topic"] for each in left if "retained" in each]
+    assert topics == ["r2d2/_appliance/state"]
     process.start()
     with RawClient(process, 4) as client:
         assert client.connect("second", clean=False)[2] == 1
