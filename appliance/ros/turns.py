@@ -8,12 +8,13 @@ the event loop's thread.
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import thread_time
 from typing import TypeAlias, TypeVar
 
+from appliance.broker.accounts import Account
 from appliance.broker.ledger import Ledger
 from appliance.broker.session import Session
 from appliance.entries import Entries
@@ -22,7 +23,8 @@ from appliance.ros.payloads import ZSTD_MAGIC
 #: Bytes of a payload up to which converting it takes some ten microseconds.
 LITTLE = 1024
 
-#: Bytes that something takes while it waits, beside its payload.
+#: Bytes of one user that wait for their turn; each of them with so much for what is around it.
+WAITING_OF_USER = 16 * 1024 * 1024
 OVERHEAD = 1024
 
 T = TypeVar("T")
@@ -56,6 +58,7 @@ class Turns:
         #: What waits, by client; and the clients whose turn it is, by user.
         self._waiting: dict[Who, deque[_Work]] = {}
         self._users: OrderedDict[str | None, deque[Who]] = OrderedDict()
+        self._bytes: Counter[Account] = Counter()
         #: Whether the others have not had their turn yet since the last one.
         self.is_busy = False
 
@@ -64,9 +67,15 @@ class Turns:
         return who in self._waiting
 
     def has_room(self, who: Who, size: int) -> bool:
-        """Whether there is memory for so many bytes more of the client to wait in. Who has no
-        other bound for what it lets wait asks first."""
-        return who is None or self._ledger.fits(who.account, size + OVERHEAD)
+        """Whether so many bytes more of the client may wait. Who has no other bound for what it
+        lets wait asks first."""
+        if who is None:
+            return True
+        size += OVERHEAD
+        own = self._bytes[who.account]
+        # One alone needs no more than memory.
+        is_share = not own or own + size <= WAITING_OF_USER
+        return is_share and self._ledger.fits(who.account, size)
 
     def do(self, who: Who, size: int, work: Callable[[], None]) -> None:
         """Do the work, which is on a payload of so many bytes, now or when it is its turn. What it
@@ -87,13 +96,21 @@ class Turns:
     def _wait(self, who: Who, size: int, work: Callable[[], None]) -> None:
         user = user_of(who)
         size += OVERHEAD
-        if who is not None:
-            self._ledger.take(who.account, size)
+        self._count(who, size)
         queue = self._waiting.get(who)
         if queue is None:
             queue = self._waiting[who] = deque()
             self._users.setdefault(user, deque()).append(who)
         queue.append(_Work(work, size))
+
+    def _count(self, who: Who, size: int) -> None:
+        if who is None:
+            return
+        account = who.account
+        self._ledger.take(account, size)
+        self._bytes[account] += size
+        if not self._bytes[account]:
+            del self._bytes[account]
 
     def _take(self, work: Callable[[], T]) -> T | None:
         """Do it, and let the others have their turn."""
@@ -130,6 +147,5 @@ class Turns:
             self._users.move_to_end(user)
         else:
             del self._users[user]
-        if who is not None:
-            self._ledger.take(who.account, -work.size)
+        self._count(who, -work.size)
         self._take(work.do)

@@ -525,11 +525,9 @@ async def test_a_client_id_with_a_slash_gives_no_way_into_the_answers_of_another
     mallory = house.client("alice/1")
     for topic in ("r2d2/switch/_reply/alice/1", "r2d2/switch/_reply/alice/1/2"):
         mallory.send(CALL, {"data": True}, response_topic=topic)
-    plus = house.client("a/+")
-    plus.send(CALL, {"data": True}, response_topic="r2d2/switch/_reply/a/+")
-    await until(lambda: house.counters().errors.total() == 3, "the refusals")
+    await until(lambda: house.counters().errors.total() == 2, "the refusals")
     await asyncio.sleep(0.02)
-    assert house.counters().errors == {"not_authorized": 2, "bad_request": 1}
+    assert house.counters().errors == {"not_authorized": 2}
     assert switch.asked == [] and alice.received == []
     status, _ = await mallory.call(CALL, {"data": True})  # where it may publish, it has answers
     assert status == "ok"

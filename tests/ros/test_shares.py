@@ -417,7 +417,7 @@ def test_what_cannot_wait_makes_the_others_wait():
     assert done[5:] == ["then"]
 
 
-def test_what_waits_takes_memory_of_its_user():
+def test_what_waits_takes_memory_of_its_user(monkeypatch):
     clock, queue = turn_house(memory=800_000)
     a, b = Who("a"), Who("b")
     queue.do(a, LARGE, lambda: None)
@@ -428,6 +428,11 @@ def test_what_waits_takes_memory_of_its_user():
     assert a.account.bytes == count * (10_000 + turns.OVERHEAD) == queue._ledger.queued_bytes
     assert 10 < count < 60
     assert queue.has_room(b, 10_000)
+    monkeypatch.setattr(turns, "WAITING_OF_USER", 30_000)
+    assert queue.has_room(b, 100_000)  # one alone
+    while queue.has_room(b, 10_000):
+        queue.do(b, 10_000, lambda: None)
+    assert b.account.bytes == 2 * (10_000 + turns.OVERHEAD)
     while clock.soon:
         clock.round()
     assert a.account.bytes == queue._ledger.queued_bytes == 0
