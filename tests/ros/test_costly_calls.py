@@ -1,0 +1,31 @@
+"""Costly messages for a moment; `python tests/ros/costly_calls.py` is longer, and prints times."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("test_msgs.msg")
+import costly_calls
+
+pytestmark = pytest.mark.timed
+
+SECONDS = 2.0
+
+
+@pytest.fixture(scope="module")
+def attack(tmp_path_factory):
+    with costly_calls.arena(tmp_path_factory.mktemp("costly")) as attack:
+        yield attack
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["call-cbor-typed-arrays", "call-cbor-texts", "call-json-texts", "command-released"],
+)
+def test_another_client_is_served_meanwhile(attack, name):
+    """Without limits and turns the worst of these stopped it for seconds."""
+    outcome = attack(name, SECONDS)
+    # Few round trips, and a computer that may be busy: 40 of the first took 3.6 s of them.
+    problems = costly_calls.problems(outcome, p99=1.0, worst=1.0, least=1)
+    assert not problems, (problems, outcome.counts)
