@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import shutil
 import sqlite3
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -14,8 +15,9 @@ import pytest_asyncio
 from broker.conftest import Peer, check_accounts, lasting
 from broker.test_broker import FakeLink
 
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Limits
+from appliance.broker.ports import InsideLink, Limits
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Disconnect,
@@ -525,3 +527,68 @@ async def test_whatever_happens_is_there_again(tmp_path: Path, seed: int) -> Non
         assert twin.store.bytes == house.store.bytes
         await twin.stop()
     await house.stop()
+
+
+async def test_whose_all_of_it_is_is_known_after_a_restart(house: House, tmp_path: Path) -> None:
+    for user in ("alice", "mallory", None):
+        for number in range(2):
+            peer = await house.join(f"{user}-{number}", user=user, **lasting(5))
+            peer.send(Subscribe(1, [Subscription(f"{user}/queue", 1)]))
+            peer.send(Publish(f"{user}/{number}", b"retained", 1, True, packet_id=1))
+            peer.lose()
+    publisher = await house.join("publisher", user="alice")
+    for user in ("alice", "mallory", None):
+        publisher.send(Publish(f"{user}/queue", b"owed", 1, packet_id=1))
+    inside = house.broker.attach("inside", InsideLink())
+    house.broker.publish(Message("state", b"online", 1, True), inside)
+    publisher.lose()
+    house.broker.flush()
+    await house.written()
+
+    def figures(broker: Broker) -> dict[str, tuple[object, ...]]:
+        accounts = broker.ledger.accounts
+        users = [accounts.of_user(user) for user in ("alice", "mallory", None)]
+        return {
+            str(each): (
+                [session.client_id for session in each.absent],
+                each.bytes,
+                each.retained,
+                each.retained_bytes,
+                each.stored,
+            )
+            for each in (*users, accounts.inside)
+        }
+
+    before = figures(house.broker)
+    assert before["the appliance"][2] == 1
+    assert before["user 'mallory'"][0] == ["mallory-0", "mallory-1"]
+    assert before["user 'mallory'"][2] == 2 and before["user 'mallory'"][4]
+    again = house.twin(tmp_path / "again")
+    assert figures(again.broker) == before
+    check_accounts(again.broker)
+    await again.stop()
+
+
+async def test_a_store_of_an_older_appliance_does_not_say_whose_a_message_is(
+    house: House, tmp_path: Path
+) -> None:
+    peer = await house.join("peer", user="alice")
+    peer.send(Publish("t", b"kept", 1, True, packet_id=1))
+    await house.written()
+    older = tmp_path / "older"
+    older.mkdir()
+    (older / "state").mkdir()
+    await house.stop()
+    shutil.copyfile(house.path, older / "state/store.db")
+    with contextlib.closing(sqlite3.connect(older / "state/store.db")) as database:
+        for column in ("username", "inside"):
+            database.execute(f"ALTER TABLE retained DROP COLUMN {column}")
+        database.execute("UPDATE about SET version = 3")
+        database.execute("PRAGMA user_version = 3")
+        database.commit()
+    again = House(older, house.limits, **house.options).start()
+    message = again.broker.retained.get("t")
+    assert message is not None and message.payload == b"kept"
+    assert again.broker.ledger.accounts.of_user(None).retained == 1
+    await again.written()
+    await again.stop()
