@@ -641,7 +641,12 @@ def import_service(name: str) -> Any:
 
 
 def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+    if "have the security libraries" in str(error):
+        return (
+            "ROS_SECURITY_ENABLE is true, and this Fast DDS was built without security, as PyPI's "
+            "is: source a ROS distribution's, or unset it"
+        )
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _errors() -> tuple[type[Exception], ...]:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 from appliance.environment import for_other_programs
 from appliance.ros import discovery, fastdds
@@ -143,3 +144,21 @@ def test_another_computer_of_the_network():
     subnet["elsewhere"] = [name for name in subnet["elsewhere"] if name != "one without a name"]
     assert subnet == {"heard": ["far", "near"], "elsewhere": ["/far"], "open": True}
     assert localhost == {"heard": ["near"], "elsewhere": [], "open": False}
+
+
+async def test_with_security_enforced_and_no_keys_nothing_is_joined(monkeypatch, tmp_path):
+    pytest.importorskip("rclpy")
+    from appliance.ros.ros2 import Ros2Node
+
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+    monkeypatch.setenv("ROS_SECURITY_KEYSTORE", str(tmp_path))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
+    node, looks, failures = Ros2Node(arguments=("--enclave", "/appliance")), [], []
+    node.start(lambda: looks.append(1), failures.append)
+    try:
+        await until(lambda: failures or looks, "the refusal")
+    finally:
+        node.stop()
+    assert looks == []
+    assert str(tmp_path / "enclaves/appliance") in failures[0] and "\n" not in failures[0]
