@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from appliance import config
+from appliance import config, wiring
+from appliance.broker.ports import UserLimits
 from appliance.config import Bind, ConfigError, Settings, reading
 
 REFERENCE = Path(__file__).parent.parent / "appliance.yaml"
@@ -659,3 +660,15 @@ def test_a_file_that_may_not_be_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(Path, "is_file", is_file)
     with pytest.raises(ConfigError, match="run this as the appliance's user, or as root"):
         config.load(tmp_path / "appliance.yaml")
+
+
+def test_the_limits_of_a_user_reach_the_broker() -> None:
+    assert wiring.broker_limits(loads("robot: r2")).user == UserLimits()
+    text = "robot: r2\nbroker: {limits: {user: {connections: 7, memory: 3 MiB, stored: 0 B}}}"
+    settings = loads(text)
+    assert wiring.broker_limits(settings).user == UserLimits(
+        connections=7, memory=3 << 20, stored=0
+    )
+    assert loads(yaml.safe_dump(config.describe(settings))).model_dump() == settings.model_dump()
+    with pytest.raises(ConfigError, match=r"broker\.limits\.user\.sessions.*at least 1"):
+        loads("robot: r2\nbroker: {limits: {user: {sessions: 0}}}")
