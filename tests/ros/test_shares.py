@@ -18,6 +18,7 @@ from appliance.broker.ledger import Ledger
 from appliance.broker.ports import Identity, Limits
 from appliance.entries import Entries
 from appliance.ros import actions, turns
+from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import CallLimits
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import load_description
@@ -29,6 +30,7 @@ from appliance.store import MemoryStore
 CONVERTERS = Converters(load_description)
 SET_BOOL, ARRAYS = "std_srvs/srv/SetBool", "test_msgs/srv/Arrays"
 FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
+STRING = "std_msgs/msg/String"
 CALL, GOAL, STOP = "r2d2/slow/_call", "r2d2/walk/_goal", "r2d2/walk/_cancel"
 
 
@@ -282,6 +284,60 @@ async def test_errors_of_size_say_which_limit(house):
         code, text = await client.error(f"r2d2/{topic}", payload)
         assert (code, expected in text) == ("too_large", True), text
     assert asked == [] or len(asked) == 1  # the look at the parameters
+
+
+async def test_who_may_not_call_has_nothing_converted(house):
+    slow = await begin(house, CallLimits(client=1))
+    house.rules.deny("alice", "publish", "forbidden")
+    client = house.client("alice")
+    nonsense = b"not JSON" * 1000
+    code, _ = await client.error(CALL, nonsense)
+    assert code == "bad_request"
+    client.send(f"{CALL}/1", {"data": True})
+    await until(lambda: slow.waiting, "the call")
+    assert (await client.error(CALL, nonsense))[0] == "too_many"
+    before = house.counters().errors["not_authorized"]
+    client.send(CALL, nonsense, response_topic="forbidden")
+    assert house.counters().errors["not_authorized"] == before + 1
+    slow.finish()
+
+
+async def test_commands_and_calls_of_a_client_stay_in_order(house):
+    routes = [RouteSettings(f"/{name}", "ros", f"r2d2/{name}", STRING) for name in ("a", "b")]
+    house.start(service("/slow", timeout=60.0), topics=routes)
+    slow = Slow(house)
+    peers = [house.node.add_subscriber(f"/{name}", STRING) for name in ("a", "b")]
+    await until(lambda: len(house.bridge.topics()) == 2, "the routes")
+    alice, bob = house.client("alice"), house.client("bob")
+    bob.send("r2d2/b", {"data": "b" * 5000})  # it has its turn now, and the others wait
+    for number in range(3):
+        alice.send("r2d2/a", {"data": f"{number}" + "a" * 5000})
+    alice.send("r2d2/a", {"data": "little"})
+    alice.send(f"{CALL}/1", {"data": True})
+    bob.send("r2d2/b", {"data": "little, too"})
+    assert [len(peer.received) for peer in peers] == [0, 2]
+    assert house.broker.ledger.queued_bytes > 15_000
+    texts = CONVERTERS.get(STRING)
+    await until(lambda: len(peers[0].received) == 4, "all commands")
+    order = [texts.to_dict(cdr)["data"][:2] for cdr in peers[0].received]
+    assert order == ["0a", "1a", "2a", "li"]
+    await until(lambda: slow.waiting, "the call that was behind them")
+    slow.finish()
+    assert alice.session.account.bytes < 5000
+
+
+async def test_who_has_too_much_waiting_is_told_so(house, monkeypatch):
+    monkeypatch.setattr(turns, "WAITING_OF_USER", 20_000)
+    house.start(topics=[RouteSettings("/a", "ros", "r2d2/a", STRING)])
+    peer = house.node.add_subscriber("/a", STRING)
+    await until(lambda: house.bridge.topics(), "the route")
+    alice = house.client("alice")
+    for _ in range(6):
+        alice.send("r2d2/a", {"data": "a" * 5000})
+    objection = house.broker.objection
+    assert objection.code == 0x97 and "waits to be converted" in objection.reason
+    await until(lambda: len(peer.received) == 4, "those that had room")
+    assert house.bridge.topics()[0].errors == 2
 
 
 # the table
