@@ -243,6 +243,9 @@ class World:
     def _look(self) -> None:
         broker = self.broker
         check_accounts(broker)
+        assert not broker.faults.count, (
+            broker.faults.last
+        )  # what was contained is found all the same
         limits = broker.limits
         # What there was room for at its PUBREC is delivered though there is none left at PUBREL.
         assert broker.ledger.queued_bytes <= 2 * limits.memory

@@ -143,7 +143,8 @@ class Arena:
             problems.append(f"the audit log was flooded: {audited} lines in {took:.1f} s")
         if len(log) > LINE * allowed:
             problems.append(f"the log was flooded: {len(log)} bytes in {took:.1f} s")
-        for sign in ("Traceback", "internal error", "never awaited", "Exception in"):
+        signs = ("Traceback", "internal error", "never awaited", "Exception in", "a fault in the")
+        for sign in signs:
             if sign in log:
                 at = log.index(sign)
                 problems.append(f"in the log: {log[max(0, at - 300) : at + 1000]}")
