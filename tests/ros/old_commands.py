@@ -42,7 +42,7 @@ TWIST = "geometry_msgs/msg/Twist"
 
 #: Seconds: `expire` of the route, and what a busy computer may add to an age.
 EXPIRE = 0.5
-TOLERANCE = 0.4
+TOLERANCE = 0.7
 
 #: Commands a second of a stream, and the last that may be the first to move the robot: it is the
 #: third to come at this pace, and an interpreter that warms up sends some in one go before.
@@ -162,7 +162,8 @@ class Robot:
         self.moved: dict[int, list[Moved]] = {}
         self.stops = 0
 
-    async def start(self):
+    async def start(self, *, is_reached):
+        """`is_reached`: there is a network before it."""
         from test_ros2 import Peer
 
         await asyncio.to_thread(self.appliance.start)
@@ -171,7 +172,8 @@ class Robot:
         await self.peer.start("robot")
         await self.peer.do("subscribe", "/cmd_vel", TWIST)
         await until(lambda: self.stops, "the stop message of the start")
-        await self.network.mend()
+        if is_reached:
+            await self.network.mend()
 
     def append(self, received):
         """The node has received a message."""
@@ -311,19 +313,17 @@ class Scenarios:
             f"{times} connections of each: {[client.connected for client in self.clients]}",
         )
 
-    async def _bridges_connected(self, before):
-        """A bridge is not asked: the appliance knows when all are there."""
+    async def _all_back(self, before):
+        """A bridge is not asked: the appliance knows when all are there again."""
         await until(
             lambda: self.robot.connections >= before + len(self.clients),
             f"{len(self.clients)} connections in the log",
         )
 
     async def _connect(self, *then):
-        before = self.robot.connections
         for client in self.clients:
             client.do("connect", *then)
         await self._all_connected()
-        await self._bridges_connected(before)
 
     async def _all_done(self, done):
         await until(
@@ -360,7 +360,7 @@ class Scenarios:
         await asyncio.sleep(AWAY)
         before = self.robot.connections
         stops = await self.robot.start_again()
-        await self._bridges_connected(before)
+        await self._all_back(before)
         # The appliance finds the node again while clients flush their queues.
         await until(lambda: self.robot.stops > stops, "the stop message of the start")
         return await self._steer_again(f"restart, {how.name}")
@@ -383,7 +383,7 @@ class Scenarios:
         await asyncio.sleep(AWAY)
         before = self.robot.connections
         await self.robot.network.mend()
-        await self._bridges_connected(before)
+        await self._all_back(before)
         return await self._steer_again("network gone")
 
     async def network_stalls(self):
@@ -401,7 +401,6 @@ class Scenarios:
 
     async def never_seen(self):
         """They steer before their first connection."""
-        await self.robot.network.cut()
         before = self.robot.connections
         for client in self.clients:
             client.do("connect")
@@ -409,7 +408,7 @@ class Scenarios:
         await self._all_done(1)
         await asyncio.sleep(AWAY)
         await self.robot.network.mend()
-        await self._bridges_connected(before)
+        await self._all_back(before)
         return await self._steer_again("never seen before")
 
     async def single(self):
@@ -474,9 +473,13 @@ async def run(scenario, kinds, versions=("3.1.1", "5"), qualities=(0, 1)) -> lis
         each = itertools.product(kinds, versions, qualities)
         clients = [Client(*what, index + 1, robot) for index, what in enumerate(each)]
         try:
-            await robot.start()
+            is_reached = scenario != "never_seen"
+            await robot.start(is_reached=is_reached)
             for client in clients:
                 await client.start()
+            if is_reached:  # what a bridge queues before, alone, has no age
+                bridges = sum(client.kind == "bridge" for client in clients)
+                await until(lambda: robot.connections >= bridges, "the bridges' connections")
             return await getattr(Scenarios(robot, clients), scenario)()
         finally:
             for client in clients:
@@ -490,7 +493,7 @@ async def mosquitto_pub(version: str, qos: int) -> Outcome:
     with tempfile.TemporaryDirectory() as directory:
         robot = Robot(Path(directory))
         try:
-            await robot.start()
+            await robot.start(is_reached=False)
             payload = json.dumps({"linear": {"x": 1, "y": time.monotonic(), "z": 1}})
             process = await asyncio.create_subprocess_exec(
                 *("mosquitto_pub", "-h", HOST, "-p", str(robot.ports[1]), "-q", str(qos)),

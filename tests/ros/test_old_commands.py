@@ -13,6 +13,8 @@ from test_ros2 import domain
 
 __all__ = ["domain"]  # a fixture for all tests here
 
+pytestmark = pytest.mark.timed
+
 has_mqttjs = shutil.which("node") and (HERE.parent / "interop/mqttjs/node_modules/mqtt").exists()
 KINDS = ["paho", *(["mqttjs"] if has_mqttjs else []), *(["bridge"] if MOSQUITTO else [])]
 
