@@ -182,7 +182,8 @@ class Commands(ToRos):
     def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
         if self._is_left or (retain and not self.rules.take_retained):
             return None
-        now = self._around.entries.time()
+        # When it was received: what came in one chunk came at once, however long it takes.
+        now = self._around.broker.now
         verdict = Verdict.CARRY_OUT
         try:
             why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)

@@ -126,6 +126,8 @@ class Driver:
         self.wire.written = b""
 
     def say(self, *packets):
+        # As a connection does it, once for all that it has received.
+        self.broker.ledger.now = asyncio.get_running_loop().time()
         self.client.receive(b"".join(packet.encode(self.version) for packet in packets))
         self.broker.flush()
 
@@ -784,8 +786,7 @@ async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
     driver.cut()
     assert house.robot.received == [twist(0.5), STOP]
     driver = Driver(house.broker, "a")
-    for _ in range(50):
-        driver.drive(qos=1)
+    driver.say(*[Publish(TOPIC, GO, qos=1, packet_id=7)] * 50)
     assert house.counters().expired == 50
     await asyncio.sleep(1.2 * AFTER)
     driver.drive(b"{}")  # it stops by itself, and is trusted when it comes back
@@ -860,8 +861,7 @@ async def test_what_a_driver_had_queued_while_the_appliance_was_away(house):
     away.cut()
     house.start(CommandRules(on_silence=OnSilence(AFTER)))
     driver = Driver(house.broker, "a", clean=False, expiry=60)
-    for _ in range(50):
-        driver.drive(qos=1)
+    driver.say(*[Publish(TOPIC, GO, qos=1, packet_id=7)] * 50)
     assert house.counters().expired == 50
     Driver(house.broker, "b").steer()
     assert house.robot.received == [twist(0.5)]
@@ -1002,6 +1002,13 @@ class TestArrivals:
         sender.rest(1)
         assert sender.moved == []
 
+    def test_the_end_of_a_queue_behind_a_pause(self, qos):
+        sender = Sender(qos)
+        for gap in (0, 0.001, 0.001, 0.3):
+            sender.say(gap)
+        sender.rest(1)
+        assert sender.moved == []
+
     def test_who_is_always_fast_is_heard_at_last(self, qos):
         sender = Sender(qos)
         while not sender.moved:
@@ -1114,6 +1121,33 @@ async def test_a_queue_behind_connect(house, version, qos, rules):
     assert house.robot.received == []
     (topic,) = house.bridge.topics()
     assert topic.last_error == "a command was too old: others came with it at once, as of a queue"
+
+
+async def test_what_came_at_once_is_a_queue_however_long_it_takes(house, monkeypatch):
+    """On a busy computer, a turn of the loop may be as long as the time between two commands."""
+    house.start(CommandRules(expire=0.5))
+    convert = house.commands._convert
+
+    def slowly(message, origin):
+        time.sleep(0.02)
+        return convert(message, origin)
+
+    monkeypatch.setattr(house.commands, "_convert", slowly)
+    Driver(house.broker, "a").say(*[Publish(TOPIC, GO)] * 5)
+    await asyncio.sleep(0.2)
+    assert house.robot.received == []
+
+
+@pytest.mark.parametrize("client", ["a", "b"])
+async def test_a_client_id_that_is_taken_over(house, client):
+    """The connection is another: what waits of the first is not carried out, and it begins anew."""
+    house.start(CommandRules(expire=0.5))
+    first = Driver(house.broker, "a", clean=False, expiry=60)
+    first.drive(b'{"linear":{"x":9}}')
+    other = Driver(house.broker, client, clean=False, expiry=60)
+    other.say(*[Publish(TOPIC, GO)] * 3)
+    await asyncio.sleep(0.3)
+    assert house.robot.received == ([] if client == "a" else [twist(9)])
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
@@ -1247,8 +1281,8 @@ async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(house):
 async def test_a_message_expiry_that_is_left_proves_nothing(house):
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a")
-    for _ in range(3):
-        driver.drive(properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
+    command = Publish(TOPIC, GO, properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
+    driver.say(command, command, command)
     await asyncio.sleep(0.2)
     assert house.robot.received == []
 
