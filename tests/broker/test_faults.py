@@ -192,7 +192,7 @@ def test_one_keep_alive_will_session_and_retained_message_that_fail(broker, stor
     for n in "abc":
         silent = join(broker, f"silent-{n}", keep_alive=10)
         if n == "b":
-            silent.client.output.end = fail  # of no use compiled: `end` is then not looked up
+            silent.wire.write = fail
         willing = join(
             broker,
             f"willing-{n}",
