@@ -66,6 +66,9 @@ log = logging.getLogger(__name__)
 #: The effort of a packet that is not of the data path.
 PACKET_EFFORT = 5
 
+#: Bytes of an unfinished packet, such as a CONNECT before its login, that there is always room for.
+SMALL_PACKET = 1024
+
 #: And of the end of a connection that broke the protocol.
 FAILURE_EFFORT = 50
 
@@ -211,7 +214,11 @@ class Client:
         ledger.take(self.account, grown)
         ledger.input_bytes += grown
         self.wire.holds(self._held)
-        if grown > 0 and self._held > ledger.reserve and not ledger.fits(self.account, 0):
+        if (
+            grown > 0
+            and self._held > max(ledger.reserve, SMALL_PACKET)
+            and not ledger.fits(self.account, 0)
+        ):
             self.fail(
                 ProtocolError(
                     ReasonCode.QUOTA_EXCEEDED,
@@ -782,6 +789,8 @@ class Client:
         packet, self._connect = self._connect, None
         if self._closed or packet is None:
             return
+        self.connection.forget_connect()
+        self._count_held()
         assigned = None if packet.client_id else "auto-" + str(uuid.uuid4()).upper()
         identity = Identity(username, assigned or packet.client_id)
         try:

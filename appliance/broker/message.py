@@ -81,13 +81,9 @@ class Message:
         self.wire_head = b""
         #: Bytes that a queue counts for this message: its topic is there as a string, and twice in
         #: bytes.
-        self.size = (
-            len(payload)
-            + 2 * len(self.topic_wire)
-            + text_size(topic)
-            + len(self.properties_wire)
-            + OVERHEAD
-        )
+        wire = len(self.topic_wire)
+        text = wire if topic.isascii() else text_size(topic)
+        self.size = len(payload) + 2 * wire + text + len(self.properties_wire) + OVERHEAD
 
     @property
     def properties(self) -> Properties | None:

@@ -17,6 +17,9 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 #: network has taken these: it is the network that says how fast a client is.
 OUTPUT_LIMIT = 1024 * 1024
 
+#: The longest topic, in bytes, that is given a number: the names are kept for each client.
+LONGEST_ALIASED = 512
+
 #: What a refusal is sent as when it has a reason string, by its first byte.
 _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
@@ -198,9 +201,13 @@ class Output:
             alias = aliases.get(message.topic, 0)
             if alias:
                 named = False
-            elif len(aliases) < self._alias_maximum and (
-                not self.maximum_packet_size
-                or (message.size < self.maximum_packet_size and not subscription_ids)
+            elif (
+                len(aliases) < self._alias_maximum
+                and len(message.topic_wire) <= LONGEST_ALIASED
+                and (
+                    not self.maximum_packet_size
+                    or (message.size < self.maximum_packet_size and not subscription_ids)
+                )
             ):
                 alias = aliases[message.topic] = len(aliases) + 1
         return message.encode_for(

@@ -11,16 +11,24 @@ from appliance.broker.complaints import Complaints
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Message
 from appliance.broker.session import LEVEL_SIZE
-from appliance.mqtt.codec import quote
+from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
 
 #: Retained messages that one tick lets expire.
 EXPIRED_A_TURN = 1024
 
 
+#: What is kept of a retained message beside it, in bytes: whose it is, and when it expires.
+OWNER_SIZE = 128
+EXPIRY_SIZE = 320
+
+
 def retained_size(message: Message) -> int:
     """Bytes that are counted for a retained message: it, and its topic's levels in the tree."""
-    return message.size + LEVEL_SIZE * message.topic.count("/")
+    topic = message.topic
+    size = message.size + OWNER_SIZE + (EXPIRY_SIZE if message.expires_at is not None else 0)
+    levels = topic.count("/")
+    return size + (text_size(topic) + LEVEL_SIZE * levels if levels else 0)
 
 
 class Retained:
@@ -40,8 +48,11 @@ class Retained:
         self._changed = changed
         self._messages: TopicTree[Message] = TopicTree()
         self._owners: dict[str, Account] = {}
-        #: When they expire, soonest first.
-        self._expiring: list[tuple[float, int, Message]] = []
+        #: When they expire, soonest first, each with a number. Those that were replaced or deleted
+        #: meanwhile are here, too, but as two numbers only.
+        self._expiring: list[tuple[float, int]] = []
+        self._numbers: dict[str, int] = {}
+        self._topics: dict[int, str] = {}
         self._order = itertools.count()
 
     def __len__(self) -> int:
@@ -107,6 +118,9 @@ class Retained:
         size = retained_size(old)
         self.bytes -= size
         self._ledger.accounts.retain(self._owners.pop(old.topic), -1, -size)
+        number = self._numbers.pop(old.topic, None)
+        if number is not None:
+            del self._topics[number]
 
     def _has_room(self, message: Message, old: Message | None, owner: Account) -> bool:
         """Whether it may take the old one's place, which makes room for it whosever it is."""
@@ -153,12 +167,13 @@ class Retained:
     def _schedule_expiry(self, message: Message) -> None:
         if message.expires_at is None:
             return
-        heapq.heappush(self._expiring, (message.expires_at, next(self._order), message))
+        number = next(self._order)
+        self._numbers[message.topic] = number
+        self._topics[number] = message.topic
+        heapq.heappush(self._expiring, (message.expires_at, number))
         # Those that were replaced are not kept until their time comes.
-        if len(self._expiring) > 2 * len(self._messages) + 64:
-            self._expiring = [
-                entry for entry in self._expiring if self._messages.get(entry[2].topic) is entry[2]
-            ]
+        if len(self._expiring) > 2 * len(self._topics) + 64:
+            self._expiring = [entry for entry in self._expiring if entry[1] in self._topics]
             heapq.heapify(self._expiring)
 
     def expire(self, now: float) -> None:
@@ -166,6 +181,7 @@ class Retained:
         left = EXPIRED_A_TURN
         while left and self._expiring and self._expiring[0][0] <= now:
             left -= 1
-            _, _, message = heapq.heappop(self._expiring)
-            if self._messages.get(message.topic) is message:
-                self._ledger.faults.run("clock.expiry", self.delete, message.topic, otherwise=None)
+            _, number = heapq.heappop(self._expiring)
+            topic = self._topics.get(number)
+            if topic is not None:
+                self._ledger.faults.run("clock.expiry", self.delete, topic, otherwise=None)

@@ -8,7 +8,7 @@ from appliance.broker.ledger import Ledger
 from appliance.broker.ports import Access, Action, Asked, Decision, Guard, Identity, Question
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target
-from appliance.mqtt.codec import decode_string
+from appliance.mqtt.codec import decode_string, text_size
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import SubscriptionTree, check_topic, parse_shared
@@ -20,8 +20,12 @@ CACHED_ROUTES = 1024
 #: And the longest of these topics, in bytes.
 CACHED_TOPIC = 512
 
-#: Entries and targets in the caches of all sessions together, some 80 bytes each.
-CACHED_IN_ALL = 500_000
+#: What an entry of these caches takes, in bytes, beside the topic; and each of its targets.
+ROUTE_SIZE = 350
+TARGET_SIZE = 96
+
+#: The part of `limits.memory` that the caches of all sessions may take beside it.
+CACHED_IN_ALL = 1 / 8
 
 #: Questions about one route that a message waits for at a time.
 UNDECIDED = 16
@@ -76,7 +80,7 @@ class Router:
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
             SubscriptionTree()
         )
-        #: Entries and targets that went into the sessions' caches since these were last cleared.
+        #: Bytes that went into the sessions' caches since these were last cleared.
         self._cached = 0
 
     def __len__(self) -> int:
@@ -128,10 +132,13 @@ class Router:
             route = self._find_route(session, topic_wire)
             if len(topic_wire) <= CACHED_TOPIC and not route.undecided:
                 session.routes[topic_wire] = route
-                self._cached += 1 + len(route.targets)
-                if self._cached > CACHED_IN_ALL:
-                    self._clear_caches()
+                self._count_cached(_route_size(route, topic_wire))
         return route
+
+    def _count_cached(self, size: int) -> None:
+        self._cached += size
+        if self._cached > self._ledger.limits.memory * CACHED_IN_ALL:
+            self._clear_caches()
 
     def _clear_caches(self) -> None:
         self._cached = 0
@@ -257,7 +264,7 @@ class Router:
             allowed = decision.allowed
             if len(topic) <= CACHED_TOPIC and not decision.pending:
                 readable[topic] = allowed
-                self._cached += 1
+                self._cached += TARGET_SIZE + text_size(topic)
         return allowed
 
     def may_keep(self, session: Session, topic: str) -> bool:
@@ -268,3 +275,12 @@ class Router:
         if session.identity is None or self.may_receive(session, topic):
             return True
         return self.decide(session.identity, Action.RECEIVE, topic).pending
+
+
+def _route_size(route: Route, topic_wire: bytes) -> int:
+    """Bytes that a route takes in the cache of its session."""
+    size = ROUTE_SIZE + text_size(route.topic) + len(topic_wire)
+    members = [target for _, members in route.shares for target in members]
+    for _, _, _, ids in (*route.targets, *members):
+        size += TARGET_SIZE + 8 * len(ids or ())
+    return size

@@ -12,6 +12,7 @@ from appliance.broker.backpressure import Congestion
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Link
+from appliance.mqtt.codec import text_size
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
@@ -50,10 +51,14 @@ SUBSCRIPTION_SIZE = 600
 LEVEL_SIZE = 350
 
 
+#: What QoS 2 keeps of a message beside it until its PUBREL, and of each that had no room for it.
+HELD_SIZE = 200
+FULL_SIZE = 64
+
+
 def subscription_size(topic_filter: str) -> int:
     """Bytes that are counted for a subscription: the filter is in the session, and in the tree."""
-    text = len(topic_filter) * (1 if topic_filter.isascii() else 4)
-    return SUBSCRIPTION_SIZE + 2 * text + LEVEL_SIZE * topic_filter.count("/")
+    return SUBSCRIPTION_SIZE + 2 * text_size(topic_filter) + LEVEL_SIZE * topic_filter.count("/")
 
 
 #: Keys for messages that wait, in the order of their coming.
@@ -67,6 +72,11 @@ class Held(NamedTuple):
     full: frozenset[Session | Share]
     #: When it came, in seconds of `Wire.now`; not known when it was sent on another connection.
     since: float = -math.inf
+
+
+def held_size(held: Held) -> int:
+    """Bytes that are counted for it."""
+    return held.message.size + HELD_SIZE + FULL_SIZE * len(held.full)
 
 
 class PendingWill(NamedTuple):
@@ -464,7 +474,7 @@ class Session:
             if delivery is not None:
                 self._count(delivery[0])
         for held in received.values():
-            self._count(held.message)
+            self._take(held_size(held))
         self._last_packet_id = next(reversed(inflight), 0)
 
     def resend(self) -> None:
@@ -675,11 +685,11 @@ class Session:
 
     def hold(self, packet_id: int, held: Held) -> bool:
         """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
-        if not self.fits(held.message.size):
+        if not self.fits(held_size(held)):
             return False
         held.message.settle()
         self.received[packet_id] = held
-        self._count(held.message)
+        self._take(held_size(held))
         if self.expiry:
             self.ledger.store.held(self, packet_id, held)
         return True
@@ -693,7 +703,7 @@ class Session:
         """The message that PUBREL releases, once."""
         held = self.received.pop(packet_id, None)
         if held is not None:
-            self._uncount(held.message)
+            self._take(-held_size(held))
             if self.expiry:
                 self.ledger.store.unheld(self, packet_id)
         return held

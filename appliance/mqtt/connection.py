@@ -52,6 +52,12 @@ _ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
 _MQTT_5 = b"\0\4MQTT\5"
 
 
+#: Chunks of a packet up to this size, in bytes, are joined as they come.
+SMALL_CHUNK = 4096
+
+#: What a topic alias takes beside its topic, in bytes.
+ALIAS_SIZE = 150
+
 #: Bytes of a User Property that is empty.
 SHORTEST_PAIR = 5
 
@@ -142,6 +148,8 @@ class Connection:
         self._have = 0
         self._need = 0
         self._aliases: dict[int, str] = {}
+        #: Bytes of a CONNECT that nobody knows yet who sent it.
+        self._connecting = 0
         #: Bytes that the aliases' topics take.
         self._aliased = 0
         #: The last PUBLISH of the data path: its bytes from the header to the topic's end, and what
@@ -154,8 +162,9 @@ class Connection:
 
     @property
     def held(self) -> int:
-        """Bytes of memory: received and not yet taken apart, and for topic aliases."""
-        return self._have + self._aliased
+        """Bytes of memory: received and not done with, a CONNECT until the end of the login, and
+        for topic aliases."""
+        return self._have + self._connecting + self._aliased
 
     @property
     def paused(self) -> bool:
@@ -170,6 +179,10 @@ class Connection:
         """Go on; `receive_data(b"")` yields what came in the meantime."""
         self._reading = True
 
+    def forget_connect(self) -> None:
+        """It is known who sent the CONNECT: what of it stays is counted elsewhere."""
+        self._connecting = 0
+
     def accept(self) -> None:
         """The client has logged in; `receive_data(b"")` yields what came in the meantime."""
         self.state = State.CONNECTED
@@ -182,7 +195,7 @@ class Connection:
         self._chunks.clear()
         self._have = 0
         self._aliases.clear()
-        self._aliased = 0
+        self._aliased = self._connecting = 0
 
     def receive_data(self, data: bytes) -> Iterable[Event]:
         """What `data`, behind what came before it, completes.
@@ -210,8 +223,12 @@ class Connection:
         """`receive_data`, the way that always works."""
         if self._have:
             # A packet cut into many chunks is joined once, when it is whole: joining at every
-            # chunk would copy a 16 MiB packet a hundred times over.
-            self._chunks.append(data)
+            # chunk would copy a 16 MiB packet a hundred times over. Tiny ones are joined at once,
+            # as each would take many times its bytes.
+            if len(self._chunks[-1]) < SMALL_CHUNK:
+                self._chunks[-1] += data
+            else:
+                self._chunks.append(data)
             self._have += len(data)
             if self._have < self._need or not self._reading:
                 return
@@ -368,6 +385,7 @@ class Connection:
             self._is_v31 = packet.version == V31
             self.version = V311 if self._is_v31 else packet.version
             self.state = State.AUTHENTICATING
+            self._connecting = len(body)
             self.authenticates = Property.AUTHENTICATION_METHOD in (packet.properties or {})
         return packet
 
@@ -392,7 +410,8 @@ class Connection:
                 )
             if packet.topic:
                 before = self._aliases.get(alias)
-                self._aliased += text_size(packet.topic) - (text_size(before) if before else 0)
+                self._aliased += text_size(packet.topic)
+                self._aliased += -text_size(before) if before is not None else ALIAS_SIZE
                 self._aliases[alias] = packet.topic
             elif alias in self._aliases:
                 packet.topic = self._aliases[alias]

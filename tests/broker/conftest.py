@@ -22,7 +22,13 @@ from appliance.broker.ports import (
     UserLimits,
 )
 from appliance.broker.retained import retained_size
-from appliance.broker.session import Delivery, Held, Session, subscription_size
+from appliance.broker.session import (
+    Delivery,
+    Held,
+    Session,
+    held_size,
+    subscription_size,
+)
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
@@ -466,11 +472,11 @@ def held_bytes(session: Session) -> int:
     waiting = [delivery[0] for delivery in (*session.queue, *session.latest.values())]
     waiting += [delivery[0] for delivery in session.large.values()]
     waiting += [delivery[0] for delivery in session.inflight.values() if delivery is not None]
-    waiting += [held.message for held in session.received.values()]
     if session.will is not None:
         waiting.append(session.will.message)
-    subscriptions = sum(map(subscription_size, session.subscriptions))
-    return sum(message.size for message in waiting) + subscriptions
+    rest = sum(map(subscription_size, session.subscriptions))
+    rest += sum(held_size(held) for held in session.received.values())
+    return sum(message.size for message in waiting) + rest
 
 
 def check_accounts(broker: Broker) -> None:

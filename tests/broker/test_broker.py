@@ -449,7 +449,7 @@ def test_who_is_there_gets_a_message_that_cannot_be_retained(join: Join, broker:
     assert len(broker.retained) == 1
 
 
-@pytest.mark.parametrize("limits", [Limits(retained_bytes=4000, user=ALONE)])
+@pytest.mark.parametrize("limits", [Limits(retained_bytes=4200, user=ALONE)])
 def test_the_bytes_of_retained_messages_are_bounded(join: Join, broker: Broker):
     publisher = join("publisher")
     assert publisher.publish("a", bytes(3000), 1, retain=True) < 0x80

@@ -325,11 +325,11 @@ def test_what_has_come_in_is_counted(join: Join, broker: Broker):
     peers[0].wire.closed or peers[0].lose()
     aliased = join("aliased")
     aliased.publish("x" * 10_000, properties=alias)
-    assert 10_000 < broker.ledger.input_bytes < 10_100
+    assert 10_000 < broker.ledger.input_bytes < 10_300
     aliased.publish("é" * 3_000 + "\U0001f916", properties=alias)
-    assert 12_000 < broker.ledger.input_bytes < 12_100, "four bytes a character"
+    assert 12_000 < broker.ledger.input_bytes < 12_300, "four bytes a character"
     aliased.publish("y", properties=alias)
-    assert broker.ledger.input_bytes < 100
+    assert broker.ledger.input_bytes < 300
 
 
 def user_properties(count: int) -> Properties:

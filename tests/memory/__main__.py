@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 
-from .shapes import MIB, SHAPES, run
+from .shapes import MIB, MOST, SHAPES, run
 
 
 def measure(name: str) -> tuple[int, int, int]:
@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
     print(f"{'shape':<46} {'grown':>7} {'counted':>8} {'allowed':>8}  (MiB)")
     for name in arguments or SHAPES:
         grown, counted, allowed = measure(name)
-        bad = grown > 1.5 * allowed
+        bad = grown > MOST * allowed
         failed |= bad
         print(
             f"{name:<46} {grown / MIB:>7.1f} {counted / MIB:>8.1f} {allowed / MIB:>8.1f}"
