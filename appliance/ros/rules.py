@@ -33,8 +33,9 @@ Limit: TypeAlias = Callable[[Any, str], Any]
 class OnSilence:
     """The stop message `publish`, in JSON, for when nothing has come for `after` seconds.
 
-    `disconnect`: whose last command was another than this one is disconnected when it falls
-    silent. What it has sent and the network still holds is then lost, and cannot move the robot.
+    `disconnect`: whose last command was another than this one is disconnected when it falls silent
+    and its computer does not answer. What it has sent and the network still holds is then lost, and
+    cannot move the robot.
     """
 
     after: float
