@@ -187,6 +187,7 @@ class Connection:
         """The client has logged in; `receive_data(b"")` yields what came in the meantime."""
         self.state = State.CONNECTED
         self._reading = True
+        self._connecting = 0
 
     def close(self) -> None:
         """Yield nothing more, keep nothing more."""
