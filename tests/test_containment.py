@@ -659,6 +659,23 @@ async def _websocket(site: Site, patch: pytest.MonkeyPatch) -> None:
         site.hands.append(await site.dial("websocket"))
 
 
+@reach("connection.wait")
+async def _waits(site: Site, patch: pytest.MonkeyPatch) -> None:
+    _, protocol = await site.victim()
+    protocol.wait(0.01)
+
+
+@reach("clock.full")
+async def _fills(site: Site, patch: pytest.MonkeyPatch) -> None:
+    _, protocol = await site.victim()
+    site.broker.ledger.filled.append(protocol._client.session)
+
+
+@reach("bridge.sweep")
+async def _sweeps(site: Site, patch: pytest.MonkeyPatch) -> None:
+    site.bridge._entries.soon("bridge.sweep", lambda: None)
+
+
 @reach("connection.probe")
 async def _probed(site: Site, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(wire, "PROBED", 0.05)
@@ -698,6 +715,7 @@ async def _loop(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("bridge.post", "bridge.message", "bridge.drain")
 async def _ros_message(site: Site, patch: pytest.MonkeyPatch) -> None:
+    site.node.spin()
     for _ in range(200):
         site.up.publish(b"\0\1\0\0\2\0\0\0x\0\0\0")
 
