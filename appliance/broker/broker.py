@@ -607,7 +607,7 @@ class Broker:
         """
         message, full, _ = held
         if age > LATE:
-            message = Late(message, age)
+            message = Late(message, max(age, message.age))
         if self.ledger.has_expired(message):
             return
         try:

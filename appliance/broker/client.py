@@ -94,16 +94,6 @@ def _size(arrived: Arrived) -> int:
     return (len(arrived.payload) if isinstance(arrived, Publish) else 0) + OVERHEAD
 
 
-def _late(arrived: Arrived) -> Arrived:
-    """The same as if it had been sent again: who does not carry out what is old is told by that."""
-    if isinstance(arrived, tuple):
-        first, topic_wire, packet_id, payload, head = arrived
-        return first | 8, topic_wire, packet_id, payload, head
-    if isinstance(arrived, Publish):
-        arrived.dup = True
-    return arrived
-
-
 def _reason(code: int, route: Route) -> str:
     """Why a message was refused, in words."""
     return route.reason if code == ReasonCode.NOT_AUTHORIZED else "no room to keep it"
@@ -149,7 +139,10 @@ class Client:
         self._behind_size = 0  # bytes
         self._awaited: Sequence[Congestion] = ()
         self._waits_since = 0.0
-        self._came_at = 0.0  # what had to wait and is tried again; 0 for what comes just now
+        #: When what had to wait and is done now came, at the latest; 0 for what comes just now.
+        self._came_at = 0.0
+        #: Since when what came waits for an answer of somebody else; 0 when nothing does.
+        self._awaits_since = 0.0
         self._allowance = Allowance(PUBLISHER_PATIENCE)
         self._congested = broker.ledger.congested
         self._hurries = False
@@ -261,13 +254,13 @@ class Client:
                 return
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
-        if not first & 8:
+        if first & 8 or (self._came_at and self._is_old()):
+            message = Late(message, math.inf)
+        else:
             # What came in is what goes out to a receiver with the same version, QoS and flags:
             # its bytes are taken over instead of being encoded again.
             message.wire_key = self._version << 8 | first
             message.wire_head = head
-        else:
-            message = Late(message, math.inf)
         if qos and self._congested and self._must_wait(event, message, route):
             return
         if qos == 2:
@@ -296,7 +289,7 @@ class Client:
             self._expires_at(packet.properties),
             properties_wire=packet.passed_on,
         )
-        if packet.dup:
+        if packet.dup or (self._came_at and self._is_old()):
             message = Late(message, math.inf)
         route = self._router.route(session, message.topic_wire)
         if route.undecided and self._hold(
@@ -314,6 +307,9 @@ class Client:
             self._refuse_payload(session, message, packet_id)
         elif packet.qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
+        elif self._came_at and route.allowed and self._ledger.has_expired(message):
+            if packet.qos:  # it was received, and is for nobody any more [MQTT-3.3.2-5]
+                self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos and not self._object(packet_id, message):
@@ -337,6 +333,7 @@ class Client:
         if asked is None or self._has_waited or session is None:
             return False
         until = self._ledger.now + asked.patience
+        came_at = self._came_at or self._ledger.now
         self._counters.publish_received -= 1  # it will be
         self._counters.publish_bytes_received -= size
 
@@ -346,13 +343,19 @@ class Client:
                 self.broker, lambda: route(session, topic_wire).undecided, self._wake, until
             )
             self._has_waited = True
+            self._came_at = came_at
             try:
                 publish(packet)
             finally:
                 self._has_waited = False
+                self._came_at = 0.0
 
         self._begin(work())
         return True
+
+    def _is_old(self) -> bool:
+        """Whether what had to wait did so for long: who does not carry out what is old is told."""
+        return self._ledger.now - self._came_at > LATE
 
     def _wake(self) -> None:
         """Somebody has answered what a packet waits for."""
@@ -425,7 +428,7 @@ class Client:
                 yield event
                 continue
             self._heard_at = self._ledger.now
-            self._behind.append((event, self._ledger.now))
+            self._behind.append((event, self._came_at or self._ledger.now))
             self._behind_size += _size(event)
             if not self._has_place_behind():
                 connection.pause()
@@ -444,8 +447,6 @@ class Client:
                 left = len(behind) - 1
                 arrived, self._came_at = behind.popleft()
                 self._behind_size -= _size(arrived)
-                if self._ledger.now - self._came_at > LATE:
-                    arrived = _late(arrived)
                 if isinstance(arrived, tuple):
                     self._on_raw_publish(arrived)
                 else:
@@ -471,7 +472,8 @@ class Client:
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        return self._ledger.now + interval if isinstance(interval, int) else None
+        came_at = self._came_at or self._ledger.now
+        return came_at + interval if isinstance(interval, int) else None
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
@@ -626,6 +628,7 @@ class Client:
                 # What comes behind the packet waits for its end.
                 self._work = work
                 self._is_awaiting = answer is not None
+                self._awaits_since = self._awaits_since or self._came_at or self._ledger.now
                 self.connection.pause()
                 if answer is None:
                     self.later()
@@ -872,7 +875,12 @@ class Client:
             if self._work is None and self.connection.paused:
                 if not self._behind:
                     self.connection.resume()
+                # What came meanwhile is as old as the wait is long, as far as is known.
+                self._came_at = self._awaits_since
                 self.receive(b"")
+                self._came_at = 0.0
+                if not self.connection.paused:
+                    self._awaits_since = 0.0
 
     def _send(self, packet: Packet) -> None:
         if self.output.send(packet):

@@ -15,9 +15,19 @@ from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
 from appliance.broker.ledger import Ledger
 from appliance.broker.message import Late, Message
-from appliance.broker.ports import Contact, Decision
+from appliance.broker.ports import Action, Contact, Decision
 from appliance.mqtt.codec import Property, decode_varint
-from appliance.mqtt.packets import Connect, Disconnect, Publish, Pubrel, Will, decode_packet
+from appliance.mqtt.packets import (
+    Connect,
+    Disconnect,
+    Puback,
+    Publish,
+    Pubrel,
+    Subscribe,
+    Subscription,
+    Will,
+    decode_packet,
+)
 from appliance.ros import commands
 from appliance.ros.arrivals import EXPECTED, STEADY, WAIT, WITHHELD, Arrivals, Verdict, sent_at
 from appliance.ros.backlog import Backlog
@@ -207,6 +217,99 @@ async def test_what_is_sent_again_is_old(house):
     await asyncio.sleep(0.11)
     driver.drive(qos=1)
     await until(lambda: house.robot.received == [twist(1), twist(0.5)])
+
+
+class Asks(AllAllowed):
+    """As a topic plugin that asks over HTTP: it has no answer yet, and then allows all."""
+
+    patience = 60.0
+
+    def __init__(self, action):
+        self.action = action
+        self.has_answered = False
+
+    def decide(self, identity, action, topic):
+        if action is self.action and not self.has_answered:
+            return Decision(False, "asked", pending=True)
+        return super().decide(identity, action, topic)
+
+    def waits(self, question, wake):
+        return not self.has_answered
+
+
+def asks(house, action):
+    """The house has a plugin that has to ask about such; gives what answers after some seconds."""
+    plugin = Asks(action)
+    house.broker.access = plugin
+    house.broker.router.asked = plugin
+
+    def answer(driver, seconds):
+        plugin.has_answered = True
+        house.broker.router.changed()
+        house.broker.ledger.now += seconds
+        driver.client.send_on()
+        house.broker.flush()
+
+    return answer
+
+
+@pytest.mark.parametrize("expiry", [None, 5])
+@pytest.mark.parametrize(("seconds", "is_old"), [(0.0, False), (1.5, True)])
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_a_command_that_waited_for_a_plugin_is_as_old_as_the_wait(
+    house, expiry, seconds, is_old, qos
+):
+    house.start(CommandRules(expire=0.2))
+    answer = asks(house, Action.PUBLISH)
+    driver = Driver(house.broker, "a")
+    properties = {Property.MESSAGE_EXPIRY_INTERVAL: expiry} if expiry else None
+    driver.drive(qos=qos, properties=properties)
+    answer(driver, seconds)
+    if qos == 2:
+        driver.say(Pubrel(7))
+    if not is_old:
+        await until(lambda: house.robot.received == [twist(0.5)])
+    else:
+        await asyncio.sleep(0.3)  # which a command that comes alone waits at most
+        assert house.robot.received == []
+        assert house.counters().expired == 1
+
+
+async def test_a_command_behind_what_waited_for_a_plugin_is_as_old_as_the_wait(house):
+    house.start(CommandRules(expire=0.2))
+    answer = asks(house, Action.SUBSCRIBE)
+    driver = Driver(house.broker, "a")
+    driver.say(Subscribe(1, [Subscription("x", 0)]))
+    driver.drive()
+    answer(driver, 1.5)
+    assert house.counters().expired == 1
+    await asyncio.sleep(0.3)
+    driver.steer(b'{"linear":{"x":1}}')
+    await until(lambda: house.robot.received == [twist(1)])
+
+
+async def test_a_message_expires_while_it_waits_for_a_plugin(house):
+    """[MQTT-3.3.2-5]: the interval begins when it comes."""
+    house.start(CommandRules())
+    house.client.subscribe("x")
+    answer = asks(house, Action.PUBLISH)
+    driver = Driver(house.broker, "a")
+    properties = {Property.MESSAGE_EXPIRY_INTERVAL: 1}
+    driver.say(Publish("x", b"", qos=1, packet_id=7, properties=properties))
+    answer(driver, 1.5)
+    assert house.client.received == []
+    assert driver.wire.written == Puback(7).encode(5)
+
+
+async def test_a_qos_2_command_that_waited_before_its_pubrec_and_after_it(house):
+    house.start(CommandRules(expire=0.5))
+    answer = asks(house, Action.PUBLISH)
+    driver = Driver(house.broker, "a")
+    driver.drive(qos=2)
+    answer(driver, 1.5)
+    await asyncio.sleep(0.15)  # which alone is old, too, but not too old
+    driver.say(Pubrel(7))
+    assert house.counters().expired == 1
 
 
 async def test_without_expire_all_is_published(house):
