@@ -337,9 +337,13 @@ class Commands(ToRos):
         try:
             limited, has_changed = self._limits.apply(cdr)
         except ConversionError as error:
+            if self._stops(cdr):
+                return cdr
             self.counters.refused += 1
             raise AgainstRulesError("", f"it is against the route's rules: {error}") from None
         if has_changed:
+            if self._stops(cdr):  # clamped, it might move the robot
+                return cdr
             self.counters.clamped += 1
             self._mention("clamped", "%s: numbers in a command of %s were clamped", origin)
         return limited

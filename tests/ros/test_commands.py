@@ -788,6 +788,26 @@ async def test_only_some_values_are_allowed(house):
     assert "'kill' is not allowed, only auto, manual" in house.counters().last_error
 
 
+@pytest.mark.parametrize("qos", [0, 2])
+@pytest.mark.parametrize(
+    "limit", [{"clamp": (("linear.x", 0.1, 0.5),)}, {"allow": (("linear.x", (0.1, 0.5)),)}]
+)
+async def test_the_stop_message_is_published_as_it_is(house, limit, qos):
+    """Neither clamped, which would make it a movement, nor refused."""
+    house.start(CommandRules(on_silence=OnSilence(60), **limit))
+    driver = Driver(house.broker, "a")
+    driver.steer()
+    driver.drive(b"{}", qos)
+    if qos:
+        driver.say(Pubrel(7))
+    assert house.robot.received == [twist(0.5), STOP]
+    counters = house.counters()
+    assert (counters.clamped, counters.refused, counters.errors) == (0, 0, 0)
+    # What only looks like it where it is limited is limited.
+    driver.steer(b'{"angular":{"z":1}}')
+    assert house.robot.received[2:] == ([twist(0.1, 1)] if "clamp" in limit else [])
+
+
 def limits(type_name, **kw):
     return FieldLimits(CommandRules(**kw), Converter(load_description(type_name), time.time_ns))
 
