@@ -21,6 +21,9 @@ it later as if it were new. So a command's age is taken from these, in this orde
 A Message Expiry Interval that is left proves nothing: it counts down in servers only, not in a
 client's queue. A message that stops the robot is never old, see `Commands`.
 
+A queue ends by a silence or by that pace, never by a time: a stream that is faster than `BURST`
+allows (125 Hz; QoS 2: 33 Hz without round trips) is never carried out without `sent-at`.
+
 The pace of somebody who steers is two gaps in a row that are no burst. A queue of QoS 1 may come
 one by one, each behind the acknowledgement of the one before, and a busy or distant client then
 has a pace as well. So what the client is sent is withheld for a moment, acknowledgements included:
@@ -67,9 +70,6 @@ STEADY = 2
 WITHHELD = 0.15
 TRY_AGAIN = 1.0
 
-#: Seconds after which a queue is over, however fast its client goes on.
-LONGEST = 60.0
-
 #: Clients of which is known that they left while they drove.
 EXPECTED = 1000
 
@@ -88,8 +88,6 @@ class _Pace:
     """How the commands of one client come, since its connection or its last silence began."""
 
     last: float
-    #: When a queue is taken to be over.
-    end: float
     #: Gaps in a row that are no burst.
     steady: int = 0
     is_waiting: bool = False
@@ -120,7 +118,7 @@ class Arrivals:
             # It may have waited for what it was sent meanwhile.
             pace.steady = 1
             self._withhold(pace, origin, now)
-        if pace.steady >= STEADY or now >= pace.end:
+        if pace.steady >= STEADY:
             pace.is_known = True
             pace.is_waiting = pace.is_queue = False
             if origin.link is not None:
@@ -133,7 +131,7 @@ class Arrivals:
         return Verdict.WAIT
 
     def _begin(self, origin: Session, oldest: float, now: float) -> Verdict:
-        pace = self._paces[origin] = _Pace(now, now + LONGEST)
+        pace = self._paces[origin] = _Pace(now)
         if self._expected and origin.client_id in self._expected:
             del self._expected[origin.client_id]
             # Of who left in the midst of driving even a single one is from then, most likely.
@@ -152,7 +150,7 @@ class Arrivals:
 
     def is_old(self, origin: Session, now: float) -> None:
         """A command has come that is known to be old: the next ones were queued behind it."""
-        self._paces[origin] = _Pace(now, now + LONGEST, is_queue=True)
+        self._paces[origin] = _Pace(now, is_queue=True)
 
     def waited(self, origin: Session) -> None:
         """The command that waits has none behind it."""

@@ -1099,7 +1099,7 @@ class TestArrivals:
     @pytest.mark.parametrize("rate", [10, 20, 25, 50])
     def test_who_steers_is_heard_from_the_third_on(self, qos, rate):
         if qos == 2 and rate == 50:
-            pytest.skip("its acknowledgements cannot be withheld: it counts as a queue for a while")
+            pytest.skip("its acknowledgements cannot be withheld: it counts as a queue")
         sender = Sender(qos)
         numbers = range(1, 40)
         for number in numbers:
@@ -1132,11 +1132,26 @@ class TestArrivals:
         sender.rest(1)
         assert sender.moved == []
 
-    def test_who_is_always_fast_is_heard_at_last(self, qos):
+    def test_a_queue_is_none_the_less_for_being_long(self, qos):
+        """It ends by a silence, or by the pace of somebody who steers, not by a time."""
         sender = Sender(qos)
-        while not sender.moved:
+        for _ in range(60_000):
             sender.say(0.002)
-        assert 160 <= sender.moved[0] < 160.01
+        assert sender.moved == []
+        for _ in range(5):
+            sender.say(0.05, "new")
+        assert sender.moved == ["new"] * 4
+
+    def test_a_long_queue_behind_what_is_known_to_be_old(self, qos):
+        sender = Sender(qos)
+        sender.arrivals.is_old(sender, sender.now)
+        for _ in range(60_000):
+            sender.say(0.002)
+        assert sender.moved == []
+        sender.rest(sender.OLDEST + 0.1)
+        sender.say(0, "new")
+        sender.rest(1)
+        assert sender.moved == ["new"]
 
 
 def test_a_queue_that_comes_one_by_one_has_a_pace_of_its_own():
