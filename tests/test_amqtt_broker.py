@@ -40,6 +40,7 @@ from appliance.amqtt_broker import (
     plugin_kinds,
 )
 from appliance.app import App
+from appliance.broker import client as network_client
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Refusal
@@ -619,6 +620,38 @@ async def test_what_waits_for_a_plugin_keeps_nobody_else() -> None:
         assert codes[0] == 0x80
         await bob.publish("a", b"behind", qos=1)
         assert (await receive(ann)).data == b"behind"
+
+
+@pytest.mark.parametrize("strangers", [1, 4])
+async def test_who_may_receive_it_holds_nobody_elses_message(strangers: int) -> None:
+    """A new client that subscribes to all is asked about, for ever: who publishes goes on."""
+    async with running({**OPEN, own(Gate): {}}, answers=Answers(600.0, 600.0)) as rig:
+        ann, bob = await rig.connect("ann:x", "a1"), await rig.connect("bob:x", "b1")
+        await bob.subscribe([("x", 1)])
+        await ann.publish("x", b"first", qos=1)
+        newcomers = [await rig.connect("eve:x", f"e{n}") for n in range(strangers)]
+        for eve in newcomers:
+            await eve.subscribe([("#", 1)])
+        Gate.answers["x"] = "hang"
+        for n in range(4):
+            await asyncio.wait_for(ann.publish("x", b"%d" % n, qos=1), PATIENCE / 2)
+        asked = [question for question in rig.frame._access._asked if question[2] == "x"]
+        newcomers_ids = {f"e{n}" for n in range(strangers)}
+        assert {who.client_id for who, _, _ in asked} == newcomers_ids, "nothing is known yet"
+        assert [(await receive(bob)).data for _ in range(5)] == [b"first", b"0", b"1", b"2", b"3"]
+
+
+async def test_who_may_receive_it_is_waited_for_for_a_moment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So that a plugin that answers soon lets a new subscriber have the first message, too."""
+    monkeypatch.setattr(network_client, "RIGHTS_PATIENCE", PATIENCE)
+    monkeypatch.setattr(Gate, "delay", 0.02)
+    async with running({**OPEN, own(Gate): {}}, answers=Answers(600.0, 600.0)) as rig:
+        ann, eve = await rig.connect("ann:x", "a1"), await rig.connect("eve:x", "e1")
+        await eve.subscribe([("#", 1)])
+        await ann.publish("x", b"first", qos=1)
+        assert (await receive(eve)).data == b"first"
 
 
 async def test_who_leaves_while_a_plugin_is_asked_is_forgotten() -> None:

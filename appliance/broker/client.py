@@ -29,7 +29,7 @@ from appliance.broker.handshake import (
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import OVERHEAD, Late, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
-from appliance.broker.ports import INSIDE, Exchange, Identity, Refusal, Wire
+from appliance.broker.ports import INSIDE, Exchange, Identity, Question, Refusal, Wire
 from appliance.broker.routing import Route
 from appliance.broker.session import Held, Session
 from appliance.broker.subscribing import Awaited, Step, answers, subscribe, unsubscribe
@@ -40,6 +40,7 @@ from appliance.mqtt.codec import (
     VERSION_NAMES,
     Properties,
     Property,
+    encode_string,
     quote,
 )
 from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, Event, RawPublish
@@ -76,6 +77,11 @@ FAILURE_EFFORT = 50
 #: their way, so that what they acknowledge among it is not kept waiting, too.
 BEHIND = 64
 BEHIND_BYTES = 64 * 1024
+
+#: Seconds that a publisher waits at once for what others may receive, and the part of its time that
+#: it does in the long run: less than makes a command old, so that nobody who subscribes stops it.
+RIGHTS_PATIENCE = LATE / 2
+RIGHTS_SHARE = 0.1
 
 #: Seconds after which it is looked at the earliest how long a message may still wait.
 LOOK_AGAIN = 0.01
@@ -144,6 +150,9 @@ class Client:
         #: Since when what came waits for an answer of somebody else; 0 when nothing does.
         self._awaits_since = 0.0
         self._allowance = Allowance(PUBLISHER_PATIENCE)
+        #: For answers about who else may receive its messages.
+        self._rights_allowance = Allowance(RIGHTS_PATIENCE)
+        self._asked_at = 0.0
         self._congested = broker.ledger.congested
         self._hurries = False
         #: Whether `send_on` will be called anyway.
@@ -234,9 +243,7 @@ class Client:
             route = session.routes[topic_wire]
         else:
             route = router.route(session, topic_wire)
-            if route.undecided and self._hold(
-                topic_wire, len(payload), self._on_raw_publish, event
-            ):
+            if route.undecided and self._hold(route, len(payload), self._on_raw_publish, event):
                 return
         targets = route.targets
         if first == 0x30 and route.allowed and self.broker.observer is None:
@@ -292,9 +299,7 @@ class Client:
         if packet.dup or (self._came_at and self._is_old()):
             message = Late(message, math.inf)
         route = self._router.route(session, message.topic_wire)
-        if route.undecided and self._hold(
-            message.topic_wire, len(packet.payload), self._on_publish, packet
-        ):
+        if route.undecided and self._hold(route, len(packet.payload), self._on_publish, packet):
             return
         packet_id = packet.packet_id or 0
         if packet.qos and self._congested and self._must_wait(packet, message, route):
@@ -324,24 +329,46 @@ class Client:
         return True
 
     def _hold(
-        self, topic_wire: bytes, size: int, publish: Callable[[Any], None], packet: object
+        self, route: Route, size: int, publish: Callable[[Any], None], packet: object
     ) -> bool:
         """Let a PUBLISH, and all behind it, wait until it is known where it may go; False when it
-        has waited, or nobody is asked about it."""
+        has waited, or nobody is asked about it.
+
+        It waits for what is asked about its user. Who else may receive it holds it for a moment
+        only, and misses it if nothing is known by then.
+        """
         session = self.session
         asked = self._router.asked
         if asked is None or self._has_waited or session is None:
             return False
-        until = self._ledger.now + asked.patience
-        came_at = self._came_at or self._ledger.now
+        allowance, now = self._rights_allowance, self._ledger.now
+        allowance.change((now - self._asked_at) * RIGHTS_SHARE)
+        self._asked_at = now
+        if allowance.used_up and not self._is_asked_about(route):
+            return False
+        until = now + asked.patience
+        came_at = self._came_at or now
+        topic_wire = encode_string(route.topic)
         self._counters.publish_received -= 1  # it will be
         self._counters.publish_bytes_received -= size
 
+        def questions() -> list[Question]:
+            return self._router.route(session, topic_wire).undecided
+
+        def own() -> list[Question]:
+            found = self._router.route(session, topic_wire)
+            return found.undecided if self._is_asked_about(found) else []
+
         def work() -> Iterator[Step]:
-            route = self._router.route
-            yield from answers(
-                self.broker, lambda: route(session, topic_wire).undecided, self._wake, until
-            )
+            yield from answers(self.broker, own, self._wake, until)
+            since = self._ledger.now
+            if not allowance.used_up and questions():
+                soon = since + allowance.left
+                for step in answers(self.broker, questions, self._wake, soon):
+                    self.wire.wait(max(soon - self._ledger.now, LOOK_AGAIN))
+                    yield step
+                allowance.change(since - self._ledger.now)
+            self._asked_at = self._ledger.now
             self._has_waited = True
             self._came_at = came_at
             try:
@@ -352,6 +379,14 @@ class Client:
 
         self._begin(work())
         return True
+
+    def _is_asked_about(self, route: Route) -> bool:
+        """Whether somebody is asked about the client itself, or another of its user."""
+        identity = self.session.identity if self.session is not None else None
+        return identity is not None and any(
+            who == identity or (who.username is not None and who.username == identity.username)
+            for who, _, _ in route.undecided
+        )
 
     def _is_old(self) -> bool:
         """Whether what had to wait did so for long: who does not carry out what is old is told."""
