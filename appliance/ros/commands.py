@@ -363,7 +363,9 @@ class Commands(ToRos):
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
         self._is_awaited = False
-        if self.rules.exclusive and lease.holder is None and origin is not None and origin.link:
+        is_free = self.rules.exclusive and lease.holder is None
+        # Who stops does not command: a stop is let through from an old queue as well.
+        if is_free and origin is not None and origin.link and not self._stops(cdr):
             lease.holder = origin
             self._around.broker.guards_changed()
             self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)

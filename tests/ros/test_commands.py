@@ -1397,6 +1397,30 @@ async def test_who_commands_meanwhile_has_the_lease(house):
     assert house.robot.received == [twist(1)]
 
 
+async def test_who_stops_takes_no_free_lease(house):
+    """An old queue that ends with a stop, above all."""
+    house.start(CommandRules(exclusive=True, on_silence=OnSilence(60)))
+    queue, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+    queue.say(*[Publish(TOPIC, GO)] * 3, Publish(TOPIC, b"{}"))
+    assert house.robot.received == [STOP]
+    assert house.commands.commanding is None
+    other.steer()
+    assert house.robot.received == [STOP, twist(0.5)]
+    assert house.commands.commanding == "b"
+
+
+async def test_who_has_the_lease_keeps_it_with_a_stop(house):
+    house.start(CommandRules(exclusive=True, lease=60, on_silence=OnSilence(60)))
+    driver = Driver(house.broker, "a")
+    driver.steer()
+    before = house.commands._lease.heard_at
+    await asyncio.sleep(0.001)
+    driver.steer(b"{}")
+    assert house.robot.received == [twist(0.5), STOP]
+    assert house.commands.commanding == "a"
+    assert house.commands._lease.heard_at > before
+
+
 async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(house):
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a")
