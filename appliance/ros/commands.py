@@ -371,7 +371,8 @@ class Commands(ToRos):
             self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)
         if origin is lease.holder:
             lease.heard_at = now
-        if self._timer is None and (self._is_driven or lease.holder is not None):
+        # Also when it waits for something later: a lease that began with zeros, or another's.
+        if self._timer is None or self._first_due() < self._timer.when():
             self._arm()
 
     # Leases
@@ -414,13 +415,23 @@ class Commands(ToRos):
         """Whether who said it last does not drive."""
         return self.rules.on_silence is None or self._stops(cdr)
 
-    def _arm(self) -> None:
+    def _first_due(self) -> float:
+        """When the silence since the last command, or of the lease's holder, is too long."""
         rules = self.rules
         due = math.inf
         if self._is_driven and rules.on_silence is not None:
             due = self._heard_at + rules.on_silence.after
         if rules.exclusive and self._lease.holder is not None:
             due = min(due, self._lease.heard_at + rules.lease)
+        return due
+
+    def _arm(self) -> None:
+        """Look when something may be due, and not later."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        rules = self.rules
+        due = self._first_due()
         if rules.on_silence is not None and rules.on_silence.disconnect:
             heard_at = min((at for _, at in self._drivers.values()), default=math.inf)
             due = min(due, heard_at + rules.on_silence.after)

@@ -491,6 +491,46 @@ async def test_the_stop_message_follows_silence_in_time(house, caplog):
     assert "fell silent for 0.1 s" in caplog.text
 
 
+@pytest.mark.parametrize("disconnect", [True, False])
+@pytest.mark.parametrize("version", [4, 5])
+@pytest.mark.parametrize("rests", [0, 1, 5])
+async def test_who_rests_before_it_drives_is_stopped_as_early(house, rests, version, disconnect):
+    """The lease begins with the zeros, and is not over for long: so says the timer, too."""
+    rules = CommandRules(exclusive=True, lease=600, on_silence=OnSilence(AFTER, "{}", disconnect))
+    house.start(rules)
+    driver = Driver(house.broker, "a", version=version)
+    for _ in range(rests):
+        driver.drive(b"{}")
+    while twist(0.5) not in house.robot.received:
+        driver.drive()
+        await asyncio.sleep(0.02)
+    await until(lambda: house.robot.received[-1] == STOP)
+    assert house.commands.commanding == "a"
+
+
+async def test_a_lease_that_ends_before_the_silence_is_too_long_is_seen_in_time(house):
+    """The timer was set for a command that nobody has the lease for: a retained one."""
+    house.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(600)))
+    house.commands._commanded(twist(0.5), None)
+    driver = Driver(house.broker, "a")
+    driver.steer()
+    assert house.commands.commanding == "a"
+    await until(lambda: house.commands.commanding is None)
+
+
+@pytest.mark.parametrize("lease", [AFTER / 2, 600])
+async def test_the_timer_is_for_what_is_due_first(house, lease):
+    house.start(CommandRules(exclusive=True, lease=lease, on_silence=OnSilence(AFTER)))
+    driver = Driver(house.broker, "a")
+    driver.steer()
+    flow = house.commands
+    assert flow._timer.when() == flow._heard_at + min(lease, AFTER)
+    # Steady driving sets no timer for each command.
+    timer = flow._timer
+    driver.steer()
+    assert flow._timer is timer
+
+
 @pytest.fixture
 def impatient(monkeypatch):
     """Who is asked for an answer has less time for it."""
