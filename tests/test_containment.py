@@ -520,9 +520,11 @@ async def _leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("tls.react")
 async def _says_much_and_leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, _ = await site.victim("tls")
-    caller.writer.write(Publish("nowhere", bytes(3_000_000)).encode(5))
-    caller.writer.close()
+    _, protocol = await site.victim("tls")
+    transport = protocol._transport
+    transport.pause_reading()
+    transport._ended = True  # as when all has come that will, and was not handed on yet
+    transport.resume_reading()
 
 
 @reach("connection.last_turn", "connection.leave")

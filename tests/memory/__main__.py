@@ -1,4 +1,4 @@
-"""python -m tests.memory [SHAPE …]: by how much memory grows, and what the limits allow."""
+"""cd tests && python -m memory [SHAPE …]: by how much memory grows, and what the limits allow."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import json
 import logging
 import subprocess
 import sys
+from pathlib import Path
 
-from .shapes import MIB, MOST, SHAPES, run
+from memory.shapes import MIB, MOST, SHAPES, run
 
 
 def measure(name: str) -> tuple[int, int, int]:
     """`run`, in a process of its own."""
     said = subprocess.run(
-        [sys.executable, "-m", "tests.memory", "--one", name],
+        [sys.executable, "-m", "memory", "--one", name],
+        cwd=Path(__file__).parents[1],
         check=True,
         capture_output=True,
         text=True,

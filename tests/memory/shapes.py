@@ -1,7 +1,7 @@
 """What strangers and users can make the broker keep, in the shapes that take most for their bytes.
 
-Each shape fills one kind of thing in a broker of its own until the limits say no. `python -m
-tests.memory` runs each in a process of its own and prints by how much its resident memory grew.
+Each shape fills one kind of thing in a broker of its own until the limits say no. In `tests`,
+`python -m memory` runs each in a process of its own and prints by how much its memory grew.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from broker.conftest import FakeAccess, Peer, lasting
+
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Limits, UserLimits
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Publish, Will
 from appliance.store import MemoryStore
-
-from ..broker.conftest import FakeAccess, Peer, lasting
 
 MIB = 1 << 20
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from .__main__ import measure
-from .shapes import MIB, MOST, SHAPES
+from memory.__main__ import measure
+from memory.shapes import MIB, MOST, SHAPES
 
 
 @pytest.mark.parametrize("name", SHAPES)

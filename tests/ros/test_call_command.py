@@ -129,9 +129,10 @@ def test_a_goal_to_its_end(run):
     first, *between, last = output.splitlines()
     assert code == 0, errors
     assert len(first.split()[1]) == 32 and first.startswith("goal ")
-    steps = ("[0,1,1]", "[1,1,2]", "[1,2,3]", "[2,3,5]")  # of which the last may be late
-    every = [f'feedback {{"sequence":{step}}}' for step in steps]
-    assert between and between == every[: len(between)]
+    # The newest goes to a client that is slow, and the last may be late.
+    every = ["[0,1,1]", "[1,1,2]", "[1,2,3]", "[2,3,5]"]
+    told = [line.partition('feedback {"sequence":')[2].removesuffix("}") for line in between]
+    assert told and told == [step for step in every if step in told]
     assert last == 'succeeded {"sequence":[0,1,1,2,3,5]}'
 
 

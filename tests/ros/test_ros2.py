@@ -17,7 +17,9 @@ import pytest
 from waiting import PATIENCE, until
 
 from appliance.broker.broker import Broker
+from appliance.broker.faults import Faults
 from appliance.broker.message import Message
+from appliance.entries import Entries
 from appliance.environment import for_other_programs
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
@@ -484,7 +486,7 @@ async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
         return sum(lost) + sum(dropped) + len(taken)
 
     await peer.do("advertise", "/image", BYTES, "best_effort")
-    node.start(look, failures.append, asyncio.get_running_loop())
+    node.start(look, failures.append, Entries(asyncio.get_running_loop(), Faults()))
     try:
         await peer.do("matched", "/image")
         published = 0

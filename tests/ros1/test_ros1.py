@@ -136,11 +136,13 @@ def test_commands_are_held_to_their_rules(robot: Node, appliance: Ros1Appliance)
     with Mqtt(appliance) as driver, Mqtt(appliance) as other:
 
         def drives() -> object:
+            # A single command, and the next behind a silence: several at once are a queue.
             driver.paho.publish("r2d2/cmd_vel", '{"linear": {"x": 9}}', 1).wait_for_publish(5)
-            other.paho.publish("r2d2/cmd_vel", '{"linear": {"x": -0.25}}', 1)
+            time.sleep(0.7)
             return robot.do("heard", "/cmd_vel")
 
         eventually(drives, "commands reach ROS")
+        other.paho.publish("r2d2/cmd_vel", '{"linear": {"x": -0.25}}', 1).wait_for_publish(5)
         eventually(
             lambda: "x: 0.0\n  y: 0.0" in str(robot.do("heard", "/cmd_vel")[-1]),  # type: ignore[index]
             "the stop message comes",

@@ -67,6 +67,8 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
         appliance.wait_for_log("not reloaded")
     finally:
         appliance.stop()
+    # The datagrams of an ended process are still to be read.
+    notify.wait(lambda: notify.all("STOPPING"), "STOPPING=1")
     assert notify.messages[-1][1] == {"STOPPING": "1", "STATUS": "stopping"}
 
 
