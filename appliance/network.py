@@ -244,6 +244,11 @@ class Network:
             ((id(chunk), id(account)), partial(self._count_for, account)),
         )
 
+    def leaves(self, member: Member) -> None:
+        """A connection is told its last bytes; one that has ended is nobody's guest any more."""
+        if member in self.open:
+            self.doorkeeper.leaves(member)
+
     def closed(self, member: Member) -> None:
         """A connection ended."""
         if member in self.open:

@@ -183,7 +183,10 @@ class ClientProtocol:
         broker.faults.run("connection.flush", broker.flush, otherwise=None)
         if self._transport is None:
             client.cut_off()
-        self._forget()
+            self._forget()
+        elif not self._closing:
+            # Its last bytes wait for a commit; or not even the flush went well.
+            self._cut_after(CLOSE_TIMEOUT)
 
     @contained("connection.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -299,6 +302,13 @@ class ClientProtocol:
             except Exception as error:
                 self._broker.faults.caught("connection.abort", error, self)
         self._forget()
+
+    def _cut_after(self, seconds: float) -> None:
+        """However its end goes on, and whether or not it reads: then it is over."""
+        self._timeout.cancel()
+        self._timeout = self._entries.later(
+            "connection.cut", seconds, self.abort, served=self, failed=self.abort
+        )
 
     def make_room(self) -> None:
         """Close at once, for somebody else: it has not logged in, or is closing anyway."""
@@ -746,9 +756,8 @@ class ClientProtocol:
         if self._transport is None or self._closing:
             return
         self._closing = True
-        self._network.doorkeeper.leaves(self)
-        self._timeout.cancel()
-        self._timeout = self._entries.later("connection.cut", CLOSE_TIMEOUT, self._transport.abort)
+        self._cut_after(CLOSE_TIMEOUT)
+        self._network.leaves(self)
         if self._waiting:
             self._pause_reading()
         else:
@@ -757,10 +766,7 @@ class ClientProtocol:
     def _close_transport(self) -> None:
         assert self._transport is not None
         if not self._transport.get_write_buffer_size():
-            self._timeout.cancel()
-            self._timeout = self._entries.later(
-                "connection.cut", farewell.TIMEOUT, self._transport.abort
-            )
+            self._cut_after(farewell.TIMEOUT)
         if self._connection is None and not self._transport.is_closing():
             # A transport closes its socket as soon as it has written: of that only a copy is left.
             with contextlib.suppress(OSError):

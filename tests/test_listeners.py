@@ -366,7 +366,13 @@ async def test_a_connection_that_breaks(house: House, tls):
     await until(lambda: len(house.network.open) == 1)
 
 
-async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeypatch):
+def break_packets(protocol: wire.ClientProtocol) -> None:
+    """Let something that nobody expected escape while the client's next packet is worked on."""
+    protocol._client._on_packet = Mock(side_effect=ZeroDivisionError)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("why", ["wrong bytes", "a fault"])
+async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeypatch, escaped, why):
     """A closed connection does not stay because its output cannot be written."""
     monkeypatch.setattr(wire, "CLOSE_TIMEOUT", 0.2)
     await house.start()
@@ -377,8 +383,16 @@ async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeyp
     for _ in range(10):
         await publisher.say(Publish("a", bytes(MIB)))
     await until(lambda: not house.protocol("deaf")._client.output.writable)
-    await caller.say(b"\0\0")
+    protocol = house.protocol("deaf")
+    if why == "wrong bytes":
+        await caller.say(b"\0\0")
+    else:
+        break_packets(protocol)
+        await caller.say(Pingreq())
+        await until(lambda: house.broker.faults.count)
+    await until(lambda: protocol._transport is None, "its connection to be cut")
     await until(lambda: len(house.network.open) == 1)
+    escaped.clear()
 
 
 @both
@@ -710,6 +724,29 @@ async def test_connections_from_one_address(house: House, caplog):
     callers[0].hang_up()
     await until(lambda: len(house.network.open) == 1)
     assert not await _is_refused(house)
+
+
+async def test_a_fault_before_a_commit_leaves_no_guest_for_ever(house: House, escaped):
+    """The last bytes are written at the commit, when the fault is long over; or not at all."""
+    await house.start(connections_per_address=2)
+    store = house.broker.store
+    store.hurry = lambda: None  # type: ignore[method-assign]
+    for n in range(3):
+        caller = await house.join(f"c{n}")
+        protocol = house.protocol(f"c{n}")
+        break_packets(protocol)
+        store.staged, store.batch, store.committed = True, 5, 4
+        protocol._client.output.batch = 5
+        await caller.say(Pingreq())
+        await until(lambda count=n + 1: house.broker.faults.count == count)
+        if n == 2:
+            protocol._forget()  # it has ended already
+        store.committed, store.staged = 5, False
+        house.broker._committed(True)
+        caller.hang_up()
+        await until(lambda: not house.network.open)
+        assert house.listeners._addresses.oldest_guest() is None
+    escaped.clear()
 
 
 async def _say_who(caller: Caller, client_id: str, user: str) -> None:
