@@ -47,6 +47,9 @@ log = logging.getLogger(__name__)
 #: Seconds that a QoS 2 exchange may take before its message counts as late.
 LATE = 0.1
 
+#: Readers that are asked whether they are full for the effort to give a message to one of them.
+LOOKS_FOR_ONE = 4
+
 #: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
 
@@ -579,6 +582,8 @@ class Broker:
         Of a group that is one of these if nobody in it has room.
         """
         size = message.size
+        looked_at = len(route.targets) + sum(len(members) for _, members in route.shares)
+        self.counters.effort += looked_at // LOOKS_FOR_ONE
         full = [
             session
             for session, qos, _, _ in route.targets

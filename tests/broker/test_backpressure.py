@@ -19,7 +19,7 @@ from appliance.broker.backpressure import (
     PUBLISHER_PATIENCE,
     Allowance,
 )
-from appliance.broker.broker import Broker
+from appliance.broker.broker import LOOKS_FOR_ONE, Broker
 from appliance.broker.client import BEHIND
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Limits
@@ -467,6 +467,26 @@ def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
     assert other_receiver.got == numbers(500)
     play(broker, publisher, *receivers)
     assert all(receiver.got == numbers(1500) for receiver in receivers[1:])
+
+
+@pytest.mark.parametrize("topic_filter", ["b", "$share/group/b"])
+def test_to_look_for_readers_that_are_full_is_an_effort(
+    waiting: Peer, broker: Broker, join: Join, topic_filter: str
+):
+    """While one reader is congested they are looked through for each message of anybody."""
+    for number in range(400):
+        join(f"reader {number}", version=4).subscribe(topic_filter, 1)
+    other = join("other", version=4)
+    (session,) = broker.ledger.congested
+    efforts = []
+    for congested in ({}, {session: None}):
+        broker.ledger.congested.clear()
+        broker.ledger.congested.update(congested)
+        for packet_id in (2 * len(efforts) + 1, 2 * len(efforts) + 2):  # the first finds the route
+            begun = broker.counters.effort
+            other.send(Publish("b", b"", 1, False, False, packet_id))
+        efforts.append(broker.counters.effort - begun)
+    assert efforts[1] - efforts[0] == 400 // LOOKS_FOR_ONE
 
 
 @pytest.fixture
