@@ -19,7 +19,8 @@ it later as if it were new. So a command's age is taken from these, in this orde
 |                                                        | out from the third on                 |
 
 A Message Expiry Interval that is left proves nothing: it counts down in servers only, not in a
-client's queue. A message that stops the robot is never old, see `Commands`.
+client's queue. A message that stops the robot is carried out though it is old, see
+`Commands`, and shows all the same that what comes behind it is a queue.
 
 A queue ends by a silence or by that pace, never by a time: a stream that is faster than `BURST`
 allows (125 Hz; QoS 2: 33 Hz without round trips) is never carried out without `sent-at`.

@@ -23,6 +23,7 @@ from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.rules import CommandRules, FieldLimits
 from appliance.ros.to_ros import AgainstRulesError, Surroundings, ToRos
+from appliance.ros.turns import LITTLE, size_of
 
 #: Seconds until a stop message that ROS would not take is published again.
 RETRY = 0.05
@@ -196,7 +197,7 @@ class Commands(ToRos):
                 self._arrivals.is_old(origin, now)
         elif origin is not None and not is_proven and self.rules.oldest < math.inf:
             verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now)
-        if why:
+        if why and not self._is_late_stop(message, origin):
             return self._expire(message, why, origin)
         is_kept = retain or (message.retain and self.rules.take_retained)
         if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
@@ -222,7 +223,11 @@ class Commands(ToRos):
             why = self._old_by_itself(message)
         except ValueError as error:
             return self._object(message, f"was refused: {error}")
-        return self._expire(message, why, session) if why else super().inspect(message, session)
+        if not why:
+            return super().inspect(message, session)
+        if size_of(message.payload) > LITTLE or self._is_late_stop(message, session):
+            return None  # a large one is looked at when it is its turn
+        return self._expire(message, why, session)
 
     def _carry_out(self, message: Message, cdr: bytes, origin: Session | None) -> Objection | None:
         objection = self._publish(cdr, message)
@@ -248,6 +253,21 @@ class Commands(ToRos):
             ahead = f"its {SENT_AT} is {-age:.1f} s in the future"
             raise ValueError(f"{ahead}: set the clocks of the robot and its client")
         return f"it was sent {age:.1f} s before, by its {SENT_AT}" if age > oldest else ""
+
+    def _is_late_stop(self, message: Message, origin: Session | None) -> bool:
+        """Whether a message that is too old stops the robot, and is carried out all the same.
+
+        What MQTT itself has expired is delivered to nobody [MQTT-3.3.2-5], also not here.
+        """
+        out, expires_at = self._out, message.expires_at
+        if out is None or self._stop is None:
+            return False
+        if expires_at is not None and expires_at <= self._around.broker.now:
+            return False
+        try:
+            return self._stops(super()._read(out[0], message, origin))
+        except ConversionError:
+            return False
 
     def _old_by_its_way(self, message: Message, retain: bool, origin: Session | None) -> str:
         """Why a message that does not say so is too old; empty when that is not known."""

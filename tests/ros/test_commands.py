@@ -1372,6 +1372,57 @@ async def test_the_stop_message_is_heard_at_once_whatever_comes_with_it(house):
     assert house.robot.received == [STOP, STOP]
 
 
+def made(seconds_ago):
+    return {Property.USER_PROPERTY: [("sent-at", str(time.time() - seconds_ago))]}
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("padding", [b"", b" " * 5000])
+@pytest.mark.parametrize("way", ["dup", "sent-at"])
+async def test_an_old_stop_message_is_carried_out(house, way, padding, qos):
+    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(house.broker, "a")
+    old = {"dup": True} if way == "dup" else {"properties": made(61)}
+    driver.steer()
+    driver.drive(b"{}" + padding, qos=qos, **old)
+    assert decode(driver.wire.written).reason_code == 0
+    if qos == 2:
+        driver.say(Pubrel(7))
+    assert house.robot.received == [twist(0.5), STOP]
+    assert house.counters().expired == 0
+    # It shows a queue all the same: another command that comes with it is old.
+    driver.drive(GO)
+    assert house.robot.received == [twist(0.5), STOP]
+
+
+async def test_a_stop_message_that_waited_behind_a_slow_reader_is_carried_out(house):
+    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(house.broker, "a")
+    driver.steer()
+    late = Late(Message(TOPIC, b"{}", 1), 5.0)
+    assert house.commands.receive(late, False, driver.client.session) is None
+    assert house.robot.received == [twist(0.5), STOP]
+    late = Late(Message(TOPIC, GO, 1), 5.0)
+    assert house.commands.receive(late, False, driver.client.session) is not None
+    assert house.robot.received == [twist(0.5), STOP]
+
+
+async def test_a_will_that_stops_the_robot(house):
+    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    gone = Driver(house.broker, "gone", will=Will(TOPIC, b"{}"))
+    Driver(house.broker, "a").steer()
+    gone.cut()
+    assert house.robot.received == [twist(0.5), STOP]
+
+
+async def test_a_stop_message_that_mqtt_has_expired_is_not_carried_out(house):
+    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(house.broker, "a")
+    driver.drive(b"{}", qos=1, properties={Property.MESSAGE_EXPIRY_INTERVAL: 0})
+    assert driver.code == 0x83
+    assert house.robot.received == []
+
+
 async def test_what_waits_is_not_carried_out_behind_a_stop(house):
     house.start(CommandRules(on_silence=OnSilence(0.5)))
     driver = Driver(house.broker, "a")
