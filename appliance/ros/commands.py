@@ -20,6 +20,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.arrivals import AHEAD, SENT_AT, Arrivals, Verdict, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
+from appliance.ros.lease import Lease
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.rules import CommandRules, FieldLimits
 from appliance.ros.to_ros import AgainstRulesError, Surroundings, ToRos
@@ -124,6 +125,8 @@ class Commands(ToRos):
         self._drivers: dict[Session, tuple[bytes, float]] = {}
         self._has_stopped = False
         self._arrivals = Arrivals()
+        #: The lease that an exclusive route has joined.
+        self._joined: Lease | None = None
         #: First commands of clients, see `Arrivals`.
         self._waiting: dict[Session, _Waiting] = {}
         #: Who fell silent while it drove, and when its computer was asked for an answer.
@@ -176,8 +179,7 @@ class Commands(ToRos):
             self._timer.cancel()
             self._timer = None
         self._around.broker.departures.remove(self._departed)
-        if self.rules.exclusive:
-            self._lease.holder = None
+        self._part_with_lease()
         self._source = None
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
@@ -401,6 +403,19 @@ class Commands(ToRos):
     def commanding(self) -> str | None:
         holder = self._lease.holder if self.rules.exclusive else None
         return None if holder is None else holder.client_id
+
+    def _share_lease(self) -> None:
+        self._part_with_lease()
+        super()._share_lease()
+        if self.rules.exclusive and not self._is_left:
+            self._lease.join(self._arm)
+            self._joined = self._lease
+
+    def _part_with_lease(self) -> None:
+        joined, self._joined = self._joined, None
+        if joined is not None:
+            joined.part(self._arm)
+            self._around.broker.guards_changed()
 
     def _release(self, why: str) -> None:
         holder, self._lease.holder = self._lease.holder, None

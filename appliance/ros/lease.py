@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from weakref import WeakValueDictionary
 
 from appliance.broker.ports import Decision
@@ -22,6 +23,21 @@ class Lease:
         self.holder: Session | None = None
         #: When the holder commanded last.
         self.heard_at = -math.inf
+        #: One of each exclusive route there: has it watch for when the holder has been silent.
+        self._watches: list[Callable[[], None]] = []
+
+    def join(self, watch: Callable[[], None]) -> None:
+        """An exclusive route leads there."""
+        self._watches.append(watch)
+
+    def part(self, watch: Callable[[], None]) -> None:
+        """It does no longer. The lease is over with the last one; until then others watch it."""
+        self._watches.remove(watch)
+        if not self._watches:
+            self.holder = None
+        elif self.holder is not None:
+            for other in self._watches:
+                other()
 
     def decide(self, session: Session) -> Decision:
         """Whether the session may command now."""

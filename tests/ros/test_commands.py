@@ -1636,3 +1636,31 @@ async def test_two_routes_to_one_ros_topic_have_one_driver(house, other, remappe
     is_taken = other is not None and other.exclusive
     assert a.code == (0x87 if is_taken else 0)
     assert joy(b) == (0 if is_taken else 0x87)
+
+
+@pytest.mark.parametrize("stays", [0, 1])
+async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, stays):
+    """Also of the one that its holder drove through; what is left sees to its end."""
+    rules = CommandRules(exclusive=True, lease=60)
+    routes = [
+        RouteSettings("/cmd_vel", "ros", topic, TWIST, rules=rules) for topic in (TOPIC, "r2d2/joy")
+    ]
+    bridge = House.start(house, *routes)
+    house.node.add_subscriber("/cmd_vel", TWIST)
+    await house.settle()
+    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    a.drive(qos=1)
+    bridge.replace([routes[stays]])
+
+    def say(driver):
+        driver.wire.written = b""
+        topic = routes[stays].mqtt
+        driver.say(Publish(topic, GO, qos=1, packet_id=7))
+        return driver.code
+
+    assert [say(b), say(a)] == [0x87, 0]
+    assert house.commands._timer is not None
+    bridge.replace([])
+    bridge.replace(routes)
+    house.node.spin()
+    assert say(b) == 0
