@@ -30,8 +30,10 @@ CACHED_IN_ALL = 1 / 8
 #: Questions about one route that a message waits for at a time.
 UNDECIDED = 16
 
-#: The effort to find a route, see `Counters.effort`; each match comes on top.
+#: The effort to find a route, see `Counters.effort`; each match comes on top, and what the search
+#: passed: so many levels and nodes are one effort.
 ROUTE_EFFORT = 20
+PASSED_AN_EFFORT = 4
 
 _ALLOWED = Decision(True, "the appliance itself")
 _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
@@ -167,12 +169,17 @@ class Router:
                 for guard in self.guards[topic]
             ]
             decision = next((verdict for verdict in verdicts if not verdict), decision)
-        matches = self._subscriptions.match(topic) if decision else []
-        self._counters.effort += ROUTE_EFFORT + len(matches)
+        self._counters.effort += ROUTE_EFFORT
+        matches = self._match(topic) if decision else []
         targets, shares = self._targets(session, topic, matches)
         return Route(
             topic, decision.allowed, decision.reason, targets, shares, bool(matches), undecided
         )
+
+    def _match(self, topic: str) -> list[tuple[Session, Subscription] | Share]:
+        found = self._subscriptions.match(topic)
+        self._counters.effort += len(found) + self._subscriptions.passed // PASSED_AN_EFFORT
+        return found
 
     def _may_publish(self, session: Session, topic: str) -> Decision:
         if session.identity is None:

@@ -146,13 +146,16 @@ class _FilterNode(Generic[V]):
 class SubscriptionTree(Generic[V]):
     """Filters, each with values by key, found by a topic: a trie whose edges are levels.
 
-    Looking a topic up visits the nodes that match a beginning of it, each once, so the cost
-    does not depend on the subscriptions to other topics. Filters and topics are valid ones.
+    Looking a topic up visits the nodes that match a beginning of it, each once. Of filters with
+    `+` these may be many, also when none of them matches in the end: `passed` says how many they
+    were. Filters and topics are valid ones.
     """
 
     def __init__(self) -> None:
         self._root: _FilterNode[V] = _FilterNode()
         self._size = 0
+        #: What the last `match` looked at: levels of the topic, and nodes.
+        self.passed = 0
 
     def __len__(self) -> int:
         """How many pairs of filter and key there are."""
@@ -196,7 +199,9 @@ class SubscriptionTree(Generic[V]):
         # The nodes reached so far. A node has one parent, so none can be reached twice.
         nodes = [self._root]
         wild = topic[:1] != "$"  # [MQTT-4.7.2-1]: no wildcard for the first level of a $ topic.
-        for level in topic.split("/"):
+        levels = topic.split("/")
+        passed = len(levels) + 1
+        for level in levels:
             reached: list[_FilterNode[V]] = []
             for node in nodes:
                 children = node.children
@@ -210,10 +215,12 @@ class SubscriptionTree(Generic[V]):
                     child = children.get("#")
                     if child is not None:
                         found.extend(child.values.values())
-            if not reached:
-                return found
             nodes = reached
+            if not nodes:
+                break
+            passed += len(nodes)
             wild = True
+        self.passed = passed
         for node in nodes:
             found.extend(node.values.values())
             child = node.children.get("#")  # `a/#` matches `a` too.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from itertools import product
 
 import pytest
 
@@ -248,6 +249,24 @@ def test_what_one_client_sends_takes_turns(join: Join, broker: Broker):
     take_turns(broker, peer)
     payloads = subscriber.payloads()
     assert heard + len(payloads) == count + 1 and payloads[-1] == b"last"
+
+
+def test_a_search_that_passes_many_filters_ends_the_turn_though_none_matches(
+    join: Join, broker: Broker
+):
+    stranger, peer = join("stranger"), join("peer")
+    for levels in product("a+", repeat=11):
+        name = "/".join([*levels, "end"])
+        broker.router.join(stranger.session, Subscription(name, 0))
+    begun = broker.counters.effort
+    topics = ["/".join(["a"] * 11 + [f"new{number}"]) for number in range(3)]
+    peer.send(*(Publish(topic, b"x") for topic in topics))
+    assert peer.client.connection.paused and peer.wire.laters  # the others have their turn
+    assert broker.counters.publish_received == 1
+    assert broker.counters.effort - begun > EFFORT_A_TURN
+    assert len(take_turns(broker, peer)) >= 2
+    assert broker.counters.publish_received == 3
+    assert not peer.client.connection.paused
 
 
 @pytest.mark.parametrize("limits", [Limits(subscriptions=MAXIMUM_FILTERS)])
