@@ -1138,12 +1138,13 @@ class TestArrivals:
 
     @pytest.mark.parametrize("rate", [10, 20, 25, 50])
     def test_who_steers_is_heard_from_the_third_on(self, qos, rate):
-        if qos == 2 and rate == 50:
-            pytest.skip("its acknowledgements cannot be withheld: it counts as a queue")
         sender = Sender(qos)
         numbers = range(1, 40)
         for number in numbers:
             sender.say(1 / rate, number)
+        if qos == 2 and rate == 50:  # its acknowledgements cannot be withheld: a queue
+            assert sender.moved == []
+            return
         assert sender.moved[-37:] == list(numbers)[2:]
         # And on, after a pause that is none.
         sender.say(sender.OLDEST - 0.01, "on")
