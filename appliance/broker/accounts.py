@@ -75,7 +75,7 @@ class Account:
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """How much of what cannot be taken back one user may hold of the `whole`.
+    """How much one user may hold of the `whole`.
 
     It may hold what is `sure`, and more up to `most` as long as all together hold no more than is
     `lent`.
@@ -109,6 +109,10 @@ class Quota:
         if total > self.whole:
             return False
         return held <= self.sure or (held <= self.most and total <= self.lent)
+
+    def must_yield(self, most: int, held: int) -> bool:
+        """Whether who holds `most` of what can be taken back gives one to who holds so many."""
+        return most > self.sure > held
 
 
 class Accounts:
@@ -217,13 +221,16 @@ class Accounts:
 
 
 class Quotas:
-    """What of all that cannot be taken back a user may hold, out of the limits in force."""
+    """What a user may hold, out of the limits in force: of what cannot be taken back no more than
+    this, and of connections and sessions that much at any rate."""
 
-    __slots__ = ("memory", "retained", "retained_bytes", "stored")
+    __slots__ = ("connections", "memory", "retained", "retained_bytes", "sessions", "stored")
 
     def __init__(self, limits: Limits, memory: int, stored: int) -> None:
         """`memory` and `stored` are what users may use of those in all, in bytes."""
         user = limits.user
+        self.connections = Quota.of(limits.connections, user.connections)
+        self.sessions = Quota.of(limits.sessions, user.sessions)
         self.memory = Quota.of(memory, user.memory)
         self.retained = Quota.of(limits.retained_messages, user.retained_messages)
         self.retained_bytes = Quota.of(limits.retained_bytes, user.retained_bytes)

@@ -218,48 +218,96 @@ class Broker:
         """Let there be room for a client of the account, and for its session if it has none.
 
         As long as there is any, everybody may have it, up to what the configuration allows a user.
-        When there is none, who has most gives some back: its newest connection, and of its
-        sessions the one whose client has been away for longest.
+        When there is none, sessions without a client go first. A connection that is in use is ended
+        only for who has less than is sure for each user, where another one has more than that.
 
         Raises:
-            ProtocolError: 0x97, nobody has more than this one would have.
+            ProtocolError: 0x97, nothing may be ended for it; nothing has changed then.
         """
-        accounts, limits, own = self.ledger.accounts, self.limits, self.limits.user
-        if session is None or session.link is None:
-            if own.connections is not None and account.connections >= own.connections:
-                raise _has_all(account, account.connections, "connections", "user.connections")
-            if accounts.connections >= limits.connections:
-                holder = accounts.largest(lambda each: each.connections)
-                if holder.connections <= account.connections + 1:
-                    raise _has_all(account, account.connections, "connections", "connections")
-                self._take_back(holder, next(reversed(holder.present)), account, "connections")
-        if session is None:
-            if own.sessions is not None and account.sessions >= own.sessions:
-                raise _has_all(account, account.sessions, "sessions", "user.sessions")
-            if accounts.sessions >= limits.sessions:
-                holder = accounts.largest(lambda each: each.sessions)
-                if holder.sessions <= account.sessions + 1:
-                    raise _has_all(account, account.sessions, "sessions", "sessions")
-                # With fewer sessions than connections allowed there may be no absent one.
-                oldest = next(iter(holder.absent), None) or next(reversed(holder.present))
-                self._take_back(holder, oldest, account, "sessions")
-                if self.sessions.get(oldest.client_id) is oldest:
-                    self._end(oldest)
+        needs_connection = session is None or session.link is None
+        closing = self._connection_to_end(account) if needs_connection else None
+        ending = self._session_to_end(account) if session is None else None
+        if closing is not None:
+            self._take_back(closing, account, "connections")
+            # Its session may have ended with it, which may be room enough.
+            ending = ending and self._session_to_end(account)
+        if ending is not None:
+            self._take_back(ending, account, "sessions")
+            if self.sessions.get(ending.client_id) is ending:
+                self._end(ending)
 
-    def _take_back(self, holder: Account, session: Session, account: Account, what: str) -> None:
-        """End the connection of a session, if it has one, as another user needs the place."""
+    def _connection_to_end(self, account: Account) -> Session | None:
+        """Whose connection makes room for one of the account; None when none has to.
+
+        Raises:
+            ProtocolError: 0x97, none may be ended for it.
+        """
+        accounts, own = self.ledger.accounts, self.limits.user.connections
+        if own is not None and account.connections >= own:
+            raise _has_all(account, account.connections, "connections", "user.connections")
+        if accounts.connections < self.limits.connections:
+            return None
+        holder = accounts.largest(lambda each: each.connections)
+        if self.ledger.quotas.connections.must_yield(holder.connections, account.connections):
+            return next(reversed(holder.present))
+        raise _has_all(account, account.connections, "connections", "connections")
+
+    def _session_to_end(self, account: Account) -> Session | None:
+        """Which session makes room for one of the account; None when none has to.
+
+        The one whose client has been away for longest, of the user who has most sessions; where
+        that one would not be left with as many as the account gets, of the account itself.
+
+        Raises:
+            ProtocolError: 0x97, none may be ended for it.
+        """
+        accounts, own = self.ledger.accounts, self.limits.user.sessions
+        has_all_of_its_own = own is not None and account.sessions >= own
+        if not has_all_of_its_own and accounts.sessions < self.limits.sessions:
+            return None
+        holder = account
+        if not has_all_of_its_own:
+            most = accounts.largest(lambda each: each.sessions if each.absent else 0)
+            if most.absent and most.sessions > account.sessions + 1:
+                holder = most
+        if holder.absent:
+            return next(iter(holder.absent))
+        if has_all_of_its_own:
+            raise _has_all(account, account.sessions, "sessions", "user.sessions")
+        # With fewer sessions than connections allowed all may be in use.
+        holder = accounts.largest(lambda each: each.connections)
+        if self.ledger.quotas.sessions.must_yield(holder.sessions, account.sessions):
+            return next(reversed(holder.present))
+        raise _has_all(account, account.sessions, "sessions", "sessions")
+
+    def _take_back(self, session: Session, account: Account, what: str) -> None:
+        """End the connection of a session, if it has one, as the account needs the place."""
         self.counters.taken_back += 1
-        self.complaints.tell(
-            self.now,
-            ("taken back", what, holder.username),
-            "%s makes room for %s: broker.limits.%s is reached, and %s has most of it "
-            "(broker.limits.user.%s bounds what a user may have)",
-            session,
-            account,
-            what,
-            holder,
-            what,
-        )
+        holder = session.account
+        key = ("taken back", what, holder.username)
+        if holder is account:
+            self.complaints.tell(
+                self.now,
+                key,
+                "%s makes room for another session of its user: %s has %d sessions, as many as "
+                "there may be, and this one's client has been away for longest "
+                "(broker.limits.user.sessions, broker.limits.sessions)",
+                session,
+                account,
+                account.sessions,
+            )
+        else:
+            self.complaints.tell(
+                self.now,
+                key,
+                "%s makes room for %s: broker.limits.%s is reached, and %s has most of it "
+                "(broker.limits.user.%s bounds what a user may have)",
+                session,
+                account,
+                what,
+                holder,
+                what,
+            )
         session.close_link(
             ReasonCode.QUOTA_EXCEEDED,
             f"others need a place, and its user has most (broker.limits.{what})",

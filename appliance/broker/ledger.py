@@ -40,7 +40,8 @@ class Counters:
     #: itself here, so that one client's turn can be ended without a look at the clock.
     effort: int = 0
     sessions_expired: int = 0
-    #: Connections and sessions that were ended as their users had most, and others none.
+    #: Connections and sessions that were ended as somebody needed the place, see
+    #: `Broker._make_room`.
     taken_back: int = 0
     clients_maximum: int = 0
 

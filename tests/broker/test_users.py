@@ -87,9 +87,51 @@ def test_accounts_that_hold_nothing_are_forgotten(broker: Broker):
 @pytest.mark.parametrize("limits", [Limits(sessions=8)])
 def test_a_user_alone_may_have_all_sessions(broker: Broker):
     assert leave_sessions(broker, "mallory", 8) == [0] * 8
-    peer = try_to_connect(broker, "one-more", "mallory")
-    assert peer.code == FULL
     assert len(broker.sessions) == 8
+
+
+def own_limit(sessions: int) -> Limits:
+    return Limits(user=UserLimits(sessions=sessions))
+
+
+@pytest.mark.parametrize("version", [4, 5])
+@pytest.mark.parametrize(
+    ("limits", "key"),
+    [(Limits(sessions=4), "broker.limits.sessions"), (own_limit(4), "broker.limits.user.sessions")],
+)
+def test_no_user_is_kept_out_by_absent_sessions_of_its_own(
+    broker: Broker, store: FakeStore, version: int, key: str, caplog: pytest.LogCaptureFixture
+):
+    leave_sessions(broker, "alice", 4)
+    peer = try_to_connect(broker, "alice-stops-the-robot", "alice", version=version)
+    assert peer.code == 0
+    assert "alice-0" not in broker.sessions and "alice-0" not in store.sessions
+    assert {"alice-1", "alice-2", "alice-3"} <= set(broker.sessions)
+    assert "client 'alice-0' (user 'alice') makes room for another session of its" in caplog.text
+    assert key in caplog.text
+    assert broker.counters.taken_back == 1
+
+
+@pytest.mark.parametrize("limits", [Limits(sessions=8)])
+def test_on_a_tie_the_oldest_absent_session_of_the_user_itself_goes(broker: Broker):
+    leave_sessions(broker, "alice", 4)
+    leave_sessions(broker, "bob", 4)
+    for user, other in (("alice", "bob"), ("bob", "alice")):
+        peer = try_to_connect(broker, f"{user}-new", user)
+        assert peer.code == 0
+        assert f"{user}-0" not in broker.sessions
+        assert f"{other}-3" in broker.sessions
+    kept = {user: [name for name in broker.sessions if name.startswith(user)]
+            for user in ("alice", "bob")}  # fmt: skip
+    assert {user: len(names) for user, names in kept.items()} == {"alice": 4, "bob": 4}
+
+
+@pytest.mark.parametrize("limits", [Limits(sessions=3), own_limit(3)])
+def test_a_user_whose_sessions_are_all_in_use_is_refused(broker: Broker, join: Join):
+    crowd = [join(f"m-{number}", user="mallory") for number in range(3)]
+    refused = try_to_connect(broker, "one-more", "mallory")
+    assert refused.code == FULL
+    assert not any(peer.wire.closed for peer in crowd)
 
 
 @pytest.mark.parametrize("limits", [Limits(sessions=8)])
@@ -116,10 +158,13 @@ def test_who_has_most_makes_room_and_nobody_else(broker: Broker):
     kept = {user: len([name for name in broker.sessions if name.startswith(user)])
             for user in ("alice", "bob", "mallory")}  # fmt: skip
     assert kept == {"alice": 3, "bob": 2, "mallory": 3}
-    # All have as much as each other: one more is one too many, whosever it is.
-    assert leave_sessions(broker, "alice", 1, first=3) == [FULL]
-    assert leave_sessions(broker, "mallory", 1, first=6) == [FULL]
-    assert leave_sessions(broker, "bob", 1, first=2) == [FULL]  # 3 are no more than it would have
+    # All have as much as each other: one more takes the place of one of the same user.
+    assert leave_sessions(broker, "alice", 1, first=3) == [0]
+    assert leave_sessions(broker, "mallory", 1, first=6) == [0]
+    assert leave_sessions(broker, "bob", 1, first=2) == [0]  # 3 are no more than it would have
+    kept = {user: len([name for name in broker.sessions if name.startswith(user)])
+            for user in ("alice", "bob", "mallory")}  # fmt: skip
+    assert kept == {"alice": 3, "bob": 2, "mallory": 3}
     assert leave_sessions(broker, None, 1) == [0]
 
 
@@ -168,7 +213,8 @@ def test_who_comes_back_needs_no_room(broker: Broker):
 def test_a_configured_number_of_sessions_is_the_most(
     broker: Broker, version: int, caplog: pytest.LogCaptureFixture
 ):
-    leave_sessions(broker, "mallory", 2)
+    for number in range(2):
+        try_to_connect(broker, f"m-{number}", "mallory")
     peer = try_to_connect(broker, "third", "mallory", version=version)
     # 3.1.1 table 3.1 has no quota
     assert peer.code == (FULL if version == 5 else ReasonCode.SERVER_UNAVAILABLE)
@@ -209,6 +255,65 @@ def test_the_newest_connection_of_who_has_most_makes_room(broker: Broker, join: 
     crowd[0].lose()
     again = try_to_connect(broker, "m-3", "mallory")
     assert again.code == 0
+
+
+def connect_many(broker: Broker, user: str, count: int) -> list[Caller]:
+    callers = [try_to_connect(broker, f"{user}-{number}", user) for number in range(count)]
+    return [caller for caller in callers if caller.code == 0]
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(connections=16, sessions=100), Limits(connections=100, sessions=16)]
+)
+def test_small_users_end_no_connection_beyond_their_sure_share(broker: Broker):
+    fleet = connect_many(broker, "fleet", 10)
+    small = [peer for user in ("low", "low2") for peer in connect_many(broker, user, 10)]
+    # The first got what was free; the second its quarter, which the fleet had beyond its own.
+    ended = [peer for peer in fleet if peer.wire.closed]
+    assert len(ended) <= 4
+    by_user = {user: len([p for p in small if p.session.identity.username == user
+                          and not p.wire.closed]) for user in ("low", "low2")}  # fmt: skip
+    assert by_user["low2"] == 4
+    assert by_user["low"] + len(fleet) - len(ended) == 12
+    assert by_user["low"] >= 4
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(connections=16, sessions=100), Limits(connections=100, sessions=16)]
+)
+def test_who_has_its_sure_share_takes_no_connection_of_who_has_more(broker: Broker):
+    small = connect_many(broker, "low", 4)
+    fleet = connect_many(broker, "fleet", 12)
+    refused = try_to_connect(broker, "low-more", "low")
+    assert refused.code == FULL
+    assert not any(peer.wire.closed for peer in small + fleet)
+    alice = try_to_connect(broker, "alice", "alice")
+    assert alice.code == 0
+    assert [peer.wire.closed for peer in fleet] == [False] * 11 + [True]
+    assert not any(peer.wire.closed for peer in small)
+
+
+@pytest.mark.parametrize("limits", [Limits(connections=16, user=UserLimits(connections=10))])
+def test_who_keeps_within_a_configured_number_loses_no_connection(broker: Broker):
+    fleet = connect_many(broker, "fleet", 10)
+    assert len(connect_many(broker, "low", 10)) == 6
+    assert connect_many(broker, "low2", 10) == []
+    assert not any(peer.wire.closed for peer in fleet)
+
+
+@pytest.mark.parametrize("limits", [Limits(connections=4, sessions=4)])
+def test_who_is_refused_for_its_session_ends_no_connection(broker: Broker, join: Join):
+    """It would have a connection of who has most, and there is no session for it."""
+    alice = try_to_connect(broker, "alice", "alice", **lasting(5))
+    crowd = connect_many(broker, "mallory", 3)
+    alice.lose()
+    late = try_to_connect(broker, "late", "mallory")
+    assert late.code == FULL
+    broker.use(Limits(connections=3, sessions=4, user=UserLimits(sessions=0)), Features())
+    refused = try_to_connect(broker, "bob", "bob")
+    assert refused.code == FULL
+    assert not any(peer.wire.closed for peer in crowd)
+    assert broker.counters.taken_back == 0
 
 
 @pytest.mark.parametrize("limits", [Limits(connections=2)])
