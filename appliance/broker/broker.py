@@ -54,8 +54,10 @@ LOOKS_FOR_ONE = 4
 ENDINGS_A_TURN = 128
 
 
-#: The effort to refuse a message, and to give a client that has logged in its session.
+#: The effort to refuse a message, to keep one of QoS 2 until its PUBREL and to take it out again,
+#: and to give a client that has logged in its session.
 REFUSAL_EFFORT = 2
+HELD_EFFORT = 3
 CONNECT_EFFORT = 50
 
 
@@ -420,28 +422,30 @@ class Broker:
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
-        give = self._giver(absent_too=False)
-        for topic_filter in session.subscriptions:
-            share = self.router.shares.get(topic_filter)
-            if share is not None and any(member.link is not None for member in share.members):
-                session.hand_over(share, give, sent=True)
+        known = self.router.shares
+        shares = {known[name] for name in session.subscriptions if name in known}
+        if shares:
+            session.hand_over(shares, self._giver(absent_too=False), sent=True)
 
     def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
         """A way to give other members what one of a group leaves; True when that is settled."""
-        known: dict[tuple[Share, str], list[Target]] = {}
+        known: dict[Share, list[Target]] = {}
 
         def give(delivery: Delivery) -> bool:
             message, _, _, _, share = delivery
             assert share is not None
             if self.ledger.has_expired(message):
                 return True
-            members = known.get((share, message.topic))
+            members = known.get(share)
             if members is None:
-                members = self.router.members(share, message.topic)
+                members = share.targets()
+                self.counters.effort += len(members) // LOOKS_FOR_ONE
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
-                known[share, message.topic] = members
-            target = share.choose(members, message)
+                known[share] = members
+            # Who may receive it is asked of those alone that it may go to: there may be thousands.
+            target = share.choose(members, message, self.router.may_receive)
+            self.counters.effort += 1 + share.looked // LOOKS_FOR_ONE
             return target is not None and self._deliver_shared(target, message, share)
 
         return give
@@ -562,14 +566,15 @@ class Broker:
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
+            self.counters.effort += 1 + share.looked // LOOKS_FOR_ONE
             if chosen is not None and self._deliver_shared(chosen, message, share):
                 taken = True
-            elif published_qos and (asked := [member[0] for member in members if member[1]]):
+            elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
                 self.counters.publish_dropped += chosen is None
-                if self.ledger.refusing and any(session.persistent for session in asked):
+                if self.ledger.refusing and any(m[1] and m[0].persistent for m in members):
                     kept = False
                 else:
-                    self._tell_full(asked[0])
+                    self._tell_full(asked)
                 full = True
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
@@ -609,6 +614,7 @@ class Broker:
         have, it is theirs, and those who have none miss it, counted and logged: one slow reader
         does not keep it from the others.
         """
+        self._count_looks(route)
         full: set[Receiver] = set()
         is_taken = False
         for session, qos, _, _ in route.targets:
@@ -630,8 +636,7 @@ class Broker:
         Of a group that is one of these if nobody in it has room.
         """
         size = message.size
-        looked_at = len(route.targets) + sum(len(members) for _, members in route.shares)
-        self.counters.effort += looked_at // LOOKS_FOR_ONE
+        self._count_looks(route)
         full = [
             session
             for session, qos, _, _ in route.targets
@@ -644,8 +649,14 @@ class Broker:
         congestions = [session.congestion for session in full]
         return [each for each in congestions if each is not None and each.patience()]
 
+    def _count_looks(self, route: Route) -> None:
+        """All receivers of a route are asked, each on its own."""
+        looks = len(route.targets) + sum(len(members) for _, members in route.shares)
+        self.counters.effort += looks // LOOKS_FOR_ONE
+
     def must_store(self, route: Route, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""
+        self._count_looks(route)
         return (
             message.retain
             or (message.qos == 2 and origin.persistent)
@@ -658,6 +669,7 @@ class Broker:
 
         `age` is in seconds from its coming.
         """
+        self.counters.effort += HELD_EFFORT
         message, full, _ = held
         if age > LATE:
             message = Late(message, max(age, message.age))
@@ -669,6 +681,7 @@ class Broker:
             self.counters.publish_dropped += 1
             self.complain(origin, "its message cannot be published: %s", error)
             return
+        self._count_looks(route)
         targets: list[Target] = []
         for target in route.targets:
             session, qos, as_published, ids = target
@@ -815,7 +828,7 @@ class Broker:
         share = self.router.shares.get(topic_filter)
         self.router.leave(session, topic_filter)
         if share is not None:
-            session.hand_over(share, self._giver(absent_too=True), sent=False)
+            session.hand_over((share,), self._giver(absent_too=True), sent=False)
         if session.persistent:
             self.store.unsubscribed(session, topic_filter)
         if self.observer is not None:

@@ -18,7 +18,7 @@ from appliance.broker.backpressure import (
     Allowance,
     Congestion,
 )
-from appliance.broker.broker import LATE, Broker
+from appliance.broker.broker import HELD_EFFORT, LATE, Broker
 from appliance.broker.handshake import (
     agree,
     connack_properties,
@@ -523,6 +523,7 @@ class Client:
         self, session: Session, packet_id: int, message: Message, route: Route
     ) -> None:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
+        self._counters.effort += HELD_EFFORT
         code = ReasonCode.SUCCESS
         held = session.received.get(packet_id)
         if (

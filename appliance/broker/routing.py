@@ -224,7 +224,7 @@ class Router:
         shares: list[tuple[Share, list[Target]]] = []
         for match in matches:
             if isinstance(match, Share):
-                shares.append((match, self.members(match, topic)))
+                shares.append((match, self._members(match, topic)))
                 continue
             session, subscription = match
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
@@ -242,18 +242,10 @@ class Router:
         targets = [target for target in merged.values() if self.may_receive(target[0], topic)]
         return targets, shares
 
-    def members(self, share: Share, topic: str) -> list[Target]:
+    def _members(self, share: Share, topic: str) -> list[Target]:
         """The members of the group that may receive the topic."""
-        return [
-            (
-                session,
-                subscription.qos,
-                subscription.retain_as_published,
-                [subscription.identifier] if subscription.identifier else None,
-            )
-            for session, subscription in share.members.items()
-            if self.may_receive(session, topic)
-        ]
+        self._counters.effort += len(share.members)
+        return [member for member in share.targets() if self.may_receive(member[0], topic)]
 
     def may_receive(self, session: Session, topic: str) -> bool:
         """Whether the rules in force let the session receive the topic's messages."""

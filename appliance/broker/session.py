@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from appliance.broker.backpressure import Congestion
@@ -784,16 +784,17 @@ class Session:
         self.ledger.queued_bytes += size
 
     def hand_over(
-        self, share: Share | None, give: Callable[[Delivery], bool], *, sent: bool
+        self, shares: Collection[Share] | None, give: Callable[[Delivery], bool], *, sent: bool
     ) -> None:
-        """Offer what a shared subscription (None: each of them) gave this session to others.
+        """Offer what these shared subscriptions (None: each there is) gave this session to others.
 
         What `give` finds nobody for stays. With `sent` what is in flight with QoS 1 is offered,
         too: another member may get it a second time. QoS 2 stays [MQTT-4.8.2-4], [MQTT-4.8.2-5].
         """
 
         def is_given(delivery: Delivery) -> bool:
-            return delivery[4] is not None and share in (None, delivery[4]) and give(delivery)
+            share = delivery[4]
+            return share is not None and (shares is None or share in shares) and give(delivery)
 
         if sent:
             for packet_id, delivery in list(self.inflight.items()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 from appliance.broker.message import Message
@@ -23,18 +24,39 @@ class Share:
         self.filter = topic_filter
         self.members: dict[Session, Subscription] = {}
         self._turn = 0
+        #: Members that the last `choose` looked at.
+        self.looked = 0
 
-    def choose(self, members: list[Target], message: Message) -> Target | None:
+    def targets(self) -> list[Target]:
+        """All members, as receivers of a message."""
+        return [
+            (
+                session,
+                subscription.qos,
+                subscription.retain_as_published,
+                [subscription.identifier] if subscription.identifier else None,
+            )
+            for session, subscription in self.members.items()
+        ]
+
+    def choose(
+        self,
+        members: list[Target],
+        message: Message,
+        may_receive: Callable[[Session, str], bool] | None = None,
+    ) -> Target | None:
         """Who of these members gets the message; None when nobody can be given it.
 
         They take turns. A member that would have to queue the message is passed over as long as
-        another can be sent it at once, and an absent one as long as any is there.
+        another can be sent it at once, and an absent one as long as any is there. `may_receive` is
+        asked where the members are not only those that may receive the topic.
         """
         best: Target | None = None
         best_rank = 0
         best_index = 0
         count = len(members)
-        for offset in range(min(count, ASKED)):
+        self.looked = min(count, ASKED)
+        for offset in range(self.looked):
             index = (self._turn + offset) % count
             session = members[index][0]
             qos = min(message.qos, members[index][1])
@@ -42,9 +64,14 @@ class Share:
                 rank = 1 if qos and session.persistent else 0
             else:
                 rank = 3 if session.ready else 2
-            if rank > best_rank and (not qos or session.has_room(message)):
+            if (
+                rank > best_rank
+                and (not qos or session.has_room(message))
+                and (may_receive is None or may_receive(session, message.topic))
+            ):
                 best, best_rank, best_index = members[index], rank, index
                 if rank == 3:
+                    self.looked = offset + 1
                     break
         if best is not None:
             self._turn = (best_index + 1) % count

@@ -999,6 +999,13 @@ async def packet_ids(fight: Fight) -> None:
     await fight.together(*(exhaust(number) for number in range(5)))
 
 
+@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+async def unreleased(fight: Fight) -> None:
+    """Twenty clients of 3.1.1 that send 180 kB of the smallest messages of QoS 2 in one moment."""
+    chunk = encode4(*(Publish("r2d2/q2", b"", 2, packet_id=1 + n) for n in range(14_000)))
+    await _at_once(fight, 20, 0.7, lambda number: chunk, version=V311)
+
+
 @attack(rf"{CLIENT}")
 async def never_completing(fight: Fight) -> None:
     """Subscribers that answer a QoS 2 message with PUBREC and never with PUBCOMP."""
@@ -1293,6 +1300,22 @@ async def one_address_in_haste(fight: Fight) -> None:
 
 
 # --- parts
+
+
+async def _at_once(
+    fight: Fight, clients: int, pause: float, make: Callable[[int], bytes], **fields: Any
+) -> None:
+    """Clients that each send what is made for them, all in one moment, again and again."""
+
+    async def stay(number: int) -> Line:
+        return await fight.join(f"burst-{number}", **fields)
+
+    lines = await fight.crowd(clients, stay, 0.4)
+    async for turn in fight.rounds(pause):
+        for number, line in enumerate(lines):
+            line.say(make(turn * clients + number))
+        fight.counts["bursts"] += 1
+        assert any(line.open for line in lines), "nobody is left"
 
 
 def _heavy_will(size: int) -> Will:

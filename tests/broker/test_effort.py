@@ -1,0 +1,101 @@
+"""What is done counts as effort, so that whoever causes much of it lets the others have a turn."""
+
+from __future__ import annotations
+
+import pytest
+
+from appliance.broker.broker import HELD_EFFORT, LOOKS_FOR_ONE, Broker
+from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.broker.shared import ASKED
+from appliance.mqtt.packets import Publish, Pubrel
+
+from .conftest import FakeAccess, Join, Peer, lasting
+
+
+def effort_of(broker: Broker, peer: Peer, *packets: Publish | Pubrel) -> int:
+    """What these packets add, their topic being known already."""
+    begun = broker.counters.effort
+    peer.send(*packets)
+    return broker.counters.effort - begun
+
+
+def test_messages_of_qos_2_that_are_never_released_take_turns(join: Join, broker: Broker):
+    """3.1.1, which knows no limit of these"""
+    peer = join("peer", version=4)
+    count = 2 * EFFORT_A_TURN
+    peer.send(*(Publish("a", b"", 2, packet_id=number + 1) for number in range(count)))
+    held = len(peer.session.received)
+    assert 0 < held <= EFFORT_A_TURN and peer.client.connection.paused
+    while peer.wire.laters:
+        peer.go_on()
+    assert len(peer.session.received) == count
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["plain", "shared"])
+def test_to_ask_many_readers_for_room_is_an_effort_with_qos_2(
+    join: Join, broker: Broker, shared: bool
+):
+    readers = 40 * LOOKS_FOR_ONE
+    for number in range(readers):
+        join(f"reader{number}").subscribe("$share/g/a" if shared else "a", 2)
+    peer = join("peer")
+    peer.publish("a", b"first", 2)  # which finds the route
+    message, release = Publish("a", b"", 2, packet_id=7), Pubrel(7)
+    assert effort_of(broker, peer, message) >= HELD_EFFORT + readers // LOOKS_FOR_ONE
+    assert effort_of(broker, peer, message) >= HELD_EFFORT, "sent again"
+    given = 1 if shared else readers
+    assert effort_of(broker, peer, release) >= HELD_EFFORT + readers // LOOKS_FOR_ONE + given
+
+
+def test_the_members_of_a_group_are_an_effort_where_they_are_visited(join: Join, broker: Broker):
+    count = 300
+    for number in range(count):
+        member = join(f"member{number}", **lasting(5))
+        member.subscribe("$share/g/t/#", 1)
+        member.lose()
+    peer = join("peer")
+    assert effort_of(broker, peer, Publish("t/1", b"", 0)) >= count, "each may be allowed the topic"
+    # Nobody is there, so as many are looked at as ever are for one message.
+    assert effort_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // LOOKS_FOR_ONE
+
+
+def test_what_a_member_leaves_is_offered_to_few_of_many(
+    join: Join, broker: Broker, access: FakeAccess, monkeypatch: pytest.MonkeyPatch
+):
+    """And only those that it would go to are asked whether they may receive it, topic by topic."""
+    leaving = join("leaving", **lasting(5))
+    leaving.subscribe("$share/g/t/#", 1)
+    publisher = join("publisher")
+    count = 20
+    for number in range(count):
+        assert publisher.publish(f"t/{number}", b"x", 1) == 0
+    for number in range(2 * ASKED):
+        member = join(f"member{number}", **lasting(5))
+        member.subscribe("$share/g/t/#", 1)
+        member.lose()
+    asked: list[str] = []
+    decide = access.decide
+    monkeypatch.setattr(access, "decide", lambda *a: (asked.append(a[2]), decide(*a))[1])
+    begun = broker.counters.effort
+    join("leaving")  # anew: its session ends
+    assert broker.counters.effort - begun >= count * ASKED // LOOKS_FOR_ONE
+    assert len(asked) == count
+    heard = [message for n in range(30) for message in join(f"member{n}", **lasting(5)).drain()]
+    assert len(heard) == count
+
+
+def test_to_leave_many_groups_takes_one_look_at_what_waits(
+    join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch
+):
+    peer = join("peer", **lasting(5))
+    for number in range(50):
+        peer.subscribe(f"$share/g/{number}", 1)
+    passes = []
+    hand_over = type(peer.session).hand_over
+    monkeypatch.setattr(
+        type(peer.session),
+        "hand_over",
+        lambda *a, **options: (passes.append(a), hand_over(*a, **options)),
+    )
+    peer.lose()
+    assert len(passes) == 1
