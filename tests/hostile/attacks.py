@@ -532,7 +532,7 @@ async def never_reading_small(fight: Fight) -> None:
     await _never_reading(fight, 200, 50)
 
 
-@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)")
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", said_after=3.0)
 async def never_reading_large(fight: Fight) -> None:
     """Subscribers with every QoS that never read, and a flood of large messages behind them."""
     await _never_reading(fight, 200, 200_000)
