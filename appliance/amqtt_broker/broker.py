@@ -462,7 +462,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         if ours is None or ours.identity is None:
             raise BrokerError(f"there is no session '{session.client_id}'")
         with self._unobserved():
-            code = self.broker.subscribe(ours, Subscription(topic_filter, qos))
+            code, _ = self.broker.subscribe(ours, Subscription(topic_filter, qos))
         return int(code) if code <= ReasonCode.GRANTED_QOS_2 else 0x80
 
     def create_offline_session(self, client_id: str) -> tuple[BrokerProtocolHandler, AmqttSession]:

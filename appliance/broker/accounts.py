@@ -110,6 +110,12 @@ class Quota:
             return False
         return held <= self.sure or (held <= self.most and total <= self.lent)
 
+    def shortage(self, total: int, size: int, what: str, key: str, user_key: str) -> str:
+        """Why `allows` says no to `size` more, in words: the keys say how much there is of it."""
+        if total + size > self.whole:
+            return f"there is no {what} left (broker.{key})"
+        return f"its user's share of the {what} is full (broker.limits.user.{user_key})"
+
     def must_yield(self, most: int, held: int) -> bool:
         """Whether who holds `most` of what can be taken back gives one to who holds so many."""
         return most > self.sure > held

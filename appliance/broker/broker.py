@@ -97,8 +97,13 @@ class Flushing(Protocol):
 Receiver: TypeAlias = "Session | Share"
 
 
-def _has_all(account: Account, held: int, what: str, key: str) -> ProtocolError:
-    text = f"{account} has {held} {what}, as many as there may be (broker.limits.{key})"
+def _has_all(account: Account, held: int, what: str) -> ProtocolError:
+    text = f"{account} has {held} {what}, as many as a user may have (broker.limits.user.{what})"
+    return ProtocolError(ReasonCode.QUOTA_EXCEEDED, text)
+
+
+def _all_taken(account: Account, held: int, what: str, limit: int) -> ProtocolError:
+    text = f"all {limit} {what} are in use (broker.limits.{what}); {account} has {held} of them"
     return ProtocolError(ReasonCode.QUOTA_EXCEEDED, text)
 
 
@@ -183,7 +188,7 @@ class Broker:
         self.counters.effort += CONNECT_EFFORT
         account = self.ledger.accounts.of(identity)
         if will is not None and not self.ledger.fits(account, will.message.size):
-            reason = "no room for its will (broker.limits.memory, broker.limits.user.memory)"
+            reason = f"no room for its will: {self.ledger.memory_shortage(will.message.size)}"
             raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason)
         session = self.sessions.get(identity.client_id)
         if session is not None:
@@ -246,13 +251,13 @@ class Broker:
         """
         accounts, own = self.ledger.accounts, self.limits.user.connections
         if own is not None and account.connections >= own:
-            raise _has_all(account, account.connections, "connections", "user.connections")
+            raise _has_all(account, account.connections, "connections")
         if accounts.connections < self.limits.connections:
             return None
         holder = accounts.largest(lambda each: each.connections)
         if self.ledger.quotas.connections.must_yield(holder.connections, account.connections):
             return next(reversed(holder.present))
-        raise _has_all(account, account.connections, "connections", "connections")
+        raise _all_taken(account, account.connections, "connections", self.limits.connections)
 
     def _session_to_end(self, account: Account) -> Session | None:
         """Which session makes room for one of the account; None when none has to.
@@ -275,12 +280,12 @@ class Broker:
         if holder.absent:
             return next(iter(holder.absent))
         if has_all_of_its_own:
-            raise _has_all(account, account.sessions, "sessions", "user.sessions")
+            raise _has_all(account, account.sessions, "sessions")
         # With fewer sessions than connections allowed all may be in use.
         holder = accounts.largest(lambda each: each.connections)
         if self.ledger.quotas.sessions.must_yield(holder.sessions, account.sessions):
             return next(reversed(holder.present))
-        raise _has_all(account, account.sessions, "sessions", "sessions")
+        raise _all_taken(account, account.sessions, "sessions", self.limits.sessions)
 
     def _take_back(self, session: Session, account: Account, what: str) -> None:
         """End the connection of a session, if it has one, as the account needs the place."""
@@ -388,17 +393,18 @@ class Broker:
             self._publish_will(session)
         self.store.session_saved(session)
 
-    def _tell_filled(self, session: Session) -> None:
+    def _tell_filled(self, session: Session, shortage: str) -> None:
         if session.ends_at is None:  # it is back, or has ended
             return
         away = timedelta(seconds=round(self.now - (session.ends_at - session.expiry)))
         policy = self.limits.queue_full
         what = "the oldest are dropped" if policy == "drop-oldest" else "more are dropped"
         log.warning(
-            "%s has been away for %s, and its queue is full: %d messages wait, %s "
-            "(broker.limits.queue_messages, queue_bytes, queue_full)",
+            "%s has been away for %s, and its queue is full: %s; %d messages wait, %s "
+            "(broker.limits.queue_full)",
             session,
             away,
+            shortage,
             len(session.queue),
             what,
         )
@@ -562,7 +568,7 @@ class Broker:
                 if self.ledger.refusing and session.persistent:
                     kept = False  # who publishes has to try again, whoever else has got it
                 else:
-                    self._tell_full(session)
+                    self._tell_full(session, message)
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
@@ -574,7 +580,7 @@ class Broker:
                 if self.ledger.refusing and any(m[1] and m[0].persistent for m in members):
                     kept = False
                 else:
-                    self._tell_full(asked)
+                    self._tell_full(asked, message)
                 full = True
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
@@ -606,6 +612,18 @@ class Broker:
             if objection is not None:
                 return objection
         return None
+
+    def shortage(self, route: Route, message: Message, origin: Session) -> str:
+        """Why a message was refused for want of room (0x97), in words for its publisher."""
+        if message.retain and message.payload:
+            shortage = self.retained.shortage(message, origin.account)
+            if shortage:
+                return f"no room to retain it: {shortage}"
+        asked = (session for session, qos, _, _ in route.targets if qos)
+        of_group = (member[0] for _, members in route.shares for member in members if member[1])
+        reader = next(asked, None) or next(of_group, None)
+        why = f": {reader.shortage(message.size)}" if reader is not None else ""
+        return f"nobody who subscribed to its topic has room for it{why}"
 
     def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
@@ -723,12 +741,13 @@ class Broker:
         key = session.client_id, message
         self.complaints.tell(self.now, key, f"%s {message}", session, *args)
 
-    def _tell_full(self, session: Session) -> None:
+    def _tell_full(self, session: Session, message: Message) -> None:
         if session.link is None:
             return  # that is told at the next tick, once: it is not slow, but away
         self.complain(
             session,
-            "takes its messages too slowly, its queue is full (%d messages, %d bytes)",
+            "takes its messages too slowly, its queue is full: %s (it has %d messages, %d bytes)",
+            session.shortage(message.size),
             len(session.queue),
             session.bytes,
         )
@@ -740,15 +759,15 @@ class Broker:
 
     # --- subscribing ---------------------------------------------------------------------------
 
-    def subscribe(self, session: Session, subscription: Subscription) -> ReasonCode:
-        """Subscribe; returns the granted QoS or the refusal, as it stands in SUBACK."""
+    def subscribe(self, session: Session, subscription: Subscription) -> tuple[ReasonCode, str]:
+        """Subscribe; returns the granted QoS or the refusal, as it stands in SUBACK, and why."""
         refusal = self._check_subscription(session, subscription)
         if refusal is not None:
             code, reason = refusal
             name = quote(subscription.filter)
             self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
             self.complain(session, "may not subscribe to %s: %s", name, reason)
-            return code
+            return code, reason
         if session.subscriptions.get(subscription.filter) != subscription:
             session.subscribe(subscription)
             self.router.join(session, subscription)
@@ -756,7 +775,7 @@ class Broker:
             self.store.subscribed(session, subscription)
         if self.observer is not None:
             self.observer.subscribed(session, subscription.filter, subscription.qos)
-        return ReasonCode(subscription.qos)
+        return ReasonCode(subscription.qos), ""
 
     def _check_subscription(
         self, session: Session, subscription: Subscription
@@ -774,12 +793,9 @@ class Broker:
             if len(session.subscriptions) >= maximum:
                 reason = f"it has {maximum} subscriptions (broker.limits.subscriptions)"
                 return ReasonCode.QUOTA_EXCEEDED, reason
-            if not session.fits(subscription_size(topic_filter)):
-                reason = (
-                    "no memory for it (broker.limits.queue_bytes, broker.limits.user.memory, "
-                    "broker.limits.memory)"
-                )
-                return ReasonCode.QUOTA_EXCEEDED, reason
+            size = subscription_size(topic_filter)
+            if not session.fits(size):
+                return ReasonCode.QUOTA_EXCEEDED, f"no room for it: {session.shortage(size)}"
         decision = self.router.decide(session.identity, Action.SUBSCRIBE, topic_filter)
         if not decision:
             return ReasonCode.NOT_AUTHORIZED, decision.reason
@@ -865,8 +881,8 @@ class Broker:
         faults.run("clock.complaints", self.complaints.tick, now, otherwise=None)
         faults.run("clock.retained", self.retained.expire, now, otherwise=None)
         filled, self.ledger.filled = self.ledger.filled, []
-        for session in filled:
-            faults.run("clock.full", self._tell_filled, session, otherwise=None)
+        for session, shortage in filled:
+            faults.run("clock.full", self._tell_filled, session, shortage, otherwise=None)
         left = ENDINGS_A_TURN
         for client in tuple(self.clients):
             try:

@@ -10,7 +10,7 @@ import math
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from appliance.broker.backpressure import (
     MESSAGE_PATIENCE,
@@ -100,9 +100,15 @@ def _size(arrived: Arrived) -> int:
     return (len(arrived.payload) if isinstance(arrived, Publish) else 0) + OVERHEAD
 
 
-def _reason(code: int, route: Route) -> str:
-    """Why a message was refused, in words."""
-    return route.reason if code == ReasonCode.NOT_AUTHORIZED else "no room to keep it"
+#: Refusals of a CONNECT that may be told in words: they say nothing of who is known here.
+_TOLD: Final = frozenset(
+    (
+        ReasonCode.BAD_AUTHENTICATION_METHOD,
+        ReasonCode.PAYLOAD_FORMAT_INVALID,
+        ReasonCode.QUOTA_EXCEEDED,
+        ReasonCode.TOPIC_NAME_INVALID,
+    )
+)
 
 
 class Client:
@@ -277,7 +283,8 @@ class Client:
         if qos:
             if self.broker.objection is not None and self._object(packet_id, message):
                 return
-            self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
+            reason = self._reason(code, route, message) if code >= 0x80 else ""
+            self.output.acknowledge(0x40, packet_id, code, reason)
 
     def _on_publish(self, packet: Publish) -> None:
         """A PUBLISH that the full decoder has read: with properties, most likely."""
@@ -318,7 +325,19 @@ class Client:
         else:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos and not self._object(packet_id, message):
-                self.output.acknowledge(0x40, packet_id, code, _reason(code, route))
+                reason = self._reason(code, route, message) if code >= 0x80 else ""
+                self.output.acknowledge(0x40, packet_id, code, reason)
+
+    def _reason(self, code: int, route: Route, message: Message) -> str:
+        """Why a message was refused, in words, if the client is told any."""
+        session = self.session
+        if session is None or self._version != 5 or not self.output.explains:
+            return ""
+        if code == ReasonCode.NOT_AUTHORIZED:
+            return route.reason
+        if self._ledger.refusing:
+            return CANNOT_KEEP
+        return self.broker.shortage(route, message, session)
 
     def _object(self, packet_id: int, message: Message) -> bool:
         """Acknowledge a message with what a part of the appliance has against it, if anything."""
@@ -524,7 +543,7 @@ class Client:
     ) -> None:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         self._counters.effort += HELD_EFFORT
-        code = ReasonCode.SUCCESS
+        code, reason = ReasonCode.SUCCESS, ""
         held = session.received.get(packet_id)
         if (
             self._ledger.refusing
@@ -565,10 +584,12 @@ class Client:
                 self._counters.publish_dropped += 1
             elif not session.hold(packet_id, Held(message, full, self.wire.now())):
                 code = ReasonCode.QUOTA_EXCEEDED
+                shortage = session.shortage(message.size)
+                reason = f"no room for its unfinished QoS 2 messages: {shortage}"
                 if self._version != 5:
-                    raise ProtocolError(code, "no room for its unfinished QoS 2 messages")
+                    raise ProtocolError(code, reason)
         if code:
-            self._refuse_qos2(packet_id, code, _reason(code, route))
+            self._refuse_qos2(packet_id, code, reason or self._reason(code, route, message))
         else:
             self.output.acknowledge(0x50, packet_id, code)
 
@@ -647,7 +668,8 @@ class Client:
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
         elif isinstance(packet, Subscribe) and session is not None:
-            self._begin(subscribe(self.broker, session, packet, self._wake))
+            explains = self.output.explains
+            self._begin(subscribe(self.broker, session, packet, self._wake, explains=explains))
         elif isinstance(packet, Unsubscribe) and session is not None:
             self._begin(unsubscribe(self.broker, session, packet))
         elif isinstance(packet, Disconnect):
@@ -817,7 +839,9 @@ class Client:
             address, secured = self.wire.address, self.wire.secured()
             self.broker.journal.refused(address, reason, code, name, user, secured)
         self._counters.connects_refused += 1
-        self._send(Connack(False, code))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
+        tells = code in _TOLD and self.broker.features.reason_strings
+        words = in_words(reason) if tells else None
+        self._send(Connack(False, code, words))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
 
     def accept(self, username: str | None, authentication: Properties | None = None) -> None:

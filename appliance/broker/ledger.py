@@ -76,8 +76,8 @@ class Ledger:
     congested: dict[Session, None] = field(default_factory=dict)
     #: Sessions whose connections are to be closed at the next flush, as their queues overflowed.
     overflowed: list[Session] = field(default_factory=list)
-    #: Sessions of absent clients whose queues are full, which is to be told.
-    filled: list[Session] = field(default_factory=list)
+    #: Sessions of absent clients whose queues are full, which is to be told; and by what.
+    filled: list[tuple[Session, str]] = field(default_factory=list)
     #: The limits that every message is measured against, out of `limits` for speed.
     queue_bytes: int = field(init=False)
     half_queue: int = field(init=False)
@@ -125,12 +125,22 @@ class Ledger:
         own = self.quotas.memory.own + self.reserve * account.connections
         return account.bytes + size <= own and self.queued_bytes + size <= self.limits.memory
 
+    def memory_shortage(self, size: int) -> str:
+        """Why `fits` says no, in words, without saying of whom."""
+        quota = self.quotas.memory
+        return quota.shortage(self.queued_bytes, size, "memory", "limits.memory", "memory")
+
     def may_store(self, account: Account, size: int) -> bool:
         """Whether a message of so many bytes more may be kept in the store for the account."""
         store = self.store
         if account.is_inside:
             return store.bytes + size <= store.size
         return self.quotas.stored.allows(account.stored, store.bytes, size)
+
+    def store_shortage(self, size: int) -> str:
+        """Why `may_store` says no, in words, without saying of whom."""
+        total = self.store.bytes
+        return self.quotas.stored.shortage(total, size, "room in the store", "store.size", "stored")
 
     def take(self, account: Account, size: int) -> None:
         """The account holds so many bytes of memory more, or less."""

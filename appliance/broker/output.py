@@ -10,7 +10,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Contact, Objection, Wire
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
 from appliance.mqtt.codec import Properties, Property
-from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubrec, Suback
+from appliance.mqtt.packets import Connack, Disconnect, Packet, Puback, Pubrec, Suback
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 #: Bytes that a client is sent before the next flush. What waits in its session waits on, until the
@@ -302,8 +302,13 @@ class Output:
         data = packet.encode(self.version or 4)
         limit = self.maximum_packet_size
         if limit and len(data) > limit:  # [MQTT-3.1.2-24]
-            if isinstance(packet, Puback | Pubrec | Suback | Disconnect) and packet.properties:
-                packet.properties = None  # [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.14.2-3]
+            if (
+                isinstance(packet, Connack | Puback | Pubrec | Suback | Disconnect)
+                and packet.properties
+                and Property.REASON_STRING in packet.properties  # nothing else is with it
+            ):
+                # [MQTT-3.2.2-19], [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.9.2-1], [MQTT-3.14.2-3]
+                packet.properties = None
                 return self.send(packet)
             return False
         if not self._out:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable, Iterator
+from typing import Final
 
 from appliance.broker.accounts import Account
 from appliance.broker.complaints import Complaints
@@ -29,6 +30,10 @@ def retained_size(message: Message) -> int:
     size = message.size + OWNER_SIZE + (EXPIRY_SIZE if message.expires_at is not None else 0)
     levels = topic.count("/")
     return size + (text_size(topic) + LEVEL_SIZE * levels if levels else 0)
+
+
+#: What the appliance itself is told that retains more than all users together may.
+_IN_ALL: Final = "there is no room left (broker.limits.{})"
 
 
 class Retained:
@@ -91,13 +96,18 @@ class Retained:
             self._messages.delete(message.topic)
         else:
             message.settle()
-            if not self._has_room(message, old, owner):
+            shortage = self._shortage(message, old, owner)
+            if shortage:
                 self._ledger.counters.publish_dropped += 1
-                self._tell_full(message, owner)
+                self._tell_full(message, owner, shortage)
                 return False
             self._put(message, owner)
         self._changed(message, owner)
         return True
+
+    def shortage(self, message: Message, owner: Account) -> str:
+        """Why the message cannot be retained, in words, and which key says so; empty: it can."""
+        return self._shortage(message, self._messages.get(message.topic), owner)
 
     def delete(self, topic: str) -> None:
         """Retain nothing for the topic any more."""
@@ -122,41 +132,40 @@ class Retained:
         if number is not None:
             del self._topics[number]
 
-    def _has_room(self, message: Message, old: Message | None, owner: Account) -> bool:
-        """Whether it may take the old one's place, which makes room for it whosever it is."""
+    def _shortage(self, message: Message, old: Message | None, owner: Account) -> str:
+        """Why it may not take the old one's place, which makes room for it whosever it is."""
         ledger = self._ledger
-        accounts, limits = ledger.accounts, ledger.limits
+        accounts, limits, quotas = ledger.accounts, ledger.limits, ledger.quotas
         size = retained_size(message)
         before = self._owners[message.topic] if old is not None else None
         freed = retained_size(old) if old is not None else 0
         own = freed if before is owner else 0
         if owner.is_inside:  # what users have leaves it as much as all of them have
-            return (
-                owner.retained < limits.retained_messages + (before is owner)
-                and owner.retained_bytes - own + size <= limits.retained_bytes
-            )
+            if owner.retained >= limits.retained_messages + (before is owner):
+                return _IN_ALL.format("retained_messages")
+            is_much = owner.retained_bytes - own + size > limits.retained_bytes
+            return _IN_ALL.format("retained_bytes") if is_much else ""
         if before is owner and size <= freed:
-            return True
+            return ""
         of_users = 0 if before is None or before.is_inside else 1
-        quotas = ledger.quotas
-        return (
-            quotas.retained.allows(
-                owner.retained - (before is owner), accounts.retained - of_users, 1
-            )
-            and quotas.retained_bytes.allows(
-                owner.retained_bytes - own, accounts.retained_bytes - freed * of_users, size
-            )
-            and ledger.may_store(owner, max(0, message.size - (old.size if old else 0)))
-        )
+        count, total = accounts.retained - of_users, accounts.retained_bytes - freed * of_users
+        growth = max(0, message.size - (old.size if old else 0))
+        if not quotas.retained.allows(owner.retained - (before is owner), count, 1):
+            what, key = "room for retained messages", "retained_messages"
+            return quotas.retained.shortage(count, 1, what, f"limits.{key}", key)
+        if not quotas.retained_bytes.allows(owner.retained_bytes - own, total, size):
+            what, key = "room for retained bytes", "retained_bytes"
+            return quotas.retained_bytes.shortage(total, size, what, f"limits.{key}", key)
+        return "" if ledger.may_store(owner, growth) else ledger.store_shortage(growth)
 
-    def _tell_full(self, message: Message, owner: Account) -> None:
+    def _tell_full(self, message: Message, owner: Account, shortage: str) -> None:
         self._complaints.tell(
             self._ledger.now,
             ("retained", owner.username),
-            "no room to retain %s: %s has %d retained messages with %d bytes, of %d with %d in all "
-            "(broker.limits.user.retained_messages and .retained_bytes, "
-            "broker.limits.retained_messages and .retained_bytes, broker.store.size)",
+            "no room to retain %s: %s; %s has %d retained messages with %d bytes, of %d with %d in "
+            "all",
             quote(message.topic),
+            shortage,
             owner,
             owner.retained,
             owner.retained_bytes,

@@ -267,7 +267,7 @@ class Session:
             return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
         if ledger.limits.queue_full == "disconnect" and link is not None:
             ledger.overflowed.append(self)
-        self._is_full()
+        self._is_full(size)
         self._drop(message)
         return False
 
@@ -299,6 +299,8 @@ class Session:
         message = delivery[0]
         if self.expiry:
             if not promised and not self._may_store(message):
+                if not self.ledger.refusing:
+                    self._is_full(message.size)
                 self.ledger.counters.publish_dropped += 1
                 return False
             self._staged()
@@ -324,7 +326,7 @@ class Session:
         while self.queue and not (
             len(self.queue) < ledger.limits.queue_messages and self.fits(message.size)
         ):
-            self._is_full()
+            self._is_full(message.size)
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
@@ -578,11 +580,11 @@ class Session:
             self._uncount(waiting[0])
             self._drop(waiting[0])
 
-    def _is_full(self) -> None:
+    def _is_full(self, size: int) -> None:
         """Have it told, once an absence: nobody else knows what its client is missing."""
         if self.link is None and not self.is_told_full:
             self.is_told_full = True
-            self.ledger.filled.append(self)
+            self.ledger.filled.append((self, self.shortage(size)))
 
     def _drop(self, message: Message) -> None:
         """Count a message that the client was too slow for."""
@@ -742,6 +744,23 @@ class Session:
                 and ledger.is_reserved(self.account, size)
             )
         )
+
+    def shortage(self, size: int) -> str:
+        """Why so many bytes more have no room with it, in words, and which key says so.
+
+        It names neither the client nor its user: a publisher may be told, too.
+        """
+        ledger = self.ledger
+        limits = ledger.limits
+        if len(self.queue) >= limits.queue_messages:
+            return f"{len(self.queue)} messages wait already (broker.limits.queue_messages)"
+        if self.bytes + size > ledger.queue_bytes:
+            return f"{self.bytes} bytes wait already (broker.limits.queue_bytes)"
+        if not self.fits(size):
+            return ledger.memory_shortage(size)
+        if self.expiry and not ledger.may_store(self.account, size):
+            return ledger.store_shortage(size)
+        return "others wait for the room there is"
 
     # --- backpressure --------------------------------------------------------------------------
 

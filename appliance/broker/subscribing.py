@@ -11,9 +11,10 @@ from typing import Final, TypeAlias
 
 from appliance.broker.broker import Broker
 from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.broker.output import in_words
 from appliance.broker.ports import Action, Question
 from appliance.broker.session import Session
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_filter, parse_shared
@@ -60,11 +61,17 @@ def answers(
 
 
 def subscribe(
-    broker: Broker, session: Session, packet: Subscribe, wake: Callable[[], None]
+    broker: Broker,
+    session: Session,
+    packet: Subscribe,
+    wake: Callable[[], None],
+    *,
+    explains: bool = False,
 ) -> Iterator[Step]:
     """Do what the packet asks for; gives its SUBACK, and None where others are to have their turn.
 
-    Who decides may first have to ask: `wake` is called when it is to be gone on with.
+    Who decides may first have to ask: `wake` is called when it is to be gone on with. With
+    `explains` the first refusal is told in words.
 
     Raises:
         ProtocolError: a filter is none, or they are too many; none of them has any effect then.
@@ -82,18 +89,21 @@ def subscribe(
     identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
     identifier = identifiers[0] if isinstance(identifiers, list) else 0
     codes: list[int] = []
+    words: Properties | None = None
     granted: list[tuple[Subscription, bool]] = []
     for subscription in subscriptions:
         if isinstance(identifier, int):
             subscription.identifier = identifier
         is_new = subscription.filter not in session.subscriptions
-        code = broker.subscribe(session, subscription)
+        code, reason = broker.subscribe(session, subscription)
         codes.append(code)
         if code <= ReasonCode.GRANTED_QOS_2:
             granted.append((subscription, is_new))
+        elif explains and words is None:  # one string for all of them: the first is told
+            words = in_words(f"{quote(subscription.filter)}: {reason}")
         if turn.is_over(SUBSCRIBE_EFFORT + subscription.filter.count("/")):
             yield None
-    yield Suback(packet.packet_id, codes)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
+    yield Suback(packet.packet_id, codes, words)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
     for subscription, is_new in granted:
         effort = RETAINED_EFFORT
         if subscription.filter in session.replays:  # the packet has it twice: so it is sent twice

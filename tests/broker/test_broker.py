@@ -237,7 +237,7 @@ def test_a_session_inside_the_appliance_publishes_and_receives(
     inside = broker.attach("_bridge", link)
     with pytest.raises(ValueError, match="_bridge"):
         broker.attach("_bridge", link)
-    assert broker.subscribe(inside, Subscription("a/#", 1, no_local=True)) == 1
+    assert broker.subscribe(inside, Subscription("a/#", 1, no_local=True)) == (1, "")
     peer = join()
     peer.subscribe("a/#")
     assert broker.publish(Message("a/b", b"out"), inside) == ReasonCode.SUCCESS

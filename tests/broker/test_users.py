@@ -12,7 +12,18 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Identity, Limits, UserLimits
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Publish, Subscribe, Subscription, Will
+from appliance.mqtt.connect import Connack
+from appliance.mqtt.packets import (
+    Packet,
+    Puback,
+    Publish,
+    Pubrec,
+    Pubrel,
+    Suback,
+    Subscribe,
+    Subscription,
+    Will,
+)
 from appliance.mqtt.reason import ReasonCode
 
 from .conftest import FakeAccess, FakeStore, Join, Peer, lasting
@@ -476,6 +487,179 @@ def test_the_store_is_shared(broker: Broker, store: FakeStore, join: Join):
     assert join("eve", user="eve").publish("f", bytes(1000), 1, retain=True) == FULL
     for user in ("mallory", "alice"):
         broker.ledger.accounts.of_user(user).stored = 0
+
+
+# --- what is told: whose share is full, and which key says how much it is
+
+
+def words(packet: Packet) -> str:
+    properties = getattr(packet, "properties", None) or {}
+    return str(properties.get(Property.REASON_STRING, ""))
+
+
+def answer(peer: Peer, packet: Packet) -> Packet:
+    """What a packet is answered with; what else comes is passed over."""
+    peer.send(packet)
+    return next(p for p in peer.received() if isinstance(p, Puback | Pubrec | Suback))
+
+
+def refused_words(broker: Broker, user: str, limits: Limits, **options: object) -> str:
+    broker.use(limits, Features(reason_strings=True))
+    caller = Caller(broker)
+    connack = caller.connect("refused", user=user, **options)
+    assert connack.reason_code == FULL
+    return words(connack)
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        (
+            Limits(connections=2),
+            "all 2 connections are in use (broker.limits.connections); user 'a' has 2 of them",
+        ),
+        (
+            Limits(sessions=2),
+            "all 2 sessions are in use (broker.limits.sessions); user 'a' has 2 of them",
+        ),
+        (
+            Limits(user=UserLimits(connections=2)),
+            "user 'a' has 2 connections, as many as a user may have "
+            "(broker.limits.user.connections)",
+        ),
+        (
+            own_limit(2),
+            "user 'a' has 2 sessions, as many as a user may have (broker.limits.user.sessions)",
+        ),
+    ],
+)
+def test_a_refused_connect_says_which_share_is_full(
+    broker: Broker, join: Join, limits: Limits, expected: str, caplog: pytest.LogCaptureFixture
+):
+    join("one", user="a")
+    join("two", user="a")
+    assert refused_words(broker, "a", limits) == expected
+    assert expected in caplog.text
+
+
+def test_a_refused_will_says_which_share_is_full(broker: Broker):
+    will = Will("will", bytes(20_000), 1)
+    limits = Limits(user=UserLimits(memory=10_000))
+    said = refused_words(broker, "a", limits, will=will)
+    assert said == (
+        "no room for its will: its user's share of the memory is full (broker.limits.user.memory)"
+    )
+
+
+def test_no_words_unless_they_are_configured_nor_where_they_do_not_fit(broker: Broker, join: Join):
+    join("one", user="a")
+    limits = Limits(connections=1)
+    small = {Property.MAXIMUM_PACKET_SIZE: 20}
+    assert refused_words(broker, "a", limits, properties=small) == ""
+    broker.use(limits, Features())
+    assert words(Caller(broker).connect("refused", user="a")) == ""
+
+
+def test_who_may_not_come_in_is_not_told_why(broker: Broker):
+    """Nor who is known here: that is for the log alone."""
+    broker.use(Limits(), Features(reason_strings=True))
+    peer = Peer(broker)
+    peer.say_connect("c")
+    peer.client.refuse(ReasonCode.NOT_AUTHORIZED, "a wrong password for user 'root'")
+    broker.flush()
+    assert words(peer.only(Connack)) == ""
+    assert try_to_connect(broker, "of-alice", "alice").code == 0
+    connack = Peer(broker).connect("of-alice", user="mallory")
+    assert connack.reason_code == ReasonCode.CLIENT_IDENTIFIER_NOT_VALID
+    assert words(connack) == ""
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize(
+    ("limits", "key"),
+    [
+        (Limits(queue_messages=1), "broker.limits.queue_messages"),
+        (Limits(queue_bytes=3000), "broker.limits.queue_bytes"),
+        (Limits(user=UserLimits(memory=3000)), "broker.limits.user.memory"),
+        (Limits(user=UserLimits(stored=1500)), "broker.limits.user.stored"),
+        (Limits(memory=3400, user=UserLimits(memory=10**9)), "broker.limits.memory"),
+    ],
+)
+def test_a_refused_message_says_whose_queue_has_no_room(
+    broker: Broker,
+    store: FakeStore,
+    join: Join,
+    qos: int,
+    limits: Limits,
+    key: str,
+    caplog: pytest.LogCaptureFixture,
+):
+    broker.features = Features(reason_strings=True)
+    absent = join("absent", user="bob", **lasting(5))
+    absent.subscribe("t", 2)
+    absent.lose()
+    publisher = join("publisher", user="alice")
+    store.size = 1_000_000
+    broker.use(limits, broker.features)
+    bob = broker.ledger.accounts.of_user("bob")
+    for number in range(1, 6):
+        got = answer(publisher, Publish("t", bytes(1000), qos, packet_id=number))
+        if got.reason_code:
+            break
+        if qos == 2:
+            publisher.send(Pubrel(number))
+        bob.stored += 1000  # as the real store would have counted
+    assert got.reason_code == FULL
+    assert words(got).startswith("nobody who subscribed to its topic has room for it: ")
+    assert f"({key})" in words(got)
+    assert "bob" not in words(got), "it is not the publisher's matter who subscribed"
+    if qos == 1:
+        broker.tick(broker.now + 1)
+        assert "client 'absent' (user 'bob') has been away" in caplog.text
+        assert f"({key})" in caplog.text
+    bob.stored = 0
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+def test_a_message_that_cannot_be_retained_says_whose_share_is_full(
+    broker: Broker, join: Join, qos: int, caplog: pytest.LogCaptureFixture
+):
+    broker.use(Limits(retained_messages=4), Features(reason_strings=True))
+    peer = join("m", user="mallory")
+    for number in range(3):
+        got = answer(peer, Publish(f"m/{number}", b"x", 1, True, packet_id=1))
+    assert got.reason_code == FULL
+    reason = (
+        "its user's share of the room for retained messages is full "
+        "(broker.limits.user.retained_messages)"
+    )
+    assert words(got) == f"no room to retain it: {reason}"
+    assert f"no room to retain 'm/2': {reason}; user 'mallory' has 2 " in caplog.text
+    for user in ("eve", "trudy"):
+        assert join(user, user=user).publish(f"{user}/0", b"x", 1, retain=True) != FULL
+    got = answer(peer, Publish("m/9", b"x", 1, True, packet_id=1))
+    assert "there is no room for retained messages left (broker.limits.retained_messages)" in (
+        words(got)
+    )
+
+
+def test_a_refused_subscription_says_which_share_is_full(broker: Broker, join: Join, access):
+    broker.use(Limits(subscriptions=1), Features(reason_strings=True))
+    access.deny("user", Action.SUBSCRIBE, "no/#")
+    peer = join("m")
+    filters = [Subscription("a"), Subscription("b"), Subscription("no/x")]
+    got = answer(peer, Subscribe(1, filters))
+    assert isinstance(got, Suback) and got.reason_codes[:2] == [0, FULL]
+    assert words(got) == "'b': it has 1 subscriptions (broker.limits.subscriptions)"
+    broker.use(Limits(user=UserLimits(memory=10)), broker.features)
+    deep = "/".join("x" * 200)
+    got = answer(peer, Subscribe(1, [Subscription(deep)]))
+    assert words(got).endswith(
+        ": no room for it: its user's share of the memory is full (broker.limits.user.memory)"
+    )
+    broker.use(broker.limits, Features())
+    silent = join("silent")
+    assert words(answer(silent, Subscribe(1, [Subscription("no/x")]))) == ""
 
 
 # --- reload

@@ -62,9 +62,9 @@ def test_there_is_one_connack(broker: Broker) -> None:
 def test_behind_a_refusal_there_is_nothing(broker: Broker) -> None:
     client = Client(broker)
     client.say(connect("c"))
-    client.client.refuse(ReasonCode.NOT_AUTHORIZED, "for a reason")
+    client.client.refuse(ReasonCode.QUOTA_EXCEEDED, "for a reason")
     broker.flush()
-    assert client.hear() == connack(0x87) and client.closed
+    assert client.hear() == connack(0x97) and client.closed
     client.let_in()
     assert client.say(connect("c"), "c0 00") == b""
     assert broker.sessions == {}

@@ -1170,7 +1170,7 @@ async def hoarder(fight: Fight) -> None:
 
 
 @attack(
-    r"client '.*(as many as there may be|limits\.(sessions|memory))",
+    r"client '.*(as many as a user may have|limits\.(sessions|memory))",
     said_after=3.0,
     sessions=300,
 )
