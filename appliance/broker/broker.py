@@ -50,8 +50,10 @@ LATE = 0.1
 #: Readers that are asked whether they are full for the effort to give a message to one of them.
 LOOKS_FOR_ONE = 4
 
-#: Connections, wills and sessions that one tick ends: some ten milliseconds of work.
+#: Connections, wills and sessions that one tick ends, and the effort after which it ends no more:
+#: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
+EFFORT_A_TICK = 2600
 
 
 #: The effort to refuse a message, to keep one of QoS 2 until its PUBREL and to take it out again,
@@ -59,6 +61,12 @@ ENDINGS_A_TURN = 128
 REFUSAL_EFFORT = 2
 HELD_EFFORT = 3
 CONNECT_EFFORT = 50
+
+#: The effort to end a connection or a session, and to take one of its subscriptions from the tree,
+#: of so many levels for one effort.
+ENDING_EFFORT = 10
+LEAVING_EFFORT = 3
+LEVELS_AN_EFFORT = 4
 
 
 class Ticking(Protocol):
@@ -368,6 +376,7 @@ class Broker:
         """The connection behind `link` ended; nothing happens when another has taken over."""
         if session.link is not link:
             return
+        self.counters.effort += ENDING_EFFORT
         session.link = None
         session.is_told_full = False
         session.ended_well = not publish_will
@@ -420,8 +429,11 @@ class Broker:
         self.ledger.accounts.ended(session)
         self._publish_will(session)
         session.ends_at = None
+        effort = ENDING_EFFORT
         for topic_filter in session.subscriptions:
             self.router.leave(session, topic_filter)
+            effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
+        self.counters.effort += effort
         session.hand_over(None, self._giver(absent_too=True), sent=True)
         session.clear()
         self.store.session_removed(session)
@@ -873,13 +885,14 @@ class Broker:
 
         Returns when a will or a session falls due next, infinity for never, and `now` when more is
         due than one turn is for: thousands of clients that fall silent together do not stop the
-        others. Between two ticks `ledger.now` may be moved on, so that what begins then is not cut
-        short.
+        others, nor a hundred wills that are long to deliver. Between two ticks `ledger.now` may be
+        moved on, so that what begins then is not cut short.
         """
         faults = self.faults
         self.ledger.now = faults.now = now
         faults.run("clock.complaints", self.complaints.tick, now, otherwise=None)
-        faults.run("clock.retained", self.retained.expire, now, otherwise=None)
+        end = self.counters.effort + EFFORT_A_TICK
+        expires_more = faults.run("clock.retained", self.retained.expire, now, otherwise=False)
         filled, self.ledger.filled = self.ledger.filled, []
         for session, shortage in filled:
             faults.run("clock.full", self._tell_filled, session, shortage, otherwise=None)
@@ -890,11 +903,13 @@ class Broker:
             except Exception as error:
                 self.fault("clock.keep_alive", error, client)
                 left -= 1
-            if not left:
+            if left <= 0 or self.counters.effort > end:
                 self.flush()
                 self.ticked_at = now
                 return now
-        while left and self._deadlines and self._deadlines[0][0] <= now:
+        while self._deadlines and self._deadlines[0][0] <= now:
+            if left <= 0 or self.counters.effort > end:
+                break
             left -= 1
             _, _, session = heapq.heappop(self._deadlines)
             # Entries are never removed early: one that no longer holds is passed over here.
@@ -906,6 +921,8 @@ class Broker:
                 faults.caught("clock.session", error, session)
         self.flush()
         self.ticked_at = now
+        if expires_more:
+            return now
         return self._deadlines[0][0] if self._deadlines else math.inf
 
     def _fall_due(self, session: Session, now: float) -> None:

@@ -9,14 +9,15 @@ from typing import Final
 
 from appliance.broker.accounts import Account
 from appliance.broker.complaints import Complaints
-from appliance.broker.ledger import Ledger
+from appliance.broker.ledger import EFFORT_A_TURN, Ledger
 from appliance.broker.message import Message
 from appliance.broker.session import LEVEL_SIZE
 from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
 
-#: Retained messages that one tick lets expire.
-EXPIRED_A_TURN = 1024
+#: The effort to retain a message, or no longer; and levels of its topic for one effort on top.
+RETAIN_EFFORT = 3
+LEVELS_AN_EFFORT = 2
 
 
 #: What is kept of a retained message beside it, in bytes: whose it is, and when it expires.
@@ -88,6 +89,7 @@ class Retained:
         """Retain the message, or with an empty one none any more; False when there is no room."""
         if self._ledger.refusing and message.qos:
             return False
+        self._ledger.counters.effort += RETAIN_EFFORT + message.topic.count("/") // LEVELS_AN_EFFORT
         old = self._messages.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
             if old is None:
@@ -185,12 +187,16 @@ class Retained:
             self._expiring = [entry for entry in self._expiring if entry[1] in self._topics]
             heapq.heapify(self._expiring)
 
-    def expire(self, now: float) -> None:
-        """Delete those whose time is over, as many as one turn is for."""
-        left = EXPIRED_A_TURN
-        while left and self._expiring and self._expiring[0][0] <= now:
-            left -= 1
+    def expire(self, now: float) -> bool:
+        """Delete those whose time is over, as many as one turn is for; True when there are more."""
+        counters = self._ledger.counters
+        end = counters.effort + EFFORT_A_TURN
+        while self._expiring and self._expiring[0][0] <= now:
+            if counters.effort > end:
+                return True
+            counters.effort += 1
             _, number = heapq.heappop(self._expiring)
             topic = self._topics.get(number)
             if topic is not None:
                 self._ledger.faults.run("clock.expiry", self.delete, topic, otherwise=None)
+        return False

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import pytest
 
-from appliance.broker.broker import HELD_EFFORT, LOOKS_FOR_ONE, Broker
+from appliance.broker.broker import (
+    EFFORT_A_TICK,
+    HELD_EFFORT,
+    LEVELS_AN_EFFORT,
+    LOOKS_FOR_ONE,
+    Broker,
+)
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.shared import ASKED
-from appliance.mqtt.packets import Publish, Pubrel
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
 
 from .conftest import FakeAccess, Join, Peer, lasting
 
@@ -99,3 +108,64 @@ def test_to_leave_many_groups_takes_one_look_at_what_waits(
     )
     peer.lose()
     assert len(passes) == 1
+
+
+def costly_topic(broker: Broker, listener: Peer, topic: str) -> None:
+    """Let a search for who hears the topic pass a thousand filters."""
+    levels = topic.split("/")
+    for wild in product((False, True), repeat=9):
+        name = "/".join(
+            "+" if is_wild else level for is_wild, level in zip(wild, levels, strict=True)
+        )
+        broker.router.join(listener.session, Subscription(f"{name}/end", 0))
+
+
+@pytest.mark.parametrize("end", ["delay", "keep alive", "session"])
+def test_wills_that_are_due_at_once_come_in_several_ticks(join: Join, broker: Broker, end: str):
+    watcher = join("watcher", keep_alive=0)
+    watcher.subscribe("#")
+    topic = "/".join("abcdefghi")
+    costly_topic(broker, watcher, topic)
+    count = 30
+    properties = {Property.WILL_DELAY_INTERVAL: 0 if end == "keep alive" else 10}
+    expiry = {"delay": 60, "keep alive": 0, "session": 10}[end]
+    for number in range(count):
+        will = Will(f"{topic}/{number}", b"gone", properties=properties)
+        peer = join(f"p{number}", will=will, keep_alive=10, **lasting(5, expiry))
+        if end != "keep alive":
+            peer.lose()
+    watcher.received()
+    now = broker.now + 16
+    heard: list[int] = []
+    while not heard or sum(heard) < count:
+        begun = broker.counters.effort
+        due = broker.tick(now)
+        assert broker.counters.effort - begun < EFFORT_A_TICK + 500
+        heard.append(len(watcher.payloads()))
+        assert heard[-1] and (due <= now) == (sum(heard) < count)
+    assert len(heard) > 2
+
+
+def test_retained_messages_that_expire_at_once_go_in_several_ticks(join: Join, broker: Broker):
+    peer = join("peer")
+    count = 100
+    expiry = {Property.MESSAGE_EXPIRY_INTERVAL: 10}
+    for number in range(count):
+        topic = f"{number}/" + "/".join("x" * 150)
+        peer.publish(topic, b"x", retain=True, properties=expiry)
+    left: list[int] = []
+    while not left or left[-1]:
+        due = broker.tick(1011.0)
+        left.append(len(broker.retained))
+        assert (due <= 1011.0) == bool(left[-1])
+    assert 3 < len(left) < 20
+
+
+def test_a_session_with_many_deep_filters_is_an_effort_at_its_end(join: Join, broker: Broker):
+    peer = join("peer")
+    deep = "/".join("x" * 100)
+    for number in range(20):
+        peer.subscribe(f"{number}/{deep}")
+    begun = broker.counters.effort
+    peer.lose()
+    assert broker.counters.effort - begun > 20 * 100 // LEVELS_AN_EFFORT

@@ -1088,6 +1088,32 @@ async def wills(fight: Fight) -> None:
         await asyncio.sleep(0.2)
 
 
+@attack(rf"{CLIENT}", at_least=3.0, **BOUNDED)
+async def costly_wills(fight: Fight) -> None:
+    """Hundreds of wills that are due in one moment, each to a topic whose search is long."""
+    levels = 11
+    topic = AREA + "/a" * levels
+    for number in range(2):
+        line = await fight.join(f"filters-{number}")
+        await line.send(encode5(Subscribe(1, _near_misses(levels, number * 1000, 1000))))
+
+    async def leave(number: int) -> Line:
+        delay = {Property.WILL_DELAY_INTERVAL: 1}
+        return await fight.join(
+            f"will-{number}",
+            will=Will(f"{topic}/{number}", b"gone", properties=delay),
+            properties={Property.SESSION_EXPIRY_INTERVAL: 60},
+        )
+
+    while fight.on:
+        lines = await fight.crowd(300, leave, 1.0)
+        for line in lines:
+            line.hang_up()
+            fight.lines.discard(line)
+        fight.counts["wills"] += len(lines)
+        await asyncio.sleep(1.2)
+
+
 @attack(
     r"makes room for user 'alice'",
     at_least=6.0,
@@ -1300,6 +1326,16 @@ async def one_address_in_haste(fight: Fight) -> None:
 
 
 # --- parts
+
+
+def _near_misses(levels: int, start: int, count: int) -> list[Subscription]:
+    """Filters that a search for a topic of so many levels `a` passes, and that none matches."""
+    return [
+        Subscription(
+            AREA + "".join("/+" if bits >> level & 1 else "/a" for level in range(levels)) + "/none"
+        )
+        for bits in range(start, min(start + count, 1 << levels))
+    ]
 
 
 async def _at_once(
