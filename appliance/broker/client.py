@@ -42,6 +42,7 @@ from appliance.mqtt.codec import (
     Property,
     encode_string,
     quote,
+    text_size,
 )
 from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, Event, RawPublish
 from appliance.mqtt.packets import (
@@ -73,11 +74,6 @@ SMALL_PACKET = 1024
 #: And of the end of a connection that broke the protocol.
 FAILURE_EFFORT = 50
 
-#: What is kept behind a message that waits, in packets and in bytes: more than most clients have on
-#: their way, so that what they acknowledge among it is not kept waiting, too.
-BEHIND = 64
-BEHIND_BYTES = 64 * 1024
-
 #: Seconds that a publisher waits at once for what others may receive, and the part of its time that
 #: it does in the long run: less than makes a command old, so that nobody who subscribes stops it.
 RIGHTS_PATIENCE = LATE / 2
@@ -96,8 +92,10 @@ HOST_BURST = 100
 def _size(arrived: Arrived) -> int:
     """Bytes that are counted for what waits behind a message."""
     if isinstance(arrived, tuple):
-        return len(arrived[3]) + OVERHEAD
-    return (len(arrived.payload) if isinstance(arrived, Publish) else 0) + OVERHEAD
+        return len(arrived[1]) + len(arrived[3]) + len(arrived[4]) + OVERHEAD
+    if isinstance(arrived, Publish):
+        return text_size(arrived.topic) + len(arrived.payload) + len(arrived.passed_on) + OVERHEAD
+    return OVERHEAD
 
 
 #: Refusals of a CONNECT that may be told in words: they say nothing of who is known here.
@@ -178,7 +176,9 @@ class Client:
         connection = self.connection
         effort = counters.effort + EFFORT_A_TURN
         try:
-            for event in self._passing(data) if self._behind else connection.receive_data(data):
+            for event in (
+                self._passing(data, effort) if self._behind else connection.receive_data(data)
+            ):
                 self._heard_at = now  # complete packets count, dripping bytes do not
                 if type(event) is tuple:
                     self._on_raw_publish(event)
@@ -443,7 +443,7 @@ class Client:
         self._counters.publish_received -= 1
         self._counters.publish_bytes_received -= len(message.payload)
         self._behind.appendleft((arrived, self._came_at or now))
-        self._behind_size += len(message.payload) + OVERHEAD
+        self._behind_size += _size(arrived)
         self.connection.pause()
         return True
 
@@ -457,24 +457,25 @@ class Client:
         self.wire.proceed()
 
     def _has_place_behind(self) -> bool:
-        """Whether more may come behind the message that waits.
+        """Whether more may come behind the message that waits: as many bytes as may wait for it.
 
         Nothing comes behind what is no PUBLISH, which may change what is to be done with it.
         """
-        behind = self._behind
+        ledger = self._ledger
+        grown = self._behind_size + self.connection.held - self._held
         return (
-            len(behind) < BEHIND
-            and self._behind_size < BEHIND_BYTES
-            and isinstance(behind[-1][0], tuple | Publish)
-            and self._ledger.queued_bytes < self._ledger.memory
+            self._behind_size < ledger.queue_bytes
+            and isinstance(self._behind[-1][0], tuple | Publish)
+            and (ledger.queued_bytes + grown <= ledger.plenty or ledger.fits(self.account, grown))
         )
 
-    def _passing(self, data: bytes) -> Iterator[Event]:
+    def _passing(self, data: bytes, limit: int) -> Iterator[Event]:
         """What comes in while a message waits, and does not wait behind it.
 
-        These are acknowledgements, for which others wait, and pings.
+        These are acknowledgements, for which others wait, and pings: all that the client may have
+        on its way is looked through for them. `limit` is the effort at which its turn ends.
         """
-        connection = self.connection
+        connection, counters = self.connection, self._counters
         if connection.paused and self._has_place_behind():
             connection.resume()
         for event in connection.receive_data(data):
@@ -484,8 +485,12 @@ class Client:
             self._heard_at = self._ledger.now
             self._behind.append((event, self._came_at or self._ledger.now))
             self._behind_size += _size(event)
+            counters.effort += 1 if isinstance(event, tuple) else PACKET_EFFORT + connection.effort
             if not self._has_place_behind():
                 connection.pause()
+            elif counters.effort > limit:
+                connection.pause()
+                self.later()
 
     def _try_again(self) -> None:
         """Publish what waits, if anything, and what came behind it, as far as there is room."""
@@ -519,9 +524,8 @@ class Client:
         self._hurries = True
         if not self._behind:
             return  # what else it waits for, as the end of its login, it waits for still
-        while self._behind and self._work is None:
-            self._try_again()
-        if self._work is None and self.connection.paused:
+        self._try_again()  # and what that is too much for, in the turns that it asked for
+        if not self._behind and self._work is None and self.connection.paused:
             self.connection.resume()
 
     def _expires_at(self, properties: Properties | None) -> float | None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
+from appliance.broker.accounts import Quota
 from appliance.broker.backpressure import (
     MESSAGE_PATIENCE,
     PATIENCE,
@@ -20,10 +21,9 @@ from appliance.broker.backpressure import (
     Allowance,
 )
 from appliance.broker.broker import LOOKS_FOR_ONE, Broker
-from appliance.broker.client import BEHIND
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Limits
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Disconnect,
     Packet,
@@ -111,7 +111,8 @@ class Actor:
 
     @property
     def done(self) -> bool:
-        return self.acknowledged == self.count and not self._owed
+        """Whether that is so, and it has received all that waits for it."""
+        return self.has_all() and not self._owed and not self.peer.session.queue
 
 
 def play(
@@ -276,24 +277,40 @@ def test_the_store_may_be_behind(join: Join, broker: Broker, store: FakeStore):
 
 
 @pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("window", [50, 100, 200, 1000], ids="{} in flight".format)
 @pytest.mark.parametrize("size", [1, 2, 3], ids=["to itself", "two", "a ring of three"])
 def test_who_publish_to_each_other_do_not_wait_for_each_other(
-    join: Join, broker: Broker, qos: int, size: int
+    join: Join, broker: Broker, qos: int, size: int, window: int
 ):
     """What they acknowledge is taken in, while what they publish waits."""
     actors = []
     for number in range(size):
         peer = join(f"client{number}", version=4)
         peer.subscribe(f"{number}", qos)
-        actors.append(Actor(peer, [f"{(number + 1) % size}"], COUNT, qos=qos, pace=10))
+        target = f"{(number + 1) % size}"
+        actors.append(Actor(peer, [target], COUNT, qos=qos, window=window, pace=10))
     steps = play(broker, *actors)
     assert all(actor.got == numbers(COUNT) for actor in actors)
     assert not broker.counters.publish_dropped
     assert steps < 2000, "nobody waited for a time to be up"
 
 
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("window", [50, 200, 1000], ids="{} in flight".format)
+def test_all_may_publish_to_all(join: Join, broker: Broker, qos: int, window: int):
+    actors = []
+    for number in range(5):
+        peer = join(f"client{number}", version=4)
+        peer.subscribe("+", qos)
+        actors.append(Actor(peer, [f"{number}"], 1200, qos=qos, window=window, pace=20))
+    play(broker, *actors)
+    assert [len(actor.got) for actor in actors] == [5 * 1200] * 5
+    assert not broker.counters.publish_dropped
+
+
 def test_a_ring_of_clients_that_send_without_end_goes_on(join: Join, broker: Broker):
     """More is on the way than is looked at: then it is the time that ends the waiting."""
+    broker.use(Limits(queue_bytes=1024 * 1024), broker.features)
     actors = []
     for number in range(3):
         peer = join(f"client{number}", version=4)
@@ -524,24 +541,77 @@ def test_what_may_change_the_message_waits_behind_it(waiting: Peer):
 
 
 def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
-    waiting.send(*(Publish("b", b"", 1, False, False, 10_001 + n) for n in range(BEHIND - 2)))
-    assert not waiting.wire.stopped
-    waiting.send(Publish("b", b"", 1, False, False, 10_100))
-    assert waiting.wire.stopped and len(waiting.client._behind) == BEHIND
-    waiting.send(Publish("b", b"", 1, False, False, 10_101), Pingreq())
+    """In bytes, as is what waits for the client: as many packets as that takes."""
+    ledger, client = broker.ledger, waiting.client
+    ledger.queue_bytes = 100_000
+    packets = [Publish("b", bytes(1000), 1, False, False, 10_001 + n) for n in range(100)]
+    sent = 0
+    while not waiting.wire.stopped:
+        waiting.send(packets[sent])
+        sent += 1
+    assert 60 < sent < 70 and 100_000 <= client._behind_size < 102_000
+    waiting.send(packets[sent], Pingreq())
     assert waiting.received() == [], "what comes all the same is kept as bytes"
-    assert broker.ledger.input_bytes >= BEHIND * 512
+    assert ledger.input_bytes >= client._behind_size + 1000
     waiting.wait()
-    assert len(waiting.received()) == BEHIND + 2
-    assert broker.ledger.input_bytes == 0
+    assert len(waiting.received()) == sent + 3
+    assert ledger.input_bytes == 0
 
 
-def test_a_large_message_behind_it_is_the_last(waiting: Peer):
+def test_what_waits_takes_no_memory_that_there_is_not(waiting: Peer, broker: Broker):
+    """Nobody is disconnected for it: what does not fit is not read."""
+    ledger = broker.ledger
+    ledger.plenty = ledger.queued_bytes
+    ledger.quotas.memory = Quota.of(ledger.queued_bytes + 50_000, None)
+    for number in range(100):
+        waiting.send(Publish("b", bytes(1000), 1, False, False, 10_001 + number))
+        if waiting.wire.stopped:
+            break
+    assert waiting.wire.stopped and not waiting.wire.closed
+    assert 0 < ledger.input_bytes < 20_000
+
+
+def test_what_waits_is_counted_with_its_topic_and_properties(
+    waiting: Peer, broker: Broker, join: Join
+):
+    waiting.send(Publish("b/" + "x" * 30_000, b"", 1, False, False, 10_001))
+    assert 60_000 < broker.ledger.input_bytes < 65_000, "the topic, and the head that it is in"
+    other = join("other")
+    pairs: Properties = {Property.USER_PROPERTY: [("k" * 1000, "v" * 29_000)]}
+    other.send(
+        Publish("a", b"", 1, False, False, 10_001),
+        Publish("b", b"", 1, False, False, 10_002, pairs),
+    )
+    assert broker.ledger.input_bytes > 90_000
+
+
+def test_much_that_comes_behind_it_is_taken_in_turns(waiting: Peer, broker: Broker):
+    """… while it comes, and when it is done after the connection was lost."""
+    packets = [Publish("b", b"", 1, False, False, 10_001 + n) for n in range(5000)]
+    waiting.send(*packets)
+    for _ in range(10):
+        begun = broker.counters.effort
+        assert waiting.wire.laters
+        waiting.go_on()
+        assert broker.counters.effort - begun < 1100
+        if not waiting.wire.laters:
+            break
+    assert len(waiting.client._behind) == 5001
+    begun = broker.counters.effort
+    waiting.client.hurry()
+    assert broker.counters.effort - begun < 1100 and waiting.client._behind
+    while waiting.wire.laters:
+        waiting.go_on()
+    assert not waiting.client._behind
+    assert len(waiting.received()) == 5001
+
+
+def test_a_large_message_may_be_behind_it(waiting: Peer):
     waiting.send(
         Publish("b", bytes(100_000), 1, False, False, 10_001),
         Publish("b", b"", 1, False, False, 10_002),
     )
-    assert waiting.wire.stopped and len(waiting.client._behind) == 2
+    assert not waiting.wire.stopped and len(waiting.client._behind) == 3
     waiting.wait()
     assert waiting.received() == [Puback(10_000), Puback(10_001), Puback(10_002)]
 
