@@ -385,11 +385,8 @@ class Bridge:
         """
         turns = self._turns
         work = partial(self._hand_over, receiver, message, retain, origin)
-        if size <= LITTLE and not turns.waits(origin):
-            work()
-        elif isinstance(receiver, Commands):
-            # Its rules depend on when a command comes, and a stop message never waits for one.
-            turns.now(work)
+        if isinstance(receiver, Commands) or (size <= LITTLE and not turns.waits(origin)):
+            work()  # where there are rules, what comes is judged first, and waits then
         elif turns.has_room(origin, size):
             turns.do(origin, size, work)
         else:
@@ -403,9 +400,7 @@ class Bridge:
         try:
             objection = receiver.receive(message, retain, origin)
         except Exception as error:
-            self._faults.caught("bridge.receive", error, receiver)
-            receiver.counters.errors += 1
-            objection = receiver.objection(message, "could not be carried: see the log")
+            objection = receiver.fault(message, error)
         if objection is not None:
             self._object(objection)
 

@@ -10,8 +10,10 @@ import asyncio
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from appliance.broker.message import Message
 from appliance.broker.ports import Objection
@@ -44,6 +46,14 @@ COARSE = 0.02
 #: Seconds until it is looked again whether what a client has sent has been read.
 READ_SOON = 0.01
 
+#: Why a command is refused that is one of many.
+QUEUED = "others came with it at once, as of a queue"
+
+#: Bytes of a payload up to which it may be a stop message: so many for each byte of the message in
+#: CDR, names and digits and white space, and never less than the other.
+STOP_BYTES = 64
+STOP_SIZE = 16 * 1024
+
 
 @dataclass(slots=True)
 class _Waiting:
@@ -55,6 +65,22 @@ class _Waiting:
     size: int
     due: float
     timer: asyncio.TimerHandle
+
+
+@dataclass(slots=True, eq=False)
+class _Command:
+    """A command that has come at `at`, and what is known of it before it is converted."""
+
+    message: Message
+    origin: Session | None
+    at: float
+    verdict: Verdict
+    #: Why it is not to be carried out, if it does not stop the robot.
+    why: str
+    #: What it was converted to, where that is known before its turn.
+    cdr: bytes = b""
+    #: Whether its client has ended its connection in good order since.
+    has_left: bool = False
 
 
 class _Stop:
@@ -72,6 +98,8 @@ class _Stop:
 
     def is_like(self, cdr: bytes) -> bool:
         """Whether a message says the same, at another time or in another frame."""
+        if abs(len(cdr) - len(self.example)) > LITTLE:
+            return False  # as long as no frame's name is
         try:
             one, other = (self._converter.to_dict(message) for message in (cdr, self.example))
         except ConversionError:  # of another type, from before a reload
@@ -129,6 +157,8 @@ class Commands(ToRos):
         self._joined: Lease | None = None
         #: First commands of clients, see `Arrivals`.
         self._waiting: dict[Session, _Waiting] = {}
+        #: Large commands that wait for their turn to be converted, and what is behind them.
+        self._queued: dict[Session | None, deque[_Command]] = {}
         #: Who fell silent while it drove, and when its computer was asked for an answer.
         self._asked: dict[Session, float] = {}
         #: Whether a stop message is overdue, which ROS would not take.
@@ -183,8 +213,35 @@ class Commands(ToRos):
         self._source = None
 
     def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
+        """What is known of a command when it comes is judged then; a large one is converted when it
+        is its turn, and what is wrong with it is returned only if that is now.
+        """
         if self._is_left or (retain and not self.rules.take_retained):
             return None
+        command = self._judge(message, retain, origin)
+        if isinstance(command, Objection):
+            return command
+        is_refused = command.why or command.verdict is Verdict.REFUSE
+        if is_refused and not self._may_stop(message):
+            return self._expire(message, command.why or QUEUED, origin)
+        is_kept = retain or (message.retain and self.rules.take_retained)
+        if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
+            self._is_awaited = True
+            return None
+        size = size_of(message.payload)
+        if size <= LITTLE and origin not in self._queued:
+            return self._finish(command)
+        turns = self._around.turns
+        if size <= LITTLE:
+            return self._do_behind_its_own(command)
+        if not turns.is_busy and not turns.waits(origin):
+            return turns.now(partial(self._finish, command))
+        return self._queue(command, size)
+
+    def _judge(
+        self, message: Message, retain: bool, origin: Session | None
+    ) -> _Command | Objection:
+        """What is to become of it, as far as that is known without a look into the payload."""
         # When it was received: what came in one chunk came at once, however long it takes.
         now = self._around.broker.now
         verdict = Verdict.CARRY_OUT
@@ -193,32 +250,112 @@ class Commands(ToRos):
             is_proven = sent_at(message.properties) is not None
         except ValueError as error:
             return self._object(message, f"was refused: {error}")
-        if origin is not None and why:
-            self._forget(origin, why)
-            if origin.link is not None:
-                self._arrivals.is_old(origin, now)
-        elif origin is not None and not is_proven and self.rules.oldest < math.inf:
-            verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now)
-        if why and not self._is_late_stop(message, origin):
-            return self._expire(message, why, origin)
-        is_kept = retain or (message.retain and self.rules.take_retained)
-        if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
-            self._is_awaited = True
-            return None
-        cdr = self._convert(message, origin)
         if origin is not None:
-            self._forget(origin, "another followed at once")  # which would be overtaken by it
-            if isinstance(cdr, Objection) or (
-                verdict is not Verdict.CARRY_OUT and self._stops(cdr)
-            ):
-                # Who says stop is heard at once, whatever comes with it.
+            # What waits would be overtaken by it.
+            self._forget(origin, why or "another followed at once")
+            if why and origin.link is not None:
+                self._arrivals.is_old(origin, now)
+            elif not why and not is_proven and self.rules.oldest < math.inf:
+                verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now)
+        return _Command(message, origin, now, verdict, why)
+
+    def _finish(self, command: _Command) -> Objection | None:
+        """Convert it and carry it out, if that is still to be; what the appliance itself fails in
+        is told of as well."""
+        try:
+            return self._convert_and_carry_out(command)
+        except Exception as error:
+            return self.fault(command.message, error)
+
+    def _convert_and_carry_out(self, command: _Command) -> Objection | None:
+        message, origin = command.message, command.origin
+        if command.why and not self._is_late_stop(message, origin):
+            return self._expire(message, command.why, origin)
+        cdr = command.cdr or self._convert(message, origin)
+        verdict = command.verdict
+        if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self._stops(cdr)):
+            # Who says stop is heard at once, whatever comes with it.
+            if origin is not None:
                 self._arrivals.waited(origin)
-                verdict = Verdict.CARRY_OUT
-            elif verdict is Verdict.REFUSE:
-                return self._expire(message, "others came with it at once, as of a queue", origin)
-            elif verdict is Verdict.WAIT:
-                return self._let_wait(message, cdr, origin)
-        return cdr if isinstance(cdr, Objection) else self._carry_out(message, cdr, origin)
+            verdict = Verdict.CARRY_OUT
+        if isinstance(cdr, Objection):
+            return cdr
+        if origin is not None and verdict is Verdict.REFUSE:
+            return self._expire(message, QUEUED, origin)
+        if origin is not None and verdict is Verdict.WAIT:
+            return self._let_wait(command, cdr, origin)
+        return self._carry_out(message, cdr, origin)
+
+    # Large commands, which wait for their turn to be converted
+
+    def _queue(self, command: _Command, size: int) -> Objection | None:
+        message, origin = command.message, command.origin
+        turns = self._around.turns
+        if not turns.has_room(origin, size):
+            if origin is not None:
+                self._arrivals.waited(origin)
+            why = "was refused: too much of its user waits to be converted"
+            return self._object(message, why, ReasonCode.QUOTA_EXCEEDED)
+        self._queued.setdefault(origin, deque()).append(command)
+        turns.do(origin, size, partial(self._have_turn, command))
+        return None
+
+    def _do_behind_its_own(self, command: _Command) -> Objection | None:
+        """A small command whose client has large ones queued waits for these, unless it stops: then
+        it is they that come too late."""
+        message, origin = command.message, command.origin
+        cdr = self._convert(message, origin)
+        if isinstance(cdr, Objection):
+            return cdr
+        if origin is not None and self._stops(cdr):
+            self._drop_queued(origin, "a stop message followed")
+            return self._finish(command)
+        command.cdr = cdr
+        return self._queue(command, max(len(cdr), len(message.payload)))
+
+    def _have_turn(self, command: _Command) -> None:
+        """It is the turn of a command that was queued: is it still to be carried out?"""
+        message, origin = command.message, command.origin
+        queue = self._queued[origin]
+        queue.remove(command)
+        if not queue:
+            del self._queued[origin]
+        command.why = command.why or self._why_late(command)
+        if self._is_left:
+            self._count_expired(command.why or "the route ends", origin)
+        elif command.why and not self._may_stop(message):
+            self._count_expired(command.why, origin)
+        elif origin is not None and not self.decide(origin):
+            self.counters.refused += 1
+        else:
+            self._finish(command)
+            if command.has_left and origin is self._source:
+                self._source = None
+                if self._is_driven:
+                    self._publish_stop(f"{origin} has left")
+
+    def _why_late(self, command: _Command) -> str:
+        """Why a command that was new has become too old in the queue; empty when it has not."""
+        oldest = self.rules.oldest
+        waited = self._around.entries.time() - command.at
+        try:
+            why = self._old_by_itself(command.message)
+        except ValueError as error:  # the clock was set
+            return str(error)
+        if why or waited + command.message.age <= oldest:
+            return why
+        return f"it waited for its turn to be converted for {waited:.1f} s"
+
+    def _drop_queued(self, origin: Session, why: str) -> None:
+        """None of the client's commands that wait for their turn is carried out."""
+        for command in self._queued.get(origin, ()):
+            command.why = command.why or why
+
+    def _may_stop(self, message: Message) -> bool:
+        """Whether it can be the route's stop message, by its size."""
+        stop = self._stop
+        most = 0 if stop is None else max(STOP_SIZE, STOP_BYTES * len(stop.example))
+        return len(message.payload) <= most
 
     def inspect(self, message: Message, session: Session) -> Objection | None:
         try:
@@ -293,15 +430,16 @@ class Commands(ToRos):
         self.counters.last_error = f"a command was too old: {why}"
         self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
 
-    def _let_wait(self, message: Message, cdr: bytes, origin: Session) -> Objection | None:
+    def _let_wait(self, command: _Command, cdr: bytes, origin: Session) -> Objection | None:
         """Keep a first command until it is known whether others are behind it."""
-        entries, ledger = self._around.entries, self._around.broker.ledger
+        message = command.message
+        ledger = self._around.broker.ledger
         size = message.size + len(cdr)
         if not ledger.fits(origin.account, size):
             self._arrivals.waited(origin)
             return self._object(message, "was refused: there is no memory for it to wait in")
         ledger.take(origin.account, size)
-        due = entries.time() + self._arrivals.waiting_time(origin, self.rules.oldest)
+        due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)
         self._waiting[origin] = _Waiting(message, cdr, size, due, timer)
         return None
@@ -324,9 +462,12 @@ class Commands(ToRos):
         return waiting
 
     def _forget(self, origin: Session, why: str) -> None:
-        """What waits is not carried out, if something does."""
+        """A first command that waits is not carried out, if there is one."""
         if self._wait_no_longer(origin) is not None:
             self._count_expired(why, origin)
+        for command in self._queued.get(origin, ()):
+            if command.verdict is Verdict.WAIT:
+                command.why = command.why or why
 
     def _has_waited(self, origin: Session) -> None:
         """Nothing has followed the first command, unless it has come and was not read yet."""
@@ -428,7 +569,13 @@ class Commands(ToRos):
         if session.ended_well:
             # Nothing was behind it: `mosquitto_pub` and the like.
             self._carry_out_waiting(session)
-        self._forget(session, "its connection was lost")
+            for command in self._queued.get(session, ()):
+                command.has_left = True
+                if command.verdict is Verdict.WAIT:
+                    command.verdict = Verdict.CARRY_OUT
+        else:
+            self._forget(session, "its connection was lost")
+            self._drop_queued(session, "its connection was lost")
         self._arrivals.departed(session)
         self._asked.pop(session, None)
         if self.rules.exclusive and session is self._lease.holder:

@@ -188,6 +188,12 @@ class ToRos(Flow):
         """What the client is told: the code, and why."""
         return Objection(message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
 
+    def fault(self, message: Message, error: Exception) -> Objection:
+        """What the client is told when it is the appliance that failed, which is reported."""
+        self._around.broker.faults.caught("bridge.receive", error, self)
+        self.counters.errors += 1
+        return self.objection(message, "could not be carried: see the log")
+
     # Who may publish: a Guard of the broker's
 
     def decide(self, session: Session) -> Decision:

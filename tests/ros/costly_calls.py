@@ -63,6 +63,18 @@ BRIDGE = {
             "compression": "zstd" if encoding.endswith("zstd") else "none",
         }
         for encoding in ("json", "cbor", "cdr", "json_zstd")
+    ]
+    + [
+        {
+            "ros": f"/costly/ruled/{encoding}",
+            "to": "ros",
+            "type": "test_msgs/msg/UnboundedSequences",
+            "encoding": encoding,
+            "expire": "500 ms",
+            "on_silence": {"after": "500 ms"},
+            "clamp": {"float64_values": [-1, 1]},
+        }
+        for encoding in ("json", "cdr")
     ],
     "services": [{"ros": "/costly", "type": "rcl_interfaces/srv/SetParameters"}],
 }
@@ -90,6 +102,8 @@ class Shape:
     window: int = 2
     #: Messages of a QoS 2 connection that are released in one go.
     released: int = 10
+    #: Whether they say that they are new, so that a route with rules carries them out.
+    is_dated: bool = False
 
 
 def cbor_of(item: bytes, size: int = MIB) -> bytes:
@@ -185,6 +199,17 @@ SHAPES = {
     "command-zstd-bomb": Shape(
         "r2d2/costly/json_zstd", lambda: zstandard.compress(json_of(b'""')), window=10
     ),
+    "ruled-json": Shape(
+        "r2d2/costly/ruled/json", lambda: sequences_json(JUST), window=10, is_dated=True
+    ),
+    "ruled-json-far": Shape("r2d2/costly/ruled/json", lambda: sequences_json(FAR), is_dated=True),
+    "ruled-cdr": Shape(
+        "r2d2/costly/ruled/cdr", lambda: sequences_cdr(JUST), window=10, is_dated=True
+    ),
+    "ruled-queue": Shape("r2d2/costly/ruled/json", lambda: sequences_json(JUST), window=10),
+    "ruled-released": Shape(
+        "r2d2/costly/ruled/json", lambda: sequences_json(JUST), qos=2, is_dated=True
+    ),
     "command-released": Shape("r2d2/costly/json", lambda: sequences_json(JUST), qos=2),
 }
 
@@ -266,6 +291,8 @@ class Caller(asyncio.Protocol):
                 Property.CONTENT_TYPE: shape.content_type,
                 Property.RESPONSE_TOPIC: f"answers/{self._name}",
             }
+        elif shape.is_dated:
+            properties = {Property.USER_PROPERTY: [("sent-at", str(time.time()))]}
         packet = Publish(
             shape.topic,
             self._payload,
@@ -374,7 +401,11 @@ def _routes(appliance: ApplianceProcess) -> tuple[int, int]:
     )
     routes = [json.loads(line) for line in said.stdout.splitlines()]
     routes = [route for route in routes if "/costly/" in str(route)]
-    return sum(r.get("messages") or 0 for r in routes), sum(r.get("errors") or 0 for r in routes)
+    refused = ("errors", "expired")
+    return (
+        sum(route.get("messages") or 0 for route in routes),
+        sum(route.get(what) or 0 for route in routes for what in refused),
+    )
 
 
 def problems(

@@ -7,6 +7,7 @@ import logging
 import math
 import struct
 import time
+from itertools import pairwise
 
 import pytest
 from waiting import until
@@ -1389,7 +1390,10 @@ async def test_an_old_stop_message_is_carried_out(house, way, padding, qos):
     assert decode(driver.wire.written).reason_code == 0
     if qos == 2:
         driver.say(Pubrel(7))
-    assert house.robot.received == [twist(0.5), STOP]
+    if not padding:
+        assert house.robot.received == [twist(0.5), STOP]
+    # A large one was converted for its PUBREC, and is again when it is its turn.
+    await until(lambda: house.robot.received == [twist(0.5), STOP])
     assert house.counters().expired == 0
     # It shows a queue all the same: another command that comes with it is old.
     driver.drive(GO)
@@ -1470,6 +1474,179 @@ async def test_what_waits_takes_memory_that_is_counted(house, monkeypatch):
     await until(lambda: house.robot.received == [twist(0.5)])
     assert (ledger.queued_bytes, account.bytes) == (before, own)
     assert "no memory" in house.counters().last_error
+
+
+# Large commands are converted one a turn
+
+
+def large(x, size=20_000):
+    return b'{"linear":{"x":%g}}' % x + b" " * size
+
+
+#: Of anybody: from here on what is large waits for its turn.
+ANOTHER = large(0.25)
+
+
+def code(driver, payload, **kw):
+    """The reason code of its PUBACK."""
+    driver.wire.written = b""
+    driver.drive(payload, qos=1, **kw)
+    return driver.code
+
+
+def make_busy(house):
+    other = Driver(house.broker, "somebody else")
+    other.steer(ANOTHER)
+    assert house.robot.received.pop() == twist(0.25)
+    return other
+
+
+async def test_large_commands_of_many_are_converted_one_a_turn(house, monkeypatch):
+    house.start(CommandRules(expire=5.0, clamp=(("linear.x", -1, 1),)))
+    drivers = [Driver(house.broker, f"driver {number}") for number in range(10)]
+    for number, driver in enumerate(drivers):
+        driver.steer(large(number / 10), qos=1)
+        driver.steer(large(5), qos=1)
+    assert house.robot.received == [twist(0)]
+    seen = []
+
+    def look():
+        seen.append(len(house.robot.received))
+        if seen[-1] < 20:
+            asyncio.get_running_loop().call_soon(look)
+
+    look()
+    await until(lambda: seen[-1] == 20)
+    assert max(b - a for a, b in pairwise(seen)) == 1
+    # Users and clients take turns, and what one client sends stays in its order.
+    assert [one for one in house.robot.received if one != twist(1)] == [
+        twist(number / 10) for number in range(10)
+    ]
+    assert house.robot.received[-9:] == [twist(1)] * 9
+    assert house.counters().clamped == 10
+
+
+async def test_a_stop_message_does_not_wait_behind_conversions(house):
+    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
+    make_busy(house)
+    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+    for x in (0.1, 0.2, 0.3):
+        driver.steer(large(x))
+        other.steer(large(x))
+    assert house.robot.received == []
+    other.drive(b"{}")
+    assert house.robot.received == [STOP]
+    # What the same client has said before has been overtaken, and comes too late.
+    await until(lambda: house.counters().expired == 3)
+    await until(lambda: len(house.robot.received) == 4)
+    assert house.robot.received == [STOP, twist(0.1), twist(0.2), twist(0.3)]
+
+
+async def test_a_small_command_does_not_overtake_a_large_one(house):
+    house.start(CommandRules(expire=5.0))
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    driver.steer(large(0.1))
+    driver.steer(GO)
+    assert house.robot.received == []
+    assert code(driver, b"[]", properties=made(0)) == 0x99
+    await until(lambda: house.robot.received == [twist(0.1), twist(0.5)])
+
+
+async def test_a_command_is_as_old_as_its_wait_for_its_turn(house, monkeypatch):
+    house.start(CommandRules(expire=0.2, on_silence=OnSilence(5.0)))
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    driver.steer(large(0.1))
+    driver.drive(large(0.1), properties={Property.MESSAGE_EXPIRY_INTERVAL: 60})
+    driver.steer(large(0, 10_000))
+    busy_until = time.monotonic() + 0.25
+    while time.monotonic() < busy_until:  # the loop has no time for them
+        pass
+    await until(lambda: house.robot.received == [STOP])  # which is carried out all the same
+    assert house.counters().expired == 2
+
+
+async def test_what_need_not_be_converted_is_not(house, monkeypatch):
+    house.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
+    driver = Driver(house.broker, "a")
+    monkeypatch.setattr(house.commands, "_read", lambda *_: pytest.fail("it was converted"))
+    huge = large(0.5, 50_000)
+    assert code(driver, huge, dup=True) == 0x83
+    assert code(driver, huge) == 0x83  # behind an old one: a queue
+    assert house.counters().expired == 2
+
+
+async def test_who_has_the_lease_when_it_is_its_turn(house):
+    house.start(CommandRules(expire=5.0, exclusive=True))
+    other = make_busy(house)
+    other.leave()
+    driver, late = Driver(house.broker, "a"), Driver(house.broker, "b")
+    late.steer(large(0.1))
+    driver.steer(GO)
+    await until(lambda: house.counters().refused == 1)
+    assert house.robot.received == [twist(0.5)]
+
+
+@pytest.mark.parametrize("proven", [True, False])
+async def test_who_leaves_before_its_turn(house, proven):
+    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
+    make_busy(house)
+    driver, lost = Driver(house.broker, "a"), Driver(house.broker, "b")
+    if proven:
+        driver.steer(large(0.1))
+    else:  # the first of its connection
+        driver.drive(large(0.1))
+    lost.steer(large(0.2))
+    driver.leave()
+    lost.cut()
+    await until(lambda: house.robot.received == [twist(0.1), STOP])
+    await until(lambda: house.counters().expired == 1)
+    assert house.commands._queued == {}
+
+
+async def test_a_large_queue_behind_connect(house):
+    """The first of it waits for its turn when the others come."""
+    house.start(CommandRules(expire=0.5))
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    driver.drive(large(0.1))
+    driver.drive(large(0.2))
+    await until(lambda: house.counters().expired == 2)
+    single = Driver(house.broker, "b")
+    await until(lambda: not house.bridge._turns.is_busy)
+    make_busy(house)
+    single.drive(large(0.3))
+    await until(lambda: house.robot.received == [twist(0.3)])
+
+
+async def test_large_commands_that_wait_are_bounded_and_end_with_their_route(house):
+    bridge = house.start(CommandRules(expire=5.0))
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    account = driver.client.session.account
+    before = account.bytes
+    codes = [code(driver, large(0.1, 1_000_000), properties=made(0)) for _ in range(20)]
+    assert codes == [0] * 16 + [0x97] * 4
+    bridge.replace([])
+    await until(lambda: account.bytes <= before)
+    assert house.robot.received == []
+
+
+async def test_a_fault_in_the_conversion_of_a_large_command(house, monkeypatch, escaped):
+    house.start(CommandRules(expire=5.0))
+    faults = house.broker.faults.count
+
+    def fail(*_):
+        raise RuntimeError("on purpose")
+
+    monkeypatch.setattr(house.commands, "_convert", fail)
+    driver = Driver(house.broker, "a")
+    assert code(driver, large(0.1), properties=made(0)) == 0x83
+    Driver(house.broker, "b").steer(large(0.1))
+    await until(lambda: house.counters().errors == 2)
+    assert house.broker.faults.count == faults + 2
+    escaped.clear()
 
 
 async def test_what_waits_does_not_outlive_its_route(house):

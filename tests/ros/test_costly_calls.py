@@ -21,7 +21,13 @@ def attack(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "name",
-    ["call-cbor-typed-arrays", "call-cbor-texts", "call-json-texts", "command-released"],
+    [
+        "call-cbor-typed-arrays",
+        "call-cbor-texts",
+        "call-json-texts",
+        "command-released",
+        "ruled-json",
+    ],
 )
 def test_another_client_is_served_meanwhile(attack, name):
     """Without limits and turns the worst of these stopped it for seconds."""
