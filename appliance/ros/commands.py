@@ -502,7 +502,6 @@ class Commands(ToRos):
         except ConversionError as error:
             if self._stops(cdr):
                 return cdr
-            self.counters.refused += 1
             raise AgainstRulesError("", f"it is against the route's rules: {error}") from None
         if has_changed:
             if self._stops(cdr):  # clamped, it might move the robot

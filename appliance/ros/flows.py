@@ -309,6 +309,14 @@ class Flow(ABC):
     def fail(self, problem: str) -> None:
         """Count a message that could not be carried, and say so once a minute."""
         self.counters.errors += 1
+        self._tell_uncarried(problem, self.counters.errors)
+
+    def refuse(self, problem: str) -> None:
+        """Count a message that the route's rules forbid, and say so once a minute."""
+        self.counters.refused += 1
+        self._tell_uncarried(problem, self.counters.refused)
+
+    def _tell_uncarried(self, problem: str, count: int) -> None:
         self.counters.last_error = problem
         now = monotonic()
         if now >= self._report_at:
@@ -318,7 +326,7 @@ class Flow(ABC):
                 "%s: a message %s (%d so far)",
                 self,
                 problem,
-                self.counters.errors,
+                count,
             )
 
     @abstractmethod

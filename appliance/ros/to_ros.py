@@ -150,7 +150,9 @@ class ToRos(Flow):
         try:
             return self._read(out[0], message, origin)
         except AgainstRulesError as error:
-            return self._object(message, f"was refused: {error}")
+            problem = f"was refused: {error}"
+            self.refuse(problem)
+            return self.objection(message, problem)
         except ConversionError as error:
             problem = f"cannot be converted: {error}"
             return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
