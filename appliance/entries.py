@@ -229,6 +229,33 @@ def contained(
     return decorate
 
 
+def contained_made(
+    entry: str,
+) -> Callable[
+    [Callable[[FaultyT, asyncio.BaseTransport], None]],
+    Callable[[FaultyT, asyncio.BaseTransport], None],
+]:
+    """`contained`, for `connection_made`: it also cuts the transport, of which nobody else knows.
+
+    So no bytes come to what was not made to the end.
+    """
+
+    def decorate(
+        method: Callable[[FaultyT, asyncio.BaseTransport], None],
+    ) -> Callable[[FaultyT, asyncio.BaseTransport], None]:
+        @functools.wraps(method)
+        def run(self: FaultyT, transport: asyncio.BaseTransport) -> None:
+            try:
+                method(self, transport)
+            except Exception as error:
+                self.fault(entry, error)
+                cast(asyncio.WriteTransport, transport).abort()
+
+        return run
+
+    return decorate
+
+
 def shield(entry: str, faults: Faults, told: T) -> T:
     """A part that is told of what happens, so that its faults are not those of who tells it."""
     return cast(T, _Shield(entry, faults, told))

@@ -15,7 +15,7 @@ import ssl
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
-from appliance.entries import Faulty, contained
+from appliance.entries import Faulty, contained, contained_made
 from appliance.turns import Turns
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
@@ -152,10 +152,10 @@ class TlsTransport:
         self._entries.faults.caught(entry, error)
         if not self._handshake.done():
             self._handshake.set_result(ConnectionAbortedError("a fault in the appliance"))
-        if hasattr(self, "_tcp"):
+        if hasattr(self, "_tcp"):  # else `contained_made` cuts it
             self.abort()
 
-    @contained("tls.made")
+    @contained_made("tls.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The TCP connection is there; in TLS the client speaks first."""
         self._tcp = cast(asyncio.Transport, transport)

@@ -14,7 +14,7 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
-from appliance.entries import contained
+from appliance.entries import contained, contained_made
 from appliance.turns import Turns
 
 #: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
@@ -114,7 +114,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         """End this connection, as something that nobody expected escaped while it was served."""
         self._protocol.fault(entry, error)
 
-    @contained("websocket.made")
+    @contained_made("websocket.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The connection is there; what is above may close it, and read when it is upgraded."""
         self._transport = cast(asyncio.Transport, transport)

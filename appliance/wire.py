@@ -16,7 +16,7 @@ from appliance import farewell, tls
 from appliance.broker.accounts import Account
 from appliance.broker.client import Client
 from appliance.broker.ports import HERE, Contact, Exchange, Identity, Refusal, Secured
-from appliance.entries import contained
+from appliance.entries import contained, contained_made
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -188,7 +188,7 @@ class ClientProtocol:
             # Its last bytes wait for a commit; or not even the flush went well.
             self._cut_after(CLOSE_TIMEOUT)
 
-    @contained("connection.made")
+    @contained_made("connection.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)

@@ -10,6 +10,7 @@ import ast
 import importlib
 import re
 import sys
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ NAMED = {
     "at",
     "caught",
     "contained",
+    "contained_made",
     "every",
     "fault",
     "from_thread",
@@ -114,6 +116,8 @@ class Saboteur:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._armed: set[str] = set()
+        #: What was caught that nobody let fail, with where.
+        self.others: list[str] = []
         self._patch_entries(monkeypatch)
         places: dict[tuple[str, str, str], dict[str, str]] = {}
         for entry, (module, kind, name, by) in INLINE.items():
@@ -134,6 +138,16 @@ class Saboteur:
         return callback(*args, **more)
 
     def _patch_entries(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        caught = Faults.caught
+
+        def noted(own: Faults, entry: str, error: BaseException, served: object = "") -> None:
+            # What the loop tells of by itself is the clients' as well: they live in it, too.
+            theirs = entry == "loop" and isinstance(error, EOFError | OSError)
+            if not isinstance(error, SabotageError) and not theirs:
+                self.others.append("".join(traceback.format_exception(error)) + f"at {entry}")
+            caught(own, entry, error, served)
+
+        monkeypatch.setattr(Faults, "caught", noted)
         run, task, repeat = entries.Entries.run, entries.Entries.task, entries.Repeated.__init__
         once, shield = Faults.run, entries._Shield.__init__
         first = self._first
