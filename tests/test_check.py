@@ -68,6 +68,18 @@ def test_routes(here: Path, route: dict[str, Any], level: str, text: str) -> Non
     assert all(text in each.text for each in findings), findings
 
 
+def test_what_the_environment_says_against_the_configuration(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy")
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", "/mine.xml")
+    told = [each for each in found(here) if each.subject == "bridge.discovery"]
+    assert [each.level for each in told] == ["warning", "ok"]
+    assert "FASTDDS_DEFAULT_PROFILES_FILE=/mine.xml is not heeded" in told[0].text
+
+
 @pytest.mark.parametrize(
     ("section", "route", "text"),
     [

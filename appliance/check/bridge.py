@@ -46,20 +46,25 @@ def bridge(settings: Settings) -> Iterator[Finding]:
             text = "types, fields and stop messages of routes are not checked for ROS 1"
             yield Finding("ok", "bridge", text)
         return
-    yield _bus(settings)
+    yield from _bus(settings)
     if is_available:
         yield from _topics(wiring.routes(settings))
         yield from _calls(wiring.call_routes(settings))
 
 
-def _bus(settings: Settings) -> Finding:
+def _bus(settings: Settings) -> Iterator[Finding]:
     """Who else is on it."""
     said, subject = settings.bridge.discovery, "bridge.discovery"
-    if said == "localhost" or (said == "environment" and discovery.is_local(os.environ)):
-        return Finding("ok", subject, "ROS nodes of this computer only")
-    if discovery.is_secured(os.environ):
-        return Finding("ok", subject, "ROS nodes that have keys, by SROS 2")
-    return Finding("warning", subject, f"{discovery.OPEN}; {discovery.OPEN_ADVICE}")
+    environment = dict(os.environ)
+    unheeded = discovery.use(said, environment)
+    if unheeded:
+        yield Finding("warning", subject, unheeded)
+    if said == "localhost" or (said == "environment" and discovery.is_local(environment)):
+        yield Finding("ok", subject, "ROS nodes of this computer only")
+    elif discovery.is_secured(environment):
+        yield Finding("ok", subject, "ROS nodes that have keys, by SROS 2")
+    else:
+        yield Finding("warning", subject, f"{discovery.OPEN}; {discovery.OPEN_ADVICE}")
 
 
 def _topics(routes: list[RouteSettings]) -> Iterator[Finding]:

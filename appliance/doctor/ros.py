@@ -17,7 +17,7 @@ from appliance.config import Settings
 from appliance.doctor.finding import Finding
 from appliance.doctor.ros1 import ros1
 from appliance.environment import of_service
-from appliance.ros import discovery, installation
+from appliance.ros import discovery, fastdds, installation
 from appliance.ros.discovery import OPEN, OPEN_ADVICE
 from appliance.ros.ros2 import Ros2Node, available
 
@@ -45,6 +45,7 @@ _DISCOVERY = (
     "ROS_STATIC_PEERS",
     "ROS_DISCOVERY_SERVER",
     "FASTDDS_BUILTIN_TRANSPORTS",
+    *fastdds.VARIABLES,
     "CYCLONEDDS_URI",
 )
 

@@ -42,16 +42,18 @@ def use(discovery: Discovery, environment: MutableMapping[str, str]) -> str:
 
     With Fast DDS localhost is a profile of ours: with ROS's own variable its sockets are open to
     the network all the same, and nodes of another user of this computer are found while nothing
-    arrives from them. Where the profile cannot be used it is that variable.
+    arrives from them. It goes before a profile of the user's. Without Fast DDS it is that variable.
     """
     if discovery == "environment" or fastdds.is_local(environment):
         return ""
     against = [f"{name}={environment[name]}" for name in _against(discovery, environment)]
+    if discovery == "localhost" and fastdds.is_used(environment):
+        against += fastdds.settings_of_user(environment)
     if discovery == "subnet":
         environment[RANGE] = "SUBNET"
         environment.pop(LOCALHOST_ONLY, None)
     else:
-        for name in PEERS:
+        for name in (*PEERS, LOCALHOST_ONLY):
             environment.pop(name, None)
         if fastdds.use_profile(environment, is_local=True):
             environment[RANGE] = "SUBNET"  # it would undo the profile's transports

@@ -22,6 +22,9 @@ _PROFILES = {
 #: What names the file to a node, and what did up to ROS 2 Jazzy, when it was called Fast RTPS.
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+#: With it a file of that name in the working directory is not read; up to Fast DDS 2, and since.
+_SKIP_FILES = ("SKIP_DEFAULT_XML", "SKIP_DEFAULT_XML_FILE")
+_TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 
 #: What to do about messages that the middleware lost on their way here.
 LOST_IN_ROS = (
@@ -50,23 +53,40 @@ def is_old() -> bool:
     return any((share / "fastrtps").is_dir() for share in shares())
 
 
+def is_used(environment: Mapping[str, str]) -> bool:
+    """Whether the middleware is Fast DDS."""
+    return environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
+
+
+def settings_of_user(environment: Mapping[str, str]) -> list[str]:
+    """What the user has said to Fast DDS: profiles, and transports that we have no profile for."""
+    said = [f"{name}={environment[name]}" for name in VARIABLES if environment.get(name)]
+    said += [f"{file} in {Path.cwd()}" for file in _FILES if Path(file).exists()]
+    transports = environment.get(_TRANSPORTS)
+    return said + ([f"{_TRANSPORTS}={transports}"] if transports not in (None, "UDPv4") else [])
+
+
 def use_profile(environment: MutableMapping[str, str], *, is_local: bool = False) -> bool:
-    """Let Fast DDS read our profile: room for images and, where `is_local`, nodes of this computer
-    only. False when it must not: the user's own settings go first.
+    """Let Fast DDS read our profile: room for images. False when it must not: the user's own
+    settings go first. Where `is_local` it is for nodes of this computer only, and goes before
+    these: any other would open sockets to the network.
 
     On ROS 2 up to Jazzy a profile's transports would also undo `ROS_LOCALHOST_ONLY`, which Kilted
     does not know any more.
     """
-    transports = environment.get("FASTDDS_BUILTIN_TRANSPORTS")
-    is_udp = transports is not None
-    if (
-        not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
-        or transports not in (None, "UDPv4")
-        or (is_old() and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"))
-        or any(variable in environment for variable in VARIABLES)
-        or any(Path(file).exists() for file in _FILES)
+    is_udp = environment.get(_TRANSPORTS) == "UDPv4"
+    if not is_used(environment) or (
+        is_old() and environment.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0")
+    ):
+        return False
+    if is_local:
+        for name in VARIABLES:
+            environment.pop(name, None)
+        environment.update(dict.fromkeys(_SKIP_FILES, "1"))
+    elif (
+        settings_of_user(environment)
         # In Humble and before it does not know the variable, and the profile says it.
-        or (is_udp and not is_old() and not is_local)
+        or (is_udp and not is_old())
     ):
         return False
     environment[VARIABLES[1 if is_old() else 0]] = str(_PROFILES[is_local, is_udp])

@@ -45,11 +45,40 @@ def test_the_service_of_a_user_of_its_own_has_no_shared_memory():
     assert "<address>127.0.0.1</address>" in profile and "SHM" not in profile
 
 
+@pytest.mark.parametrize("is_old", [False, True])
 @pytest.mark.parametrize(
     "given",
-    [{"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {"FASTDDS_DEFAULT_PROFILES_FILE": "/mine.xml"}],
+    [
+        {"FASTDDS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
+    ],
 )
-def test_where_the_profile_cannot_be_used_it_is_ross_own_variable(given, monkeypatch):
+def test_the_profile_goes_before_one_of_the_users_and_says_so(given, is_old, monkeypatch):
+    """With that one, the bridge's sockets were open to the network."""
+    monkeypatch.setattr(fastdds, "is_old", lambda: is_old)
+    environment = dict(given)
+    ((name, value),) = given.items()
+    said = discovery.use("localhost", environment)
+    assert f"so that {name}={value} is not heeded" in said
+    assert discovery.is_local(environment)
+    assert "/mine.xml" not in environment.values()
+    used = "FASTRTPS" if is_old else "FASTDDS"
+    profile = Path(environment[f"{used}_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<address>127.0.0.1</address>" in profile
+
+
+def test_the_profile_goes_before_one_in_the_working_directory():
+    Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
+    environment = {}
+    said = discovery.use("localhost", environment)
+    assert f"DEFAULT_FASTDDS_PROFILES.xml in {Path.cwd()} is not heeded" in said
+    assert discovery.is_local(environment)
+    assert environment["SKIP_DEFAULT_XML_FILE"] == "1"
+
+
+def test_where_the_profile_cannot_be_used_it_is_ross_own_variable(monkeypatch):
+    given = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
     environment = dict(given)
     assert discovery.use("localhost", environment) == ""
     assert environment == {**given, RANGE: "LOCALHOST"}
