@@ -90,9 +90,8 @@ class Caller:
             self._connection.subscribe([topic_filter], 1, retained=False)
         except RefusedError as error:
             advice = _as_ros_name(topic_filter)
-            raise RefusedError(
-                f"{error}. {advice or f'The ACL line that allows it: pattern read {rule}/#'}"
-            ) from None
+            line = f"The ACL line that allows it: pattern read {rule}/#"
+            raise error.advised(advice or line) from None
         self._listening.add(topic_filter)
 
     def _send(self, topic: str, token: str, payload: bytes, reply: str) -> None:
@@ -107,9 +106,8 @@ class Caller:
             code: ReasonCode = self._connection.publish(to, payload, 1, False, properties)
         except RefusedError as error:
             advice = _as_ros_name(topic)
-            raise RefusedError(
-                f"{error}. {advice or f'The ACL line that allows it: topic write {topic}/#'}"
-            ) from None
+            line = f"The ACL line that allows it: topic write {topic}/#"
+            raise error.advised(advice or line) from None
         if code.value == NO_MATCHING_SUBSCRIBERS:
             raise ClientError(
                 f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
@@ -165,9 +163,8 @@ class Caller:
             self._connection.subscribe(topics, 1, retained=False)
         except RefusedError as error:
             advice = _as_ros_name(f"{action}/_goal")
-            raise RefusedError(
-                f"{error}. {advice or f'The ACL line that allows it: topic read {action}/#'}"
-            ) from None
+            line = f"The ACL line that allows it: topic read {action}/#"
+            raise error.advised(advice or line) from None
         id_ = orjson.loads(self.call(f"{action}/_goal", payload, ANSWER_TIMEOUT))["goal_id"]
         accepted(id_)
         deadline = None if timeout is None else time.monotonic() + timeout

@@ -17,7 +17,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from appliance.logs import VISIBLE_IN_LINES
+from appliance.logs import VISIBLE, VISIBLE_IN_LINES
 
 ANSWER_TIMEOUT = 10.0  # seconds to wait for the broker's answer to a packet that needs one
 
@@ -27,7 +27,40 @@ class ClientError(Exception):
 
 
 class RefusedError(ClientError):
-    """The broker did not allow it; the message says what."""
+    """The broker refused it; the message says what and, if the broker said so, why.
+
+    `by_rules` is whether its access rules may be the reason.
+    """
+
+    def __init__(self, message: str, *, by_rules: bool) -> None:
+        super().__init__(message)
+        self.by_rules = by_rules
+
+    def advised(self, advice: str) -> RefusedError:
+        """With what to do about access rules, where these may be the reason."""
+        return RefusedError(f"{self}. {advice}", by_rules=True) if self.by_rules else self
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the broker said of a packet: a code and, in MQTT 5, perhaps why."""
+
+    code: ReasonCode
+    properties: Properties | None
+
+    def __str__(self) -> str:
+        """In words, without what could command a terminal."""
+        return f"{self.code}: {self.why}" if self.why else str(self.code)
+
+    @property
+    def why(self) -> str:
+        """The server's reason string, if it gave one."""
+        return str(getattr(self.properties, "ReasonString", "")).translate(VISIBLE)
+
+    @property
+    def may_be_rules(self) -> bool:
+        """Whether it may be access rules that refuse it; 3.1.1 has one code for everything."""
+        return self.code.value in (0x80, 0x87)
 
 
 @dataclass(frozen=True)
@@ -115,18 +148,22 @@ class Connection:
         self, target: Target, on_message: Callable[[paho.MQTTMessage], None] = lambda message: None
     ) -> None:
         self._target = target
-        self._answer: ReasonCode | None = None
-        self._granted: dict[int | None, list[ReasonCode]] = {}
-        self._published: dict[int, ReasonCode] = {}
-        self._ended: ReasonCode | None = None
+        self._answer: Answer | None = None
+        self._granted: dict[int | None, list[Answer]] = {}
+        self._published: dict[int, Answer] = {}
+        self._ended: Answer | None = None
         self._client = client = paho.Client(
             CallbackAPIVersion.VERSION2, target.client_id, protocol=target.version
         )
         client.username_pw_set(target.username, target.password)
-        client.on_connect = lambda c, u, flags, reason, p: setattr(self, "_answer", reason)
-        client.on_disconnect = lambda c, u, flags, reason, p: setattr(self, "_ended", reason)
-        client.on_subscribe = lambda c, u, mid, reasons, p: self._granted.update({mid: reasons})
-        client.on_publish = lambda c, u, mid, reason, p: self._published.update({mid: reason})
+        client.on_connect = lambda c, u, flags, code, p: setattr(self, "_answer", Answer(code, p))
+        client.on_disconnect = lambda c, u, flags, code, p: setattr(self, "_ended", Answer(code, p))
+        client.on_subscribe = lambda c, u, mid, codes, p: self._granted.update(
+            {mid: [Answer(code, p) for code in codes]}
+        )
+        client.on_publish = lambda c, u, mid, code, p: self._published.update(
+            {mid: Answer(code, p)}
+        )
         client.on_message = lambda c, u, message: on_message(message)
         context = _tls(target)
         if target.certificate is not None:
@@ -157,9 +194,11 @@ class Connection:
             reason = (error.strerror or str(error)).lower()
             raise ClientError(f"{target.address} cannot be reached: {reason}") from None
         self._wait(lambda: self._answer is not None, "the login")
-        if self._answer is not None and self._answer.is_failure:
+        answer = self._answer
+        if answer is not None and answer.code.is_failure:
             who = f"user {target.username!r}" if target.username else "a client without user name"
-            raise ClientError(f"{target.address} refused {who}: {self._answer} (its log says why)")
+            hint = "" if answer.why else " (its log says why)"
+            raise ClientError(f"{target.address} refused {who}: {answer}{hint}")
 
     def publish(
         self,
@@ -176,10 +215,13 @@ class Connection:
         except ValueError as error:
             raise ClientError(f"{topic!r} cannot be published: {error}") from None
         self._wait(lambda: message.mid in self._published, "a message")
-        reason: ReasonCode = self._published.pop(message.mid)
-        if reason.is_failure:
-            raise RefusedError(f"{topic!r} was refused: {reason}")
-        return reason
+        answer = self._published.pop(message.mid)
+        if answer.code.is_failure:
+            # Of QoS 2 the library tells the end alone, and not the PUBREC that says why.
+            hint = " (--qos 1 tells why)" if qos == 2 and not answer.why else ""
+            text = f"{topic!r} was refused: {answer}{hint}"
+            raise RefusedError(text, by_rules=answer.may_be_rules)
+        return answer.code
 
     def subscribe(self, filters: list[str], qos: int, *, retained: bool = True) -> None:
         """Subscribes to all of the filters; with MQTT 5 also without what is retained there.
@@ -199,12 +241,15 @@ class Connection:
             raise ClientError(f"{', '.join(filters)}: {error}") from None
         self._wait(lambda: mid in self._granted, "the subscription")
         refused = [
-            f"{name!r} was refused: {reason}"
-            for name, reason in zip(filters, self._granted[mid], strict=False)
-            if reason.is_failure
+            (name, answer)
+            for name, answer in zip(filters, self._granted[mid], strict=False)
+            if answer.code.is_failure
         ]
         if refused:
-            raise RefusedError("; ".join(refused))
+            text = "; ".join(f"{name!r} was refused: {answer.code}" for name, answer in refused)
+            why = refused[0][1].why  # one for all of them
+            by_rules = any(answer.may_be_rules for _, answer in refused)
+            raise RefusedError(f"{text}: {why}" if why else text, by_rules=by_rules)
 
     def run(
         self, done: Callable[[], bool], deadline: float | None = None, step: float = 1.0
@@ -219,7 +264,7 @@ class Connection:
             if done():
                 break
             if self._ended is not None or code != MQTTErrorCode.MQTT_ERR_SUCCESS:
-                known = self._ended is not None and self._ended.value >= 0x80
+                known = self._ended is not None and self._ended.code.value >= 0x80
                 why = str(self._ended) if known else "without giving a reason"
                 raise ClientError(f"{self._target.address} ended the connection: {why}")
         return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import socket
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator
@@ -15,6 +16,9 @@ import pytest
 from waiting import PATIENCE
 
 from appliance import certs, cli
+from appliance.mqtt.codec import Property
+from appliance.mqtt.connect import Connack
+from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubcomp, Pubrec, Suback
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
@@ -192,6 +196,89 @@ def test_a_server_that_speaks_no_tls(peer: Peer, capfd: pytest.CaptureFixture[st
     error = capfd.readouterr().err
     assert f"no TLS with localhost:{port}" in error
     assert "is this the port of a listener with tls: true?" in error
+
+
+WORDS = {Property.REASON_STRING: "linear.x is\x1b no number"}
+ACCEPTED = Connack()
+ADVICE = "appliance acl explain"
+
+
+@pytest.mark.parametrize(
+    ("command", "answers", "told", "is_advised"),
+    [
+        (
+            ["pub", "a", "-m", "x"],
+            [ACCEPTED, Puback(1, 0x99, WORDS)],
+            r"'a' was refused: Payload format invalid: linear.x is\x1b no number",
+            False,
+        ),
+        (
+            ["pub", "a", "-m", "x", "-q", "2"],
+            [ACCEPTED, Pubrec(1, 0x97, WORDS), Pubcomp(1, 0x92)],
+            "'a' was refused: Packet identifier not found (--qos 1 tells why)",
+            False,
+        ),
+        (
+            ["pub", "a", "-m", "x"],
+            [ACCEPTED, Puback(1, 0x87, {Property.REASON_STRING: "no rule allows it"})],
+            "'a' was refused: Not authorized: no rule allows it. On the robot, `" + ADVICE,
+            True,
+        ),
+        (
+            ["sub", "a", "b"],
+            [ACCEPTED, Suback(1, [0, 0x97], {Property.REASON_STRING: "'b': no room for it"})],
+            "'b' was refused: Quota exceeded: 'b': no room for it",
+            False,
+        ),
+        (
+            ["sub", "a"],
+            [Connack(False, 0x97, {Property.REASON_STRING: "user 'alice' has 3 sessions"})],
+            "refused user 'alice': Quota exceeded: user 'alice' has 3 sessions\n",
+            False,
+        ),
+        (["sub", "a"], [Connack(False, 0x97)], "Quota exceeded (its log says why)", False),
+        (
+            ["sub", "a"],
+            [ACCEPTED, Disconnect(0x93, {Property.REASON_STRING: "more than 20"})],
+            "ended the connection: Receive maximum exceeded: more than 20",
+            False,
+        ),
+    ],
+    ids=["puback", "pubrec", "puback-acl", "suback", "connack", "connack-silent", "disconnect"],
+)
+def test_the_servers_reason_is_told(
+    peer: Peer,
+    command: list[str],
+    answers: list[Packet],
+    told: str,
+    is_advised: bool,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """And the access rules are named only where they may be the reason."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(peer.directory / "server.crt", peer.directory / "server.key")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+
+        def answer() -> None:
+            client, _ = server.accept()
+            client.settimeout(PATIENCE)
+            with context.wrap_socket(client, server_side=True) as secured:
+                for packet in answers:
+                    if secured.recv(65536):
+                        secured.sendall(packet.encode(5))
+                while secured.recv(65536):
+                    pass
+
+        thread = Thread(target=answer)
+        thread.start()
+        name, *rest = command
+        port = ["-p", str(server.getsockname()[1])]
+        assert run(peer.arguments(name, *rest, *port)) == 1
+        thread.join(PATIENCE)
+    error = capfd.readouterr().err
+    assert told in error
+    assert (ADVICE in error) is is_advised
 
 
 def test_a_certificate_without_its_key(

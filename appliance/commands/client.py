@@ -48,7 +48,7 @@ def pub(
     try:
         client.publish(connection.target(), topic, payloads, qos, retain)
     except client.RefusedError as error:
-        raise CommandError(f"{error}. {_EXPLAINED}") from None
+        raise CommandError(str(error.advised(_EXPLAINED))) from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
 
@@ -83,7 +83,7 @@ def sub(
             timeout=timeout,
         )
     except client.RefusedError as error:
-        raise CommandError(f"{error}. {_EXPLAINED}") from None
+        raise CommandError(str(error.advised(_EXPLAINED))) from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
     if count is not None and received < count:
