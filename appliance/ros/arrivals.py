@@ -49,6 +49,12 @@ from appliance.mqtt.codec import Properties, Property, quote
 #: The user property that says when a command was made.
 SENT_AT = "sent-at"
 
+#: What it may look like.
+_FORMS = "seconds since 1970 (1780000000.25) or RFC 3339 (2026-05-28T20:26:40.25Z)"
+
+#: Numbers from which on it is no second that anybody means: the year 5138, and thousands of it.
+_UNITS = ((1e17, "nanoseconds"), (1e14, "microseconds"), (1e11, "milliseconds"))
+
 #: Seconds that a client's clock may be ahead of ours; a command may be older by as much.
 AHEAD = 0.25
 
@@ -189,11 +195,20 @@ def sent_at(properties: Properties | None) -> float | None:
         return None
     if len(said) > 1:
         raise ValueError(f"it says {SENT_AT} {len(said)} times")
-    problem = f"its {SENT_AT} is {quote(said[0][:40])}, no RFC 3339 and no seconds since 1970"
+    problem = f"its {SENT_AT} is {quote(said[0][:40])}"
     try:
-        return _seconds(said[0])
-    except (ValueError, OverflowError):
-        raise ValueError(problem) from None
+        seconds = _seconds(said[0])
+    except (ValueError, OverflowError) as error:
+        what = str(error) if isinstance(error, _NoZoneError) else f"it takes {_FORMS}"
+        raise ValueError(f"{problem}: {what}") from None
+    for limit, unit in _UNITS:
+        if seconds >= limit:
+            raise ValueError(f"{problem}: that looks like {unit}, and it is in seconds")
+    return seconds
+
+
+class _NoZoneError(ValueError):
+    """A date and a time that could be anywhere."""
 
 
 def _seconds(text: str) -> float:
@@ -211,6 +226,8 @@ def _seconds(text: str) -> float:
     elif head.endswith("Z"):
         head, rest = head[:-1], "Z"
     moment = datetime.fromisoformat(head + rest.replace("Z", "+00:00"))
+    if moment.tzinfo is None and ":" in head:
+        raise _NoZoneError("without its time zone: add Z for UTC, or such as +02:00")
     if moment.tzinfo is None or "T" not in text.upper().replace(" ", "T"):
         raise ValueError
     return moment.astimezone(timezone.utc).timestamp()

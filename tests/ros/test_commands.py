@@ -1280,6 +1280,25 @@ def test_sent_at_of_another_form(text):
         sent_at(said(text))
 
 
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("1780000000250", "'1780000000250': that looks like milliseconds, and it is in seconds"),
+        ("1780000000250.5", "that looks like milliseconds"),
+        ("1780000000250000", "that looks like microseconds"),
+        ("1780000000250000000", "that looks like nanoseconds"),
+        ("2026-05-28T20:26:40", "without its time zone: .*Z for UTC, or such as \\+02:00"),
+        ("2026-05-28T20:26:40.5", "without its time zone"),
+        ("yesterday", "seconds since 1970 .1780000000.25. or RFC 3339 .2026-05-28T20:26:40.25Z."),
+        ("2026-05-28", "seconds since 1970 .1780000000.25. or RFC 3339"),
+        ("9" * 41, "seconds since 1970 .1780000000.25. or RFC 3339"),
+    ],
+)
+def test_a_wrong_sent_at_is_told_with_what_is_right(text, advice):
+    with pytest.raises(ValueError, match=f"its sent-at is .*{advice}"):
+        sent_at(said(text))
+
+
 def test_sent_at_is_said_once_or_not_at_all():
     assert sent_at(None) is sent_at({}) is sent_at(said()) is None
     with pytest.raises(ValueError, match="it says sent-at 2 times"):
@@ -1707,7 +1726,7 @@ async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(house):
     assert say(-1) == 0x83
     assert "in the future: set the clocks" in house.counters().last_error
     driver.drive(qos=2, properties=said("yesterday"))
-    assert driver.wire.written.endswith(b"no RFC 3339 and no seconds since 1970")
+    assert driver.wire.written.endswith(b"(1780000000.25) or RFC 3339 (2026-05-28T20:26:40.25Z)")
 
 
 async def test_a_message_expiry_that_is_left_proves_nothing(house):
