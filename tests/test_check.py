@@ -15,6 +15,7 @@ from appliance.init import initialise
 from appliance.ros import ros2
 
 TWIST = "geometry_msgs/msg/Twist"
+VECTOR = "geometry_msgs/msg/Vector3"
 
 
 @pytest.fixture
@@ -51,13 +52,9 @@ def found(here: Path, bridge: dict[str, Any] | None = None, **broker: Any) -> li
             "error",
             "on_silence.publish: liner: unknown field; did you mean 'linear'?",
         ),
-        ({"to": "ros", "type": TWIST, "clamp": {"linear.w": [0, 1]}}, "error", "no field 'w'"),
-        ({"to": "ros", "type": TWIST, "allow": {"linear.x": ["a"]}}, "error", "not a number"),
-        (
-            {"to": "ros", "type": TWIST, "clamp": {"linear.x": [0, 1]}, "allow": {"linear.z": [0]}},
-            "",
-            "",
-        ),
+        ({"to": "ros", "type": VECTOR, "clamp": {"w": [0, 1]}}, "error", "no field 'w'"),
+        ({"to": "ros", "type": VECTOR, "allow": {"x": ["a"]}}, "error", "not a number"),
+        ({"to": "ros", "type": VECTOR, "clamp": {"x": [0, 1]}, "allow": {"z": [0]}}, "", ""),
     ],
 )
 def test_routes(here: Path, route: dict[str, Any], level: str, text: str) -> None:
@@ -112,6 +109,103 @@ def test_without_ros_it_says_what_was_not_looked_at(
     assert not [each for each in told if each.subject == "route /a"]
 
 
+def test_all_mistakes_of_a_route_are_told(here: Path) -> None:
+    pytest.importorskip("rclpy")
+    route = {
+        "ros": "/a",
+        "to": "ros",
+        "type": TWIST,
+        "encoding": "text",
+        "clamp": {"linear.w": [0, 1], "angular.z": [0, 1]},
+        "allow": {"linear.v": [0]},
+        "on_silence": {"after": "1 s", "publish": {"liner": {}}},
+    }
+    told = found(here, {"topics": [route]})
+    texts = [each.text for each in told if each.subject == "route /a" and each.level == "error"]
+    assert len(texts) == 4, texts
+    for text, part in zip(texts, ("as text", "'w'", "'v'", "'linear'?"), strict=True):
+        assert part in text
+    route = {"ros": "/a", "to": "mqtt", "type": TWIST, "fields": ["liner.x", "linear.w"]}
+    told = found(here, {"topics": [route]})
+    assert len([each for each in told if each.subject == "route /a"]) == 2
+
+
+SAFE = {"expire": "500 ms", "on_silence": {"after": "500 ms"}}
+
+
+@pytest.mark.parametrize("bus", ["ros2", "ros1"])
+@pytest.mark.parametrize(
+    ("route", "level", "text"),
+    [
+        (SAFE, "", ""),
+        ({"on_silence": {"after": "500 ms"}}, "", ""),
+        ({"expire": "500 ms"}, "warning", "add: on_silence: {after: 500 ms}"),
+        ({"ros": "/arm/cmd_vel", "type": None, "expire": "1 s"}, "warning", "add: on_silence"),
+        ({"type": "std_msgs/msg/String"}, "", ""),
+        ({"to": "mqtt"}, "", ""),
+        ({**SAFE, "on_silence": {"after": "5 min"}}, "warning", "may drive on for 300 s"),
+        ({**SAFE, "expire": "5 min"}, "warning", "may drive on for 300 s"),
+        ({**SAFE, "lease": "2 s"}, "warning", "no effect without exclusive: true"),
+        ({**SAFE, "lease": "2 s", "exclusive": True}, "", ""),
+        (
+            {**SAFE, "on_silence": {"after": "1 s", "publish": {"linear": {"x": 0.1}}}},
+            "error",
+            "this stop message drives",
+        ),
+        ({**SAFE, "on_silence": {"after": "1 s", "publish": {"linear": {"x": 0.0}}}}, "", ""),
+        (
+            {
+                "type": "std_msgs/msg/Float64",
+                "on_silence": {"after": "1 s", "publish": {"data": 1}},
+            },
+            "",
+            "",
+        ),
+    ],
+)
+def test_what_lets_a_robot_drive_on(
+    here: Path, bus: str, route: dict[str, Any], level: str, text: str
+) -> None:
+    said = {"ros": "/a", "to": "ros", "type": TWIST, **route}
+    said = {key: value for key, value in said.items() if value is not None}
+    told = found(here, {"bus": bus, "topics": [said]})
+    findings = [each for each in told if each.subject == f"route {said['ros']}"]
+    findings = [each for each in findings if each.level != "ok"]
+    assert [each.level for each in findings] == ([level] if level else []), findings
+    assert all(text in each.text for each in findings), findings
+
+
+def test_a_route_that_drives_and_has_no_rules(here: Path) -> None:
+    told = found(here, {"topics": [{"ros": "/a", "to": "ros", "type": TWIST}]})
+    texts = [each.text for each in told if each.subject == "route /a"]
+    assert len(texts) == 2 and "add: on_silence" in texts[0] and "add: expire" in texts[1]
+
+
+@pytest.mark.parametrize(
+    ("limit", "is_told"),
+    [
+        ({"allow": {"linear.x": [0.5]}}, True),
+        ({"allow": {"linear.x": [0, 0.5]}}, False),
+        ({"clamp": {"linear.x": [0.2, 0.5]}}, True),
+        ({"clamp": {"linear.x": [-0.2, 0.5]}}, False),
+    ],
+)
+def test_limits_that_exclude_the_stop_message(
+    here: Path, limit: dict[str, Any], is_told: bool
+) -> None:
+    pytest.importorskip("rclpy")
+    told = found(here, {"topics": [{"ros": "/a", "to": "ros", "type": TWIST, **SAFE, **limit}]})
+    findings = [each for each in told if each.subject == "route /a"]
+    assert [each.level for each in findings] == ["warning"] * is_told, findings
+    assert all("against the route's own stop message" in each.text for each in findings)
+
+
+def test_rules_for_nobody(here: Path) -> None:
+    (here / "acl.conf").write_text("user alice\ntopic read a\nuser bob\ntopic read a\ntopic b\n")
+    (finding,) = [each for each in found(here) if "no user" in each.text]
+    assert finding.subject == "acl.conf:4" and "'bob'" in finding.text
+
+
 def test_rules_that_name_nothing(here: Path) -> None:
     (here / "acl.conf").write_text(
         "user alice\n"
@@ -137,9 +231,12 @@ def test_who_may_command(here: Path) -> None:
     topics.append({"ros": "/c", "to": "mqtt"})
     told = {each.subject: each for each in found(here, {"topics": topics})}
     assert told["/a ← r2/a"].level == "ok"
-    assert "written by alice" in told["/a ← r2/a"].text
-    assert "not by bob" in told["/a ← r2/a"].text
+    assert told["/a ← r2/a"].text == (
+        "alice may send to it; bob may not. To let bob send to it, add to acl.conf below the line "
+        "`user bob`: topic write {robot}/a"
+    )
     assert told["/b ← r2/b"].level == "warning"
+    assert "no user may send to it. To let alice send to it, add" in told["/b ← r2/b"].text
     assert told["/b ← r2/b"].text.endswith("topic write {robot}/b")
     assert not [subject for subject in told if "r2/c" in subject]
     # The line that it names does it.

@@ -184,6 +184,19 @@ def test_what_is_not_a_configuration_at_all(text: str, place: str) -> None:
     assert place in problems(text)[0]
 
 
+@pytest.mark.parametrize(
+    ("line", "example"),
+    [
+        ("on_silence: 500 ms", "on_silence: {after: 500 ms}"),
+        ("clamp: [-1, 1]", "clamp: {linear.x: [-0.5, 0.5]}"),
+        ("on_silence: {after: 1 s, publish: 0}", "publish: {linear: {x: 0}}"),
+    ],
+)
+def test_a_value_where_keys_belong_is_told_with_an_example(line: str, example: str) -> None:
+    (problem,) = problems(f"bridge:\n  topics:\n    - ros: /a\n      to: ros\n      {line}\n")
+    assert f"must be keys with values, such as `{example}`" in problem
+
+
 def test_rules_of_commands() -> None:
     text = """\
 bridge:

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator
 
 from appliance import wiring
+from appliance.check.commands import commands, stop_message
 from appliance.check.finding import Finding
 from appliance.config import Settings
 from appliance.ros import discovery, installation, ros1, ros2
@@ -22,6 +23,7 @@ from appliance.ros.definitions import UnknownTypeError, describe
 from appliance.ros.graph import CallRoutes
 from appliance.ros.payloads import RAW
 from appliance.ros.payloads import check as check_encoding
+from appliance.ros.rules import CommandRules
 
 
 def bridge(settings: Settings) -> Iterator[Finding]:
@@ -45,8 +47,10 @@ def bridge(settings: Settings) -> Iterator[Finding]:
         if is_available:
             text = "types, fields and stop messages of routes are not checked for ROS 1"
             yield Finding("ok", "bridge", text)
+        yield from commands(settings)
         return
     yield from _bus(settings)
+    yield from commands(settings)
     if is_available:
         yield from _topics(wiring.routes(settings))
         yield from _calls(wiring.call_routes(settings))
@@ -77,18 +81,36 @@ def _topics(routes: list[RouteSettings]) -> Iterator[Finding]:
                 yield Finding("ok", ", ".join(route.names), text)
             continue
 
-        def look(route: RouteSettings = route, type_name: str = type_name) -> None:
-            if route.encoding in RAW and route.rules is None:
-                converters.get(type_name)
-                return
-            converter = converters.get(type_name, route.fields)
-            for direction in ("mqtt", "ros"):
-                if route.to in (direction, "both"):
-                    check_encoding(converter, route.encoding, to_ros=direction == "ros")
-            if route.rules is not None:
-                check_rules(route.rules, converters.get(type_name))
+        subject = ", ".join(route.names)
+        told = list(_looked_at(subject, type_name, functools.partial(converters.get, type_name)))
+        if not told:  # that there is none would be told by each
+            for look in _looks(route, type_name, converters):
+                told += _looked_at(subject, type_name, look)
+        yield from dict.fromkeys(told)
+        if route.rules is not None and not told:
+            text = stop_message(route.rules, converters.get(type_name))
+            if text:
+                yield Finding("warning", f"route {subject}", text)
 
-        yield from _looked_at(", ".join(route.names), type_name, look)
+
+def _looks(
+    route: RouteSettings, type_name: str, converters: Converters
+) -> Iterator[Callable[[], object]]:
+    """What raises an error for a mistake in the route, each for one."""
+    if route.encoding not in RAW or route.rules is not None:
+        for field in route.fields:
+            yield functools.partial(converters.get, type_name, (field,))
+        for direction in ("mqtt", "ros"):
+            if route.to in (direction, "both"):
+                converter = converters.get(type_name)
+                to_ros = direction == "ros"
+                yield functools.partial(check_encoding, converter, route.encoding, to_ros=to_ros)
+    if route.rules is not None:
+        converter, rules = converters.get(type_name), route.rules
+        parts = [CommandRules(clamp=(one,)) for one in rules.clamp]
+        parts += [CommandRules(allow=(one,)) for one in rules.allow]
+        for part in (*parts, CommandRules(on_silence=rules.on_silence)):
+            yield functools.partial(check_rules, part, converter)
 
 
 def _calls(routes: CallRoutes) -> Iterator[Finding]:

@@ -52,13 +52,14 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
     others = [name for name in users if name not in may]
     subject = f"{ros} ← {topic}"
     line = f"topic {Permission.WRITE.name.lower()} {_written(topic, settings.robot)}"
-    if not may:
-        text = f"nobody may write it; in {settings.broker.acl.name}, below `user {others[0]}`, "
-        return Finding("warning", subject, f"{text}this line lets {others[0]}: {line}")
-    text = f"may be written by {_named(may)}"
+    who = _named(may) if may else "no user"
+    text = f"{who} may send to it"
     if others:
-        text += f"; not by {_named(others)}, whom this line below `user NAME` lets: {line}"
-    return Finding("ok", subject, text)
+        text += (
+            f"{f'; {_named(others)} may not' if may else ''}. To let {others[0]} send to it, add "
+        )
+        text += f"to {settings.broker.acl.name} below the line `user {others[0]}`: {line}"
+    return Finding("ok" if may else "warning", subject, text)
 
 
 def _written(topic: str, robot: str) -> str:

@@ -98,8 +98,13 @@ def _access(settings: Settings) -> Iterator[Finding]:
         yield from rights(settings, rules, users)
     others = broker.plugins or broker.tls.username_from != "none"  # they may know more
     if rules is not None and users is not None and not others:
-        for name in sorted({rule.user for rule in rules.rules if rule.user} - set(users)):
-            yield Finding("warning", str(broker.acl), f"rules for {name!r}, who is no user")
+        strangers = {rule.user: rule for rule in reversed(rules.rules) if rule.user not in users}
+        for name, first in strangers.items():
+            if name:
+                text = (
+                    f"rules for {name!r}, who is no user: a slip? Else: appliance user add {name}"
+                )
+                yield Finding("warning", f"{first.file}:{first.line}", text)
 
 
 def _store(settings: Settings) -> Iterator[Finding]:

@@ -270,6 +270,16 @@ _PLAIN = {
 }
 
 
+#: What sections look like that are easily taken for a value.
+_EXAMPLES = {
+    "allow": "{linear.z: [0]}",
+    "clamp": "{linear.x: [-0.5, 0.5]}",
+    "on_error": "{success: false}",
+    "on_silence": "{after: 500 ms}",
+    "publish": "{linear: {x: 0}}",
+}
+
+
 _BOUNDS = {
     "greater_than": ("gt", "must be more than"),
     "greater_than_equal": ("ge", "must be at least"),
@@ -298,6 +308,8 @@ def _explain(detail: ErrorDetails, written: str | None) -> str:
         what = f"must have at least {context['min_length']}"
     else:
         what = _PLAIN.get(kind, detail["msg"])
+        if kind in ("dict_type", "model_type") and path[-1] in _EXAMPLES:
+            what += f", such as `{path[-1]}: {_EXAMPLES[str(path[-1])]}`"
     return what if written is None else f"{what} (it says {mask(path, written)!r})"
 
 
