@@ -411,7 +411,7 @@ class App:
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
         if not changed and self._reload.last_change:  # mostly by itself, before anybody could ask
-            return [f"nothing has changed since the last time: {self._reload.last_change}"]
+            return [f"nothing has changed since the last reload, {self._reload.last_change}"]
         return changed
 
     async def _answer_routes(self) -> list[dict[str, object]]:

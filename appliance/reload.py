@@ -130,7 +130,7 @@ class Reload:
                 raise
             text = ", ".join(changed) or "nothing has changed"
             if changed:
-                self.last_change = f"at {datetime.now():%H:%M:%S}, {text}"
+                self.last_change = f"which was at {datetime.now():%H:%M:%S}: {text}"
             self._ended(True, text)
             log.info("reloaded: %s", text)
             return changed

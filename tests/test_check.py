@@ -269,3 +269,10 @@ def test_plugins_settings(
     ]
     assert finding.level == level
     assert text in finding.text and "hunter2" not in finding.text
+
+
+def test_what_a_listener_for_websocket_is_for(here: Path) -> None:
+    listeners = [{"bind": "127.0.0.1:8080", "protocol": "websocket"}, {"bind": "127.0.0.1:1883"}]
+    told = [each for each in found(here, listeners=listeners) if "WebSocket" in each.text]
+    assert [each.subject for each in told] == ["listener 127.0.0.1:8080"]
+    assert "ws://HOST:PORT/mqtt" in told[0].text and "plain MQTT is refused" in told[0].text

@@ -138,7 +138,9 @@ def test_the_command_tells_what_has_changed(robot: ApplianceProcess) -> None:
         assert answer.reason_code == ReasonCode.MALFORMED_PACKET
     (again,) = reload(robot)
     assert re.fullmatch(
-        r"nothing has changed since the last time: at \d\d:\d\d:\d\d, " + ", ".join(told), again
+        r"nothing has changed since the last reload, which was at \d\d:\d\d:\d\d: "
+        + ", ".join(told),
+        again,
     )
 
 

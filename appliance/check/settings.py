@@ -56,6 +56,10 @@ def _warnings() -> Iterator[list[Finding]]:
 def _listeners(settings: Settings) -> Iterator[Finding]:
     for listener in settings.broker.listeners:
         subject = f"listener {listener.bind}"
+        if listener.protocol == "websocket":
+            scheme = "wss" if listener.tls else "ws"
+            text = f"for WebSocket only ({scheme}://HOST:PORT/mqtt): plain MQTT is refused here"
+            yield Finding("ok", subject, text)
         if listener.tls:
             yield Finding("ok", subject, "TLS")
         elif listener.bind.loopback:

@@ -348,6 +348,11 @@ class Connection:
                 ReasonCode.MALFORMED_PACKET,
                 "what it sends is TLS; is it meant for the listener with tls: true?",
             )
+        if self.state is State.NEW and first == 0x47:  # the G of GET
+            raise ProtocolError(
+                ReasonCode.MALFORMED_PACKET,
+                "what it sends is HTTP; is it meant for a listener with protocol: websocket?",
+            )
         if kind in _FLAGLESS and first & 0x0F:
             # Said of these before that they may not come at all, as mosquitto does.
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a {kind.name} with reserved flags")

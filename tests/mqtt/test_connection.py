@@ -548,3 +548,15 @@ def test_zeros_are_no_packet_in_any_state(data):
     for connection in (Connection(SIZE, ALIASES), connected(4), connected(5)):
         found = said(connection, [data, data])
         assert found == [ReasonCode.PROTOCOL_ERROR]
+
+
+@pytest.mark.parametrize(
+    ("sent", "hint"),
+    [
+        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc", "listener with tls: true"),
+        (b"GET /mqtt HTTP/1.1\r\n", "listener with protocol: websocket"),
+    ],
+)
+def test_who_comes_to_the_wrong_listener_is_told_to_the_log(sent: bytes, hint: str) -> None:
+    with pytest.raises(ProtocolError, match=hint):
+        list(Connection(SIZE, ALIASES).receive_data(sent))
