@@ -412,6 +412,7 @@ class ClientProtocol:
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
+            self._client.inflow.not_read(self._loop.time())
             self._transport.pause_reading()
 
     def _read_on(self) -> None:
@@ -437,6 +438,15 @@ class ClientProtocol:
             self._in_turn = False
             self._read_later()
         else:
+            inflow = self._client.inflow
+            inflow.read(self._loop.time())
+            # What TLS has kept meanwhile is not seen like this.
+            if (
+                inflow.is_behind
+                and self._tls is None
+                and not contact(self._transport.get_extra_info("socket")).has_unread
+            ):
+                inflow.has_caught_up()
             self._transport.resume_reading()
 
     def _send_on(self) -> None:
@@ -461,6 +471,8 @@ class ClientProtocol:
         ledger = self._ledger
         grown = size - self._frame
         self._frame = size
+        if size and not self._client.inflow.unfinished:
+            self._client.inflow.unfinished = ledger.now
         ledger.take(self.account, grown)
         if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
             reason = (
@@ -722,8 +734,12 @@ class ClientProtocol:
         if self._transport is None:
             return HERE
         known = contact(self._transport.get_extra_info("socket"))
-        waits = bool(self._held) or self._sends_on
-        return replace(known, has_unread=True) if waits else known
+        has_unread = known.has_unread or bool(self._held) or self._sends_on
+        now = self._ledger.now  # of the chunk that is being taken in, if one is
+        inflow = self._client.inflow
+        held = inflow.held(now, has_unread=has_unread)
+        flowing = inflow.flowing(now)
+        return replace(known, has_unread=has_unread, flowing=flowing, held=held)
 
     def probe(self) -> None:
         """Have it answer within two seconds, if it can."""

@@ -9,9 +9,10 @@ import time
 
 import pytest
 from house import House
+from waiting import until
 
 from appliance.broker.ports import HERE, Contact
-from appliance.mqtt.packets import Pingreq, Pingresp, Subscribe, Subscription
+from appliance.mqtt.packets import Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.sockets import Probe, contact
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_INFO"), reason="only Linux tells")
@@ -108,3 +109,59 @@ def test_a_unix_socket_is_on_this_computer():
         far.send(b"x")
         assert contact(near).has_unread
         Probe(near).end()
+
+
+class Watches:
+    """Does something with each message that comes."""
+
+    def __init__(self, house, published):
+        house.broker.observer = self
+        self._published = published
+
+    def published(self, session, message):
+        self._published(message)
+
+    def disconnected(self, session):
+        """That is of no interest."""
+
+
+@pytest.mark.parametrize("in_a_frame", [False, True])
+async def test_a_packet_is_as_old_as_its_first_byte(house, in_a_frame):
+    caller = await house.join("a")
+    heard = []
+    Watches(house, lambda message: heard.append((message.payload, message.age)))
+    packet, behind = (Publish("x", payload).encode(5) for payload in (b"late", b"new"))
+    begun = time.monotonic()
+    if in_a_frame:  # which is kept until it has come
+        house.protocol("a").keep(9)
+        house.protocol("a").keep(10)
+        await asyncio.sleep(0.5)
+        house.protocol("a").keep(0)
+        parts = [packet + behind, behind]
+    else:
+        parts = [packet[:3], packet[3:6], packet[6:] + behind, behind]
+    for part in parts:
+        caller.writer.write(part)
+        await asyncio.sleep(0.25)
+    took = time.monotonic() - begun
+    await until(lambda: len(heard) >= 3)
+    assert heard[0][0] == b"late" and 0.3 < heard[0][1] <= took
+    # Behind it in the same chunk, or in one of its own.
+    assert heard[1:] == [(b"new", 0.0)] * 2
+
+
+async def test_what_was_not_read_for_a_time_is_told(house):
+    caller = await house.join("a")
+    wire = house.protocol("a")
+    held = []
+    Watches(house, lambda message: held.append(wire.contact().held))
+    await caller.say(Publish("x", b""))
+    await until(lambda: len(held) == 1)
+    wire._rest(0.3)
+    await caller.say(Publish("x", b""))
+    await until(lambda: len(held) == 2)
+    await caller.say(Publish("x", b""))
+    await until(lambda: len(held) == 3)
+    assert held[0] < 0.2  # the login
+    assert held[1] > 0.29
+    assert held[2] == 0

@@ -702,7 +702,7 @@ class Broker:
         self.counters.effort += HELD_EFFORT
         message, full, _ = held
         if age > LATE:
-            message = Late(message, max(age, message.age))
+            message = Late(message, age + message.age)
         if self.ledger.has_expired(message):
             return
         try:

@@ -9,7 +9,7 @@ import logging
 import math
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
 from appliance.broker.backpressure import (
@@ -26,6 +26,7 @@ from appliance.broker.handshake import (
     maximum_packet_size,
     pending_will,
 )
+from appliance.broker.inflow import Inflow
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import OVERHEAD, Late, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
@@ -119,6 +120,8 @@ class Client:
         self.connection = Connection(limits.packet_size, limits.topic_alias, limits.user_properties)
         self.output = Output(broker, wire, self)
         self.session: Session | None = None
+        #: When what it publishes has come.
+        self.inflow = Inflow()
         self._router = broker.router
         self._ledger = broker.ledger
         self._counters = broker.counters
@@ -175,10 +178,18 @@ class Client:
         now = self._ledger.now
         connection = self.connection
         effort = counters.effort + EFFORT_A_TURN
+        inflow = self.inflow
+        if inflow.is_watched:
+            inflow.came(data, now)
         try:
-            for event in (
-                self._passing(data, effort) if self._behind else connection.receive_data(data)
-            ):
+            events: Iterable[Event]
+            if inflow.unfinished and now - inflow.unfinished > LATE:
+                events = self._completing(data, effort)
+            elif self._behind:
+                events = self._passing(data, effort)
+            else:
+                events = connection.receive_data(data)
+            for event in events:
                 self._heard_at = now  # complete packets count, dripping bytes do not
                 if type(event) is tuple:
                     self._on_raw_publish(event)
@@ -206,8 +217,28 @@ class Client:
             self.wire.stop_reading()
         if self._store.fresh:
             self._depend()
-        if connection.held + self._behind_size != self._held:
+        held = connection.held
+        if held or inflow.unfinished:
+            self._note_unfinished(now)
+        if held + self._behind_size != self._held:
             self._count_held()
+
+    def _note_unfinished(self, now: float) -> None:
+        """Know when a packet that is not whole began to come."""
+        inflow = self.inflow
+        if not self.connection.unfinished:
+            inflow.unfinished = 0.0
+        elif not inflow.unfinished or self._heard_at == now:
+            inflow.unfinished = now
+
+    def _completing(self, data: bytes, effort: int) -> Iterator[Event]:
+        """What comes in; what has come in parts, slowly, is as old as the first of them."""
+        came_at, self._came_at = self._came_at, self.inflow.unfinished
+        connection = self.connection
+        for event in self._passing(data, effort) if self._behind else connection.receive_data(data):
+            yield event
+            self._came_at = came_at
+        self._came_at = came_at
 
     def _depend(self) -> None:
         """What it was just answered depends on what was just staged."""
@@ -268,7 +299,7 @@ class Client:
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
         if first & 8 or (self._came_at and self._is_old()):
-            message = Late(message, math.inf)
+            message = Late(message, math.inf if first & 8 else self._age())
         else:
             # What came in is what goes out to a receiver with the same version, QoS and flags:
             # its bytes are taken over instead of being encoded again.
@@ -304,7 +335,7 @@ class Client:
             properties_wire=packet.passed_on,
         )
         if packet.dup or (self._came_at and self._is_old()):
-            message = Late(message, math.inf)
+            message = Late(message, math.inf if packet.dup else self._age())
         route = self._router.route(session, message.topic_wire)
         if route.undecided and self._hold(route, len(packet.payload), self._on_publish, packet):
             return
@@ -410,6 +441,10 @@ class Client:
     def _is_old(self) -> bool:
         """Whether what had to wait did so for long: who does not carry out what is old is told."""
         return self._ledger.now - self._came_at > LATE
+
+    def _age(self) -> float:
+        """How old what is done now is: of what had to wait, nobody knows for how long it had."""
+        return self._ledger.now - self._came_at if self.inflow.unfinished else math.inf
 
     def _wake(self) -> None:
         """Somebody has answered what a packet waits for."""

@@ -95,11 +95,16 @@ class Contact:
 
     `silence` is how long nothing has come from it, not even an acknowledgement of the network's;
     infinity where that cannot be known. `has_unread`: bytes have come that were not looked at yet.
+    `flowing` is for how long it has sent without a pause, `held` for how long what it sends now may
+    have waited in here, as it was not read. `unheard`: it has sent nothing new for so long.
     """
 
     round_trip: float = 0.0
     silence: float = 0.0
     has_unread: bool = False
+    flowing: float = 0.0
+    held: float = 0.0
+    unheard: float = 0.0
 
 
 #: What is on this computer is there as long as its connection is.

@@ -167,6 +167,11 @@ class Connection:
         return self._have + self._connecting + self._aliased
 
     @property
+    def unfinished(self) -> bool:
+        """Whether a packet has come in part, and nothing else is kept."""
+        return self._have > 0 and self._reading
+
+    @property
     def paused(self) -> bool:
         """Whether what comes is kept until `accept` or `resume`."""
         return not self._reading and self.state is not State.CLOSED

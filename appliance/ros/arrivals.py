@@ -22,6 +22,11 @@ A Message Expiry Interval that is left proves nothing: it counts down in servers
 client's queue. A message that stops the robot is carried out though it is old, see
 `Commands`, and shows all the same that what comes behind it is a queue.
 
+A client has one queue for all that it sends: what is known of it holds for all its topics, and two
+commands have a pause between them only when all of its messages have one. What the appliance has
+not read for longer than `oldest` is a new beginning; of what came since, the appliance cannot tell
+when. A command that comes in parts is as old as its first byte.
+
 A queue ends by a silence or by that pace, never by a time: a stream that is faster than `BURST`
 allows (125 Hz; QoS 2: 33 Hz without round trips) is never carried out without `sent-at`.
 
@@ -39,10 +44,12 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
+from typing import Protocol
 
+from appliance.broker.ports import HERE, Contact
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, quote
 
@@ -100,26 +107,74 @@ class _Pace:
     is_waiting: bool = False
     is_queue: bool = False
     is_known: bool = False
+    #: Whether what came last may have waited in here for too long.
+    was_held: bool = False
+    #: Of the message that came last.
+    number: int = -1
+    verdict: Verdict = Verdict.CARRY_OUT
+    #: Where a first command waits.
+    holders: list[Holder] = field(default_factory=list)
     withheld_until: float = -math.inf
 
 
+class Holder(Protocol):
+    """A route that lets first commands wait."""
+
+    def drop_waiting(self, origin: Session, why: str) -> None:
+        """What waits of the session is not carried out: it is of a queue."""
+
+
 class Arrivals:
-    """The commands of all clients to one topic, as they come; times in seconds."""
+    """The commands of all clients to all topics, as they come; times in seconds.
+
+    A client has one queue for all topics: what is known of it by one route holds for the others.
+    """
 
     def __init__(self) -> None:
         self._paces: dict[Session, _Pace] = {}
         self._expected: OrderedDict[str, None] = OrderedDict()
 
-    def judge(self, origin: Session, qos: int, oldest: float, now: float) -> Verdict:
-        """What to do with a command of unknown age that has come now."""
+    def judge(
+        self, origin: Session, qos: int, oldest: float, now: float, number: int = -1
+    ) -> Verdict:
+        """What to do with a command of unknown age that has come now.
+
+        `number` is the message's, which may have several routes; -1 when it is not known.
+        """
         pace = self._paces.get(origin)
-        if pace is None or now - pace.last > oldest:
-            return self._begin(origin, oldest, now)
+        if pace is not None and pace.number == number >= 0:
+            return pace.verdict
+        verdict = self._judge(pace, origin, qos, oldest, now)
+        pace = self._paces[origin]
+        pace.number, pace.verdict = number, verdict
+        if pace.is_queue:
+            self._drop(pace, origin, "another followed at once")
+        return verdict
+
+    def _judge(
+        self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
+    ) -> Verdict:
+        contact = _contact(origin)
+        was_held = pace is not None and pace.was_held
+        is_held = contact.held > oldest
+        if pace is None or now - pace.last > oldest or (is_held and not was_held):
+            verdict = self._begin(origin, oldest, now)
+            pace = self._paces[origin]
+            if is_held and contact.unheard > oldest:
+                pace.is_queue, pace.is_waiting, verdict = True, False, Verdict.REFUSE
+            pace.was_held = is_held
+            return verdict
         gap = now - pace.last
         pace.last = now
+        if is_held:
+            pace.is_queue, pace.is_waiting, pace.steady = True, False, 0
+            return Verdict.REFUSE
+        pace.was_held = False
         if pace.is_known:
             return Verdict.CARRY_OUT
-        is_steady = gap >= (BURST_QOS_2 + 2 * _round_trip(origin) if qos == 2 else BURST)
+        burst = BURST_QOS_2 + 2 * contact.round_trip if qos == 2 else BURST
+        # Other messages may come between the two, and all of them without a pause.
+        is_steady = gap >= burst and contact.flowing < gap
         pace.steady = pace.steady + 1 if is_steady else 0
         if qos == 1 and pace.steady and now > pace.withheld_until:
             # It may have waited for what it was sent meanwhile.
@@ -153,17 +208,36 @@ class Arrivals:
 
     def waiting_time(self, origin: Session, oldest: float) -> float:
         """Seconds that a first command waits: until then the next of a queue would have come."""
-        return min(WAIT + 2 * _round_trip(origin), oldest)
+        return min(WAIT + 2 * _contact(origin).round_trip, oldest)
+
+    def look(self, origin: Session, oldest: float, now: float) -> None:
+        """A command of QoS 2 has come, that is not released yet: was it held in here?"""
+        pace = self._paces.get(origin)
+        if pace is not None and _contact(origin).held > oldest:
+            self._judge(pace, origin, 2, oldest, now)
 
     def is_old(self, origin: Session, now: float) -> None:
         """A command has come that is known to be old: the next ones were queued behind it."""
+        pace = self._paces.get(origin)
+        if pace is not None:
+            self._drop(pace, origin, "what came behind it is old")
         self._paces[origin] = _Pace(now, is_queue=True)
+
+    def waits(self, origin: Session, holder: Holder) -> None:
+        """A first command waits there."""
+        self._paces[origin].holders.append(holder)
+
+    def _drop(self, pace: _Pace, origin: Session, why: str) -> None:
+        holders, pace.holders = pace.holders, []
+        for holder in holders:
+            holder.drop_waiting(origin, why)
 
     def waited(self, origin: Session) -> None:
         """The command that waits has none behind it."""
         pace = self._paces.get(origin)
         if pace is not None:
             pace.is_waiting = False
+            pace.holders = []
 
     def expect(self, client_id: str) -> None:
         """The client left in the midst of driving, and may have queued what it commanded since."""
@@ -176,8 +250,8 @@ class Arrivals:
         self._paces.pop(session, None)
 
 
-def _round_trip(origin: Session) -> float:
-    return 0.0 if origin.link is None else origin.link.contact().round_trip
+def _contact(origin: Session) -> Contact:
+    return HERE if origin.link is None else origin.link.contact()
 
 
 def sent_at(properties: Properties | None) -> float | None:

@@ -29,6 +29,7 @@ from appliance.entries import Entries, Repeated
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros.arrivals import Arrivals
 from appliance.ros.commands import Commands
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError
@@ -126,7 +127,7 @@ class Bridge:
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._turns = Turns(entries, broker.ledger)
-        self._around = Surroundings(entries, self._post, broker, Leases(), self._turns)
+        self._around = Surroundings(entries, self._post, broker, Leases(), self._turns, Arrivals())
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None
         self._metered = 0
@@ -287,6 +288,7 @@ class Bridge:
             lambda origin: _Link(self._receive, origin),
         )
         self._subscribe()
+        self._broker.departures.append(self._around.arrivals.departed)
         self.calls.start()
         self._forget_schemas(self._session)
         self.forget_leftovers()
@@ -328,6 +330,8 @@ class Bridge:
             self._diagnostics.stop()
         for command in self._to_ros.values():
             command.leave()
+        if self._around.arrivals.departed in self._broker.departures:
+            self._broker.departures.remove(self._around.arrivals.departed)
         await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session

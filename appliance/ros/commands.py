@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from appliance.broker.message import Message
-from appliance.broker.ports import Objection
+from appliance.broker.ports import HERE, Objection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.arrivals import AHEAD, SENT_AT, Arrivals, Verdict, sent_at
+from appliance.ros.arrivals import AHEAD, SENT_AT, Verdict, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.lease import Lease
@@ -63,6 +63,7 @@ class _Waiting:
     cdr: bytes
     #: What of it is counted, in bytes.
     size: int
+    came_at: float
     due: float
     timer: asyncio.TimerHandle
 
@@ -152,7 +153,7 @@ class Commands(ToRos):
         #: infinity when they have fallen silent since.
         self._drivers: dict[Session, tuple[bytes, float]] = {}
         self._has_stopped = False
-        self._arrivals = Arrivals()
+        self._arrivals = around.arrivals
         #: The lease that an exclusive route has joined.
         self._joined: Lease | None = None
         #: First commands of clients, see `Arrivals`.
@@ -194,7 +195,7 @@ class Commands(ToRos):
         self._around.broker.departures.append(self._departed)
         if isinstance(before, Commands):
             # What the network has of their commands, or a client that is away, is as old here.
-            self._drivers, self._arrivals = before._drivers, before._arrivals
+            self._drivers = before._drivers
             self._arm()
 
     def leave(self) -> None:
@@ -256,7 +257,10 @@ class Commands(ToRos):
             if why and origin.link is not None:
                 self._arrivals.is_old(origin, now)
             elif not why and not is_proven and self.rules.oldest < math.inf:
-                verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now)
+                number = self._around.broker.counters.messages_received
+                verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now, number)
+                if verdict is Verdict.WAIT:
+                    self._arrivals.waits(origin, self)
         return _Command(message, origin, now, verdict, why)
 
     def _finish(self, command: _Command) -> Objection | None:
@@ -363,6 +367,8 @@ class Commands(ToRos):
         except ValueError as error:
             return self._object(message, f"was refused: {error}")
         if not why:
+            if self.rules.oldest < math.inf:
+                self._arrivals.look(session, self.rules.oldest, self._around.broker.now)
             return super().inspect(message, session)
         if size_of(message.payload) > LITTLE or self._is_late_stop(message, session):
             return None  # a large one is looked at when it is its turn
@@ -441,7 +447,7 @@ class Commands(ToRos):
         ledger.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)
-        self._waiting[origin] = _Waiting(message, cdr, size, due, timer)
+        self._waiting[origin] = _Waiting(message, cdr, size, command.at, due, timer)
         return None
 
     def _wait_until(self, when: float, origin: Session) -> asyncio.TimerHandle:
@@ -461,6 +467,10 @@ class Commands(ToRos):
             self._around.broker.ledger.take(origin.account, -waiting.size)
         return waiting
 
+    def drop_waiting(self, origin: Session, why: str) -> None:
+        """As `Arrivals` has it: what waits is of a queue."""
+        self._forget(origin, why)
+
     def _forget(self, origin: Session, why: str) -> None:
         """A first command that waits is not carried out, if there is one."""
         if self._wait_no_longer(origin) is not None:
@@ -473,7 +483,10 @@ class Commands(ToRos):
         """Nothing has followed the first command, unless it has come and was not read yet."""
         now = self._around.entries.time()
         waiting = self._waiting[origin]
-        if origin.link is not None and origin.link.contact().has_unread:
+        self._around.broker.ledger.now = now
+        contact = HERE if origin.link is None else origin.link.contact()
+        # What comes with it may be something else than commands.
+        if contact.has_unread or contact.flowing >= now - waiting.came_at:
             if now < waiting.due + self.rules.oldest:
                 waiting.timer = self._wait_until(now + READ_SOON, origin)
             else:
@@ -575,7 +588,6 @@ class Commands(ToRos):
         else:
             self._forget(session, "its connection was lost")
             self._drop_queued(session, "its connection was lost")
-        self._arrivals.departed(session)
         self._asked.pop(session, None)
         if self.rules.exclusive and session is self._lease.holder:
             self._release("has left")

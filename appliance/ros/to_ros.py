@@ -13,6 +13,7 @@ from appliance.broker.session import Session
 from appliance.entries import Entries
 from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros.arrivals import Arrivals
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.flows import Echo, Flow, Route, Tell
 from appliance.ros.lease import Lease, Leases
@@ -32,13 +33,15 @@ class AgainstRulesError(ConversionError):
 @dataclass(frozen=True, slots=True)
 class Surroundings:
     """What a flow to ROS needs: the loop, a way to it from any thread, the broker, who commands
-    which ROS topic alone, and whose turn it is to have a large message converted."""
+    which ROS topic alone, whose turn it is to have a large message converted, and what is known of
+    how clients' commands come."""
 
     entries: Entries
     post: Callable[..., None]
     broker: Broker
     leases: Leases
     turns: Turns
+    arrivals: Arrivals
 
 
 class ToRos(Flow):

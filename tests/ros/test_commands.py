@@ -1041,9 +1041,10 @@ class FarLink:
     def __init__(self, round_trip=0.0):
         self.round_trip = round_trip
         self.withheld = []
+        self.flowing = self.held = self.unheard = 0.0
 
     def contact(self):
-        return Contact(self.round_trip)
+        return Contact(self.round_trip, flowing=self.flowing, held=self.held, unheard=self.unheard)
 
     def withhold(self, seconds):
         self.withheld.append(seconds)
@@ -1195,6 +1196,52 @@ class TestArrivals:
         sender.say(0, "new")
         sender.rest(1)
         assert sender.moved == ["new"]
+
+    def test_a_queue_with_other_messages_between_its_commands(self, qos):
+        """As large as pictures, they take their time, in which there is no pause."""
+        sender = Sender(qos)
+        for _ in range(100):
+            sender.link.flowing += 0.09
+            sender.say(0.09)
+        sender.rest(1)
+        assert sender.moved == []
+        for _ in range(5):
+            sender.link.flowing = 0.03
+            sender.say(0.09, "new")
+        assert sender.moved[-3:] == ["new"] * 3
+
+    @pytest.mark.parametrize("steered", [False, True])
+    def test_what_was_not_read_for_a_time_is_a_new_beginning(self, qos, steered):
+        sender = Sender(qos)
+        for _ in range(10 * steered):
+            sender.say(0.05)
+        sender.moved.clear()
+        sender.link.held = 3.0
+        for gap in (3.0 if steered else 0.0, 0, 0, *[0.05] * 20):
+            sender.say(gap)
+        sender.rest(0.3)
+        assert sender.moved == []
+        sender.link.held = 0.0
+        for _ in range(4):
+            sender.say(0.05, "new")
+        assert sender.moved[-2:] == ["new"] * 2
+
+    @pytest.mark.parametrize(("unheard", "moves"), [(0.1, 1), (0.6, 0)])
+    def test_a_single_one_that_was_not_read_for_a_time(self, qos, unheard, moves):
+        """The system knows when it came at the latest."""
+        sender = Sender(qos)
+        sender.link.held, sender.link.unheard = 3.0, unheard
+        sender.say(0)
+        sender.rest(1)
+        assert len(sender.moved) == moves
+
+    def test_who_is_not_read_for_less_than_a_command_may_take_steers_on(self, qos):
+        sender = Sender(qos)
+        for _ in range(10):
+            sender.say(0.05)
+        sender.link.held = sender.OLDEST
+        sender.say(0, "new")
+        assert sender.moved[-1] == "new"
 
 
 def test_a_queue_that_comes_one_by_one_has_a_pace_of_its_own():
@@ -1379,6 +1426,87 @@ async def test_a_single_command_and_a_cut(house):
     assert house.counters().expired == 1
     assert house.broker.ledger.queued_bytes == before
     assert house.commands._arrivals._paces == {}
+
+
+def start_two(house, mqtt="r2d2/arm"):
+    """Two routes to ROS; gives what the second's node receives."""
+    rules = CommandRules(expire=0.5)
+    routes = [
+        RouteSettings(ros, "ros", topic, TWIST, rules=rules)
+        for ros, topic in (("/cmd_vel", TOPIC), ("/arm", mqtt))
+    ]
+    House.start(house, *routes)
+    house.robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    return house.node.add_subscriber("/arm", TWIST)
+
+
+@pytest.mark.parametrize("count", [1, 60])
+async def test_what_is_known_of_a_client_holds_for_all_topics(house, count):
+    """It has one queue for them."""
+    arm = start_two(house)
+    await house.settle()
+    driver = Driver(house.broker, "a")
+    driver.say(*[Publish(TOPIC, GO)] * count, Publish("r2d2/arm", GO))
+    await asyncio.sleep(0.3)
+    assert house.robot.received == arm.received == []
+    for _ in range(5):
+        await asyncio.sleep(0.05)
+        driver.drive()
+    assert house.robot.received == [twist(0.5)] * 4
+    driver.say(Publish("r2d2/arm", GO))
+    assert arm.received == [twist(0.5)]
+
+
+async def test_a_command_to_two_ros_topics_is_one(house):
+    arm = start_two(house, TOPIC)
+    await house.settle()
+    driver = Driver(house.broker, "a")
+    driver.drive()
+    await until(lambda: house.robot.received == arm.received == [twist(0.5)])
+    await asyncio.sleep(0.5)
+    driver.say(*[Publish(TOPIC, GO)] * 2)
+    await asyncio.sleep(0.3)
+    assert house.robot.received == arm.received == [twist(0.5)]
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_who_drives_and_was_not_read_for_a_time(house, qos):
+    """Of QoS 2, that is known when the command comes, and not when it is released."""
+    house.start(CommandRules(expire=0.5))
+    driver = Driver(house.broker, "a")
+    driver.wire.connection = Contact()
+    for _ in range(5):
+        driver.drive(qos=qos)
+        if qos == 2:
+            driver.say(Pubrel(7))
+        await asyncio.sleep(0.06)
+    assert house.robot.received
+    house.robot.received.clear()
+    driver.wire.connection = Contact(held=3.0)
+    commands = [Publish(TOPIC, GO, qos=qos, packet_id=n if qos else None) for n in (1, 2)]
+    driver.say(*commands)
+    driver.wire.connection = Contact()
+    if qos == 2:
+        driver.say(Pubrel(1), Pubrel(2))
+    await asyncio.sleep(0.3)
+    assert house.robot.received == []
+
+
+@pytest.mark.parametrize("pauses", [False, True])
+async def test_a_command_with_something_else_behind_it(house, pauses):
+    """A first command waits for what else there is, and that may be a picture."""
+    house.start(CommandRules(expire=0.3))
+    driver = Driver(house.broker, "a")
+    driver.wire.connection = Contact(flowing=60.0)
+    driver.drive()
+    await asyncio.sleep(0.2)
+    assert house.robot.received == []
+    if pauses:
+        driver.wire.connection = Contact(flowing=0.05)
+        await until(lambda: house.robot.received == [twist(0.5)])
+    else:
+        await until(lambda: house.counters().expired == 1)
+        assert house.robot.received == []
 
 
 async def test_the_stop_message_is_heard_at_once_whatever_comes_with_it(house):

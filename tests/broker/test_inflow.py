@@ -1,0 +1,121 @@
+"""When what a client sends has come, on times of its own."""
+
+from __future__ import annotations
+
+import pytest
+
+from appliance.broker.inflow import A_BYTE, PAUSE, PAUSE_BEHIND, Inflow
+
+COMMAND = b"0" * 60
+
+
+class Sending(Inflow):
+    """Its chunks come when the test says."""
+
+    def __init__(self):
+        super().__init__()
+        self.now = 100.0
+        self.flowing(self.now)
+
+    def hear(self, after, data=COMMAND):
+        self.now += after
+        self.came(data, self.now)
+
+    def age(self, *, has_unread=False):
+        return self.held(self.now, has_unread=has_unread)
+
+
+def test_what_comes_at_once_flows_since_its_first_byte():
+    inflow = Sending()
+    for _ in range(50):
+        inflow.hear(PAUSE)
+    assert inflow.flowing(inflow.now) == pytest.approx(50 * PAUSE)
+    inflow.hear(3 * PAUSE)
+    assert inflow.flowing(inflow.now) == 0
+    inflow.hear(PAUSE / 2)
+    assert inflow.flowing(inflow.now) == pytest.approx(PAUSE / 2)
+    assert inflow.flowing(inflow.now + 2 * PAUSE) == 0
+
+
+def test_a_pause_in_the_middle_of_a_packet_is_none():
+    """A slow network makes it, and not who has nothing more to say."""
+    inflow = Sending()
+    inflow.unfinished = inflow.now
+    inflow.hear(1.0)
+    assert inflow.flowing(inflow.now) == 1.0
+    assert inflow.flowing(inflow.now + 2) == 3.0
+
+
+def test_nor_one_that_the_next_bytes_took_to_come():
+    """TLS hands over whole records only, of up to 16 KiB."""
+    record = bytes(16384)
+    inflow = Sending()
+    for _ in range(10):
+        inflow.hear(len(record) * A_BYTE, record)
+    assert inflow.flowing(inflow.now) > 0.1
+    inflow.hear(0.05, record)
+    assert inflow.flowing(inflow.now) == 0
+
+
+@pytest.mark.parametrize("data", [b"\x40\2\0\1", b"\x62\2\0\1" * 9, b"\x40\2\0\1\x50\2\0\2"])
+def test_acknowledgements_neither_end_a_pause_nor_fill_it(data):
+    inflow = Sending()
+    for _ in range(9):
+        inflow.hear(0.001, data)
+    inflow.hear(0.001)
+    assert inflow.flowing(inflow.now) == 0
+
+
+def test_what_waited_while_nobody_read():
+    inflow = Sending()
+    inflow.not_read(inflow.now)
+    inflow.not_read(inflow.now + 1)
+    assert inflow.held(inflow.now + 2, has_unread=False) == 2.0
+    inflow.now += 3
+    inflow.read(inflow.now)
+    inflow.hear(PAUSE_BEHIND)  # the loop had something else to do, meanwhile
+    assert inflow.age(has_unread=True) == 3.0
+    inflow.hear(0.001)
+    assert inflow.flowing(inflow.now) > 3
+    assert inflow.age() == 3.0  # it was the last of it
+    assert inflow.age() == 3.0
+    inflow.hear(0.001)
+    assert inflow.age() == 0
+
+
+def test_many_short_times_are_a_long_one_until_it_has_caught_up():
+    inflow = Sending()
+    for _ in range(10):
+        inflow.not_read(inflow.now)
+        inflow.now += 0.1
+        inflow.read(inflow.now)
+        inflow.hear(0.002)
+        inflow.age(has_unread=True)
+    assert inflow.age(has_unread=True) == pytest.approx(1)
+
+
+def test_a_moment_in_which_it_was_not_read_leaves_its_pauses_as_they_are():
+    """Who sends a large chunk is not read for the rest of the round."""
+    inflow = Sending()
+    for _ in range(100):
+        inflow.now += 0.001
+        inflow.not_read(inflow.now)
+        inflow.now += 0.001
+        inflow.read(inflow.now)
+        inflow.hear(2 * PAUSE)
+        assert inflow.flowing(inflow.now) == 0
+        inflow.hear(0.001)
+        inflow.age()
+        inflow.now += 0.001
+
+
+def test_who_pauses_has_nothing_left_of_before():
+    inflow = Sending()
+    for _ in range(100):
+        inflow.not_read(inflow.now)  # for the rest of the round, by a large chunk of its own
+        inflow.hear(0, bytes(500))
+        assert inflow.flowing(inflow.now) == 0
+        inflow.now += 0.01
+        inflow.read(inflow.now)
+        assert inflow.age(has_unread=True) == pytest.approx(0.01)
+        inflow.now += 2 * PAUSE_BEHIND
