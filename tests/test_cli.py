@@ -7,10 +7,12 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import typer
 import yaml
 from waiting import PATIENCE, eventually
 
@@ -53,6 +55,20 @@ def test_help_is_there_at_once_and_for_everything(capsys: pytest.CaptureFixture[
     for command in ("init", "run", "check", "user", "cert", "acl", "pub", "sub", "bench", "demo"):
         assert f" {command} " in text
         assert run(command, "--help") == 0
+
+
+def test_no_help_is_cut_off_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """There it is 80 columns wide."""
+
+    def texts(command: object, *path: str) -> Iterator[tuple[tuple[str, ...], str]]:
+        assert run(*path, "--help") == 0
+        yield path, capsys.readouterr().out
+        for name, each in getattr(command, "commands", {}).items():
+            yield from texts(each, *path, name)
+
+    told = dict(texts(typer.main.get_command(cli.app)))
+    assert len(told) > 30
+    assert {path: text for path, text in told.items() if "…" in text} == {}
 
 
 def test_a_command_loads_only_what_it_needs() -> None:

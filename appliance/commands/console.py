@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +19,7 @@ ConfigOption = Annotated[
         "--config",
         "-c",
         metavar="FILE",
-        help="The configuration; else ./appliance.yaml, else /etc/appliance/appliance.yaml.",
+        help="The configuration; else ./appliance.yaml, else that in /etc/appliance.",
     ),
 ]
 PasswordFileOption = Annotated[
@@ -92,3 +93,14 @@ def shown(path: Path) -> str:
         return str(path.absolute().relative_to(Path.cwd()))
     except ValueError:
         return str(path)
+
+
+def print_table(rows: Iterable[tuple[str, ...]]) -> None:
+    """In columns as wide as they have to be: a program that reads them misses nothing."""
+    lines = list(rows)
+    columns = max(map(len, lines), default=0)
+    padded = [(*row, *[""] * (columns - len(row))) for row in lines]
+    widths = [max(map(len, column)) for column in zip(*padded, strict=True)]
+    for row in padded:
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        typer.echo(line.rstrip())

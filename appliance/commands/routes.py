@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
 
-from appliance.commands.console import CommandError, ConfigOption, load
+from appliance.commands.console import CommandError, ConfigOption, load, print_table
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
@@ -56,7 +55,7 @@ def routes(
         return
     if bridged:
         rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
-        _print_table([(*HEAD, *FIGURES), *rows])
+        print_table([(*HEAD, *FIGURES), *rows])
         _print_errors(bridged)
         if any(entry.get("lost") for entry in bridged):
             from appliance.ros.fastdds import LOST_IN_ROS
@@ -99,7 +98,7 @@ def _print_skipped(skipped: list[dict[str, str]], shown: list[dict[str, str]]) -
     typer.echo(
         "\nskipped: " + ", ".join(f"{count} {WHY.get(why, why)}" for why, count in counts.items())
     )
-    _print_table(
+    print_table(
         (
             entry["ros"],
             ARROWS.get(entry["direction"], entry["direction"]),
@@ -110,13 +109,3 @@ def _print_skipped(skipped: list[dict[str, str]], shown: list[dict[str, str]]) -
     )
     if len(shown) < len(skipped):
         typer.echo(f"and {len(skipped) - len(shown)} more: appliance routes --all")
-
-
-def _print_table(rows: Iterable[tuple[str, ...]]) -> None:
-    lines = list(rows)
-    columns = max(map(len, lines), default=0)
-    padded = [(*row, *[""] * (columns - len(row))) for row in lines]
-    widths = [max(map(len, column)) for column in zip(*padded, strict=True)]
-    for row in padded:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        typer.echo(line.rstrip())

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-from appliance.commands.console import CommandError, ConfigOption, load, shown
+from appliance.commands.console import CommandError, ConfigOption, load, print_table, shown
+
+HEAD = ("CLIENT ID", "USER", "SUBSCRIPTIONS", "MESSAGES", "BYTES", "OLDEST", "ENDS")
 
 store_app = typer.Typer(help="What outlives a restart.")
 
@@ -20,12 +22,7 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
     path, _ = _store_path(config)
     from datetime import datetime
 
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     from appliance.config import format_size
-    from appliance.mqtt.codec import quote
     from appliance.store import StoreError
     from appliance.store.inspection import summarise
 
@@ -37,19 +34,21 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
     def when(moment: float | None) -> str:
         return "" if moment is None else f"{datetime.fromtimestamp(moment):%Y-%m-%d %H:%M:%S}"
 
-    table = Table("client id", "user", "subscriptions", "messages", "bytes", "oldest", "ends")
-    for session in summary.sessions:
-        table.add_row(
-            escape(quote(session.client_id)),
-            "" if session.username is None else escape(quote(session.username)),
+    rows = [
+        (
+            repr(session.client_id),
+            "" if session.username is None else repr(session.username),
             str(session.subscriptions),
             str(session.messages),
             str(session.size),
             when(session.oldest),
             when(session.ends_at) or "connected",
         )
-    if summary.sessions:
-        Console().print(table)
+        for session in summary.sessions
+    ]
+    if rows:
+        print_table([HEAD, *rows])
+        typer.echo()
     typer.echo(
         f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
         f"{summary.retained_size} bytes; all {summary.messages} messages have "

@@ -57,14 +57,18 @@ class Summary:
     file_size: int
 
 
+def _require(path: Path) -> None:
+    if not path.exists():
+        raise StoreError(f"{path} is not there: nothing has been stored yet")
+
+
 def read(path: Path) -> Rows:
     """All rows, while the appliance may be running.
 
     Raises:
         StoreError: there is no database, or it cannot be read.
     """
-    if not path.exists():
-        raise StoreError(f"{path} is not there: nothing has been stored yet")
+    _require(path)
     try:
         with contextlib.closing(connect_to_read(path)) as connection:
             # What an older appliance wrote has fewer tables until this one runs.
@@ -195,19 +199,42 @@ def prune_retained(path: Path, filters: list[str]) -> int:
     """
     for topic_filter in filters:
         check_filter(topic_filter)
-    rows = read(path)
-    topics = {key: cast(str, row[1]) for key, row in rows[Table.MESSAGE].items()}
-    chosen = [
-        key
-        for key, row in rows[Table.RETAINED].items()
-        if any(matches(each, topics.get(cast(int, row[1]), "")) for each in filters)
-    ]
-    batch = Batch(0, 1 << 62)
-    for key in chosen:
-        batch.remove(Table.RETAINED, key)
-    with _locked(path), contextlib.closing(connect(path)) as connection:
-        write(connection, batch)
-    return len(chosen)
+    with _changing(path) as (rows, batch):
+        topics = {key: cast(str, row[1]) for key, row in rows[Table.MESSAGE].items()}
+        for key, row in rows[Table.RETAINED].items():
+            topic = topics.get(cast(int, row[1]), "")
+            if any(matches(each, topic) for each in filters):
+                batch.remove(Table.RETAINED, key)
+        return len(batch.deleted[Table.RETAINED])
+
+
+#: What refers to messages, and in which column.
+_REFERRING = ((Table.SESSION, 5), (Table.OWED, 2), (Table.RECEIVED, 3), (Table.RETAINED, 1))
+
+
+@contextlib.contextmanager
+def _changing(path: Path) -> Iterator[tuple[Rows, Batch]]:
+    """All rows, and what is to be done with them, which is written at the end.
+
+    Messages that nothing refers to any more go with it, and what room they had in the file.
+    """
+    _require(path)
+    with _locked(path):
+        rows, batch = read(path), Batch(0, 1 << 62)
+        yield rows, batch
+        used = {
+            row[column]
+            for table, column in _REFERRING
+            for key, row in rows[table].items()
+            if key not in batch.deleted[table]
+        }
+        for key in rows[Table.MESSAGE].keys() - used:
+            batch.remove(Table.MESSAGE, key)
+        with contextlib.closing(connect(path)) as connection:
+            write(connection, batch)
+            # It takes as much room again for a moment; without that the file stays as large.
+            with contextlib.suppress(sqlite3.Error):
+                connection.execute("VACUUM")
 
 
 @contextlib.contextmanager
@@ -230,27 +257,23 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
         StoreError: an appliance is running, there is no database, or no such client.
         sqlite3.Error, OSError: it cannot be written.
     """
-    rows = read(path)
-    chosen = {
-        key: row
-        for key, row in rows[Table.SESSION].items()
-        if not client_ids or row[1] in client_ids
-    }
-    missing = set(client_ids) - {row[1] for row in chosen.values()}
-    if missing:
-        raise StoreError(f"no session of {', '.join(map(repr, sorted(missing)))} is kept")
-    with _locked(path):
-        batch = Batch(0, 1 << 62)
+    with _changing(path) as (rows, batch):
+        chosen = {
+            key: row
+            for key, row in rows[Table.SESSION].items()
+            if not client_ids or row[1] in client_ids
+        }
+        missing = set(client_ids) - {row[1] for row in chosen.values()}
+        if missing:
+            raise StoreError(f"no session of {', '.join(map(repr, sorted(missing)))} is kept")
         messages = rows[Table.MESSAGE]
         limit = None if older_than is None else _now(rows) - older_than
-        gone = 0
         for key, row in rows[Table.OWED].items():
             stored = messages.get(cast(int, row[2])) if row[2] is not None else None
             if row[1] in chosen and (
                 limit is None or (stored is not None and cast(float, stored[8]) < limit)
             ):
                 batch.remove(Table.OWED, key)
-                gone += 1
         if limit is None:
             for key in chosen:
                 batch.remove(Table.SESSION, key)
@@ -258,7 +281,4 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
                 for key, row in rows[table].items():
                     if row[1] in chosen:
                         batch.remove(table, key)
-        # Messages that nothing refers to any more go at the appliance's next start.
-        with contextlib.closing(connect(path)) as connection:
-            write(connection, batch)
-    return (len(chosen) if limit is None else 0), gone
+        return len(batch.deleted[Table.SESSION]), len(batch.deleted[Table.OWED])

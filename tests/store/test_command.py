@@ -96,6 +96,43 @@ def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -
         assert len([packet for packet in client.drain() if isinstance(packet, Publish)]) == 2
 
 
+def test_what_is_pruned_is_in_no_figure_any_more(process: ApplianceProcess) -> None:
+    with RawClient(process, 4) as client:
+        client.connect("publisher")
+        client.send(Publish("r2d2/a", bytes(500_000), 1, packet_id=1))
+        assert isinstance(client.decode(client.receive()), Puback)
+    process.stop()
+    database = process.directory / "state/store.db"
+    before = store(process).stdout.splitlines()[-1]
+    assert before.startswith("2 sessions, 2 retained"), before
+    assert "all 4 messages have 500" in before, before
+    assert database.stat().st_size > 500_000
+    for name in ("first", "second"):
+        store(process, "prune", "--client", name)
+    after = store(process).stdout.splitlines()[-1]
+    assert after.startswith("0 sessions, 2 retained messages of "), after
+    kept = after.partition("retained messages of ")[2].partition(" bytes")[0]
+    # The one that is owed to nobody is gone, and the retained ones are all there is.
+    assert f"; all 2 messages have {kept} bytes" in after, after
+    assert database.stat().st_size < 500_000
+    store(process, "prune", "--retained", "#")
+    assert "0 sessions, 0 retained messages of 0 bytes; all 0 messages have 0 bytes" in (
+        store(process).stdout
+    )
+
+
+def test_nothing_is_cut_off_in_a_pipe(process: ApplianceProcess) -> None:
+    name = "a-client-of-a-fleet-" + "x" * 300
+    with RawClient(process, 4) as client:
+        client.connect(name, clean=False)
+    lines = store(process).stdout.splitlines()
+    assert lines[0].split() == [
+        *("CLIENT", "ID", "USER", "SUBSCRIPTIONS", "MESSAGES", "BYTES", "OLDEST", "ENDS")
+    ]
+    (line,) = [each for each in lines if name in each]
+    assert "'alice'" in line and "…" not in line
+
+
 def test_nothing_stored_yet_is_told(process: ApplianceProcess) -> None:
     process.stop()
     shutil.rmtree(process.directory / "state")
