@@ -301,15 +301,16 @@ class Broker:
         holder = session.account
         key = ("taken back", what, holder.username)
         if holder is account:
+            own = self.limits.user.sessions
             self.complaints.tell(
                 self.now,
                 key,
-                "%s makes room for another session of its user: %s has %d sessions, as many as "
-                "there may be, and this one's client has been away for longest "
-                "(broker.limits.user.sessions, broker.limits.sessions)",
+                "%s makes room for another session of its user: %s has %d sessions, there may be "
+                "no more (broker.limits.%s), and this one's client has been away for longest",
                 session,
                 account,
                 account.sessions,
+                "sessions" if own is None or account.sessions < own else "user.sessions",
             )
         else:
             self.complaints.tell(
