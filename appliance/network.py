@@ -26,9 +26,14 @@ FEW_MESSAGES = 64
 #: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
 LARGEST_PORTION = 256 * 1024
 
-#: What all clients that send much may cause in one round of the event loop, see
-#: `Counters.effort`: some six milliseconds.
+#: What all clients may cause in one round of the event loop, see `Counters.effort`: some six
+#: milliseconds. And what each user may cause beyond that with little chunks: who sends little does
+#: not wait for who sends much, or are many.
 EFFORT_A_ROUND = 1500
+EFFORT_BEYOND = 100
+
+#: Effort after which it is looked where the round began.
+UNLOOKED = 300
 
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
@@ -121,8 +126,11 @@ class Network:
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
         self._turns: deque[Turn] = deque()
-        self._effort_begun = 0
+        #: `Counters.effort` from which on it is to be asked whether the round is over.
+        self.checkpoint = 0
         self._counting = False
+        #: What each account has caused beyond the end of the round.
+        self._beyond: dict[Account, int] = {}
         self._farewells: set[Farewell] = set()
         self._all_closed: asyncio.Event | None = None
 
@@ -140,19 +148,37 @@ class Network:
         self.much_output = self.broker.limits.memory // 4
 
     def is_busy(self) -> bool:
+        """Whether as much was done in this round of the event loop as one round is for, or others
+        wait for the next one.
+
+        Who sends much then waits, too.
+        """
+        return self.is_round_over() or bool(self._turns)
+
+    def is_round_over(self) -> bool:
         """Whether as much was done in this round of the event loop as one round is for.
 
-        Who sends much then waits. Who sends little does not, whatever the others do.
+        To be asked when `Counters.effort` is beyond the `checkpoint`, by who sends little.
         """
+        effort = self.broker.counters.effort
         if not self._counting:
             self._counting = True
-            self._effort_begun = self.broker.counters.effort
+            self.checkpoint = effort + EFFORT_A_ROUND
             self.entries.soon("network.round", self._new_round, failed=self._new_round)
-        effort = self.broker.counters.effort - self._effort_begun
-        return effort > EFFORT_A_ROUND or bool(self._turns)
+        return effort > self.checkpoint
 
     def _new_round(self) -> None:
         self._counting = False
+        self.checkpoint = self.broker.counters.effort + UNLOOKED
+        self._beyond.clear()
+
+    def may_go_beyond(self, account: Account) -> bool:
+        """Whether its clients have sent little since the round is over."""
+        return self._beyond.get(account, 0) < EFFORT_BEYOND
+
+    def went_beyond(self, account: Account, effort: int) -> None:
+        """So much was done for one of them nevertheless."""
+        self._beyond[account] = self._beyond.get(account, 0) + effort
 
     def count(self, effort: int) -> None:
         """So much was done, see `Counters.effort`."""

@@ -96,6 +96,7 @@ class ClientProtocol:
         self._loop = network.entries.loop
         self._client = Client(self._broker, self)
         self._closing = False
+        self._is_lost = False
         # Input: what was received and waits, and what it waits for.
         self._held = _NOTHING
         self._frame = 0  # bytes of a WebSocket frame that is not complete
@@ -244,6 +245,7 @@ class ClientProtocol:
     @contained("connection.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection ended, whoever ended it."""
+        self._is_lost = True
         self._forget()
         while self._waiting:
             self._take_waiting(self._waiting_size)
@@ -269,7 +271,16 @@ class ClientProtocol:
         self.keep(0)
         if self._connection is not None:
             self._network.part(self._connection)
-        self._leave()
+        if self._network.is_busy():
+            self._leave_later()
+        else:
+            self._leave()
+
+    def _leave_later(self) -> None:
+        """Let the others have their turn, then end the client."""
+        if not self._turn_over:
+            self._turn_over = True
+            self._network.queue_turn(self)
 
     def _leave(self) -> None:
         """End the client when what it said before it left is done, in as many turns as it takes."""
@@ -279,10 +290,8 @@ class ClientProtocol:
                 self._client.send_on()
             except Exception as error:
                 self._broker.fault("connection.last_turn", error, self._client)
-            self._entries.soon(
-                "connection.leave", self._leave, served=self, failed=self._client.cut_off
-            )
             self._broker.flush()
+            self._leave_later()
         else:
             self._client.lost()
             self._broker.flush()
@@ -324,11 +333,13 @@ class ClientProtocol:
     def data_received(self, data: bytes) -> None:
         """Hand the chunk to the client; then everyone is written to, once, what it caused."""
         try:
-            if len(data) > self._little and not self._in_turn:
-                data = self._receive_much(data)
+            counters = self._counters
+            if (
+                len(data) > self._little or counters.effort > self._network.checkpoint
+            ) and not self._in_turn:
+                data = self._receive_in_turn(data)
                 if not data:
                     return
-            counters = self._counters
             self._ledger.now = self._loop.time()
             published = counters.publish_received
             self._client.receive(data)
@@ -346,10 +357,22 @@ class ClientProtocol:
         except Exception as error:
             self.fault("connection.chunk", error)
 
-    def _receive_much(self, data: bytes) -> bytes:
+    def _receive_in_turn(self, data: bytes) -> bytes:
         """Let who sends much wait where that is due; returns what is to be taken in now."""
+        network, account = self._network, self.account
+        if len(data) <= self._little:
+            if not network.is_round_over():
+                return data
+            if network.may_go_beyond(account):
+                begun = self._counters.effort
+                self._take_portion(data)
+                network.went_beyond(account, self._counters.effort - begun)
+            else:
+                self._held = memoryview(data)
+                self._read_later()
+            return b""
         self._check_memory()
-        portion = 0 if self._network.is_busy() else self._network.portion
+        portion = 0 if network.is_busy() else network.portion
         if len(data) >= LARGE_CHUNK or len(data) > portion:
             self._read_later()
         if len(data) > portion:
@@ -396,7 +419,10 @@ class ClientProtocol:
 
     def _rested(self) -> None:
         self._resting = None
-        self._read_on()
+        if self._network.is_busy():
+            self._read_later()
+        else:
+            self._read_on()
 
     def _read_later(self) -> None:
         """Let the others have their turn, then read on."""
@@ -408,7 +434,10 @@ class ClientProtocol:
     def take_turn(self) -> None:
         """The others have had their turn."""
         self._turn_over = False
-        self._read_on()
+        if self._is_lost:
+            self._leave()
+        else:
+            self._read_on()
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
@@ -433,9 +462,7 @@ class ClientProtocol:
             portion = bytes(self._held[: self._network.portion])
             # An empty part would keep the whole.
             self._held = self._held[self._network.portion :] or _NOTHING
-            self._in_turn = True
-            self.data_received(portion)  # which never raises
-            self._in_turn = False
+            self._take_portion(portion)
             self._read_later()
         else:
             inflow = self._client.inflow
@@ -448,6 +475,12 @@ class ClientProtocol:
             ):
                 inflow.has_caught_up()
             self._transport.resume_reading()
+
+    def _take_portion(self, data: bytes) -> None:
+        """Take in what is not to wait for a turn, or has had it."""
+        self._in_turn = True
+        self.data_received(data)  # which never raises
+        self._in_turn = False
 
     def _send_on(self) -> None:
         self._sends_on = self._stopped = False

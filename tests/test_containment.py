@@ -539,7 +539,7 @@ async def _says_much_and_leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
     transport.resume_reading()
 
 
-@reach("connection.last_turn", "connection.leave")
+@reach("connection.last_turn")
 async def _asks_much_and_leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
     caller, protocol = await site.victim()
     protocol._sends_on = True  # as when it has more to do than there was time for

@@ -776,6 +776,46 @@ async def deep_topics(fight: Fight) -> None:
     await fight.together(*(publish(number) for number in range(50)))
 
 
+@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+async def new_deep_topics(fight: Fight) -> None:
+    """Twenty clients that publish to ever new topics of 100 levels, as fast as they are read."""
+
+    async def publish(number: int) -> None:
+        line = await fight.join(f"new-{number}")
+        async for turn in fight.rounds():
+            topics = (f"{AREA}/{number}/{turn}/{index}" + "/abcd" * 95 for index in range(20))
+            await line.send(encode5(*(Publish(topic, b"x", 1, packet_id=1) for topic in topics)))
+            await line.hear(line.received + 20 * 4)
+            fight.counts["messages"] += 20
+
+    await fight.together(*(publish(number) for number in range(20)))
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+async def little_chunks(fight: Fight) -> None:
+    """A hundred clients that each send 15 kB to new topics, all in one moment, again and again."""
+
+    def make(number: int) -> bytes:
+        return encode5(*(Publish(f"{AREA}/{number}/{index}", b"") for index in range(600)))
+
+    await _at_once(fight, 100, 0.5, make)
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+async def near_misses(fight: Fight) -> None:
+    """Twenty clients, each message of which passes two thousand filters that do not match."""
+    levels = 11
+    for number in range(3):
+        line = await fight.join(f"filters-{number}")
+        await line.send(encode5(Subscribe(1, _near_misses(levels, number * 1000, 1000))))
+
+    def make(number: int) -> bytes:
+        topics = (f"{AREA}{'/a' * levels}/{number}-{index}" for index in range(5))
+        return encode5(*(Publish(topic, b"") for topic in topics))
+
+    await _at_once(fight, 20, 0.3, make)
+
+
 @attack(rf"{CLIENT}", short=False)
 async def invented_topics(fight: Fight) -> None:
     """Each client publishes to a thousand topics of its own, so that all of them are remembered."""

@@ -1,0 +1,131 @@
+"""One round of the event loop: who sends little is served in it, whatever the others send."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+from house import Caller, House, make_contexts
+
+from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.mqtt.packets import (
+    Connack,
+    Connect,
+    Pingreq,
+    Pingresp,
+    Publish,
+    Subscribe,
+    Subscription,
+    Will,
+)
+from appliance.network import EFFORT_A_ROUND, EFFORT_BEYOND, UNLOOKED
+from appliance.wire import LITTLE, ClientProtocol
+
+CROWD = 40
+
+#: What one round may come to: the last chunk of each of the three parts may be a whole turn's.
+MOST = UNLOOKED + EFFORT_A_ROUND + EFFORT_BEYOND + 3 * EFFORT_A_TURN
+
+
+async def until(holds: Callable[[], bool], what: Callable[[], object]) -> None:
+    for _ in range(20_000):
+        if holds():
+            return
+        await asyncio.sleep(0.001)
+    pytest.fail(f"waited in vain, and have {what()}")
+
+
+async def crowd(house: House, will: Will | None = None) -> list[tuple[Caller, ClientProtocol]]:
+    """Clients of one user."""
+    there = []
+    for number in range(CROWD):
+        caller = await house.dial()
+        await caller.say(Connect(f"p{number}", username="mallory", will=will))
+        answer = await caller.hear()
+        assert isinstance(answer, Connack) and answer.reason_code == 0
+        there.append((caller, house.protocol(f"p{number}")))
+    return there
+
+
+@pytest.fixture
+async def house(tmp_path: Path) -> AsyncIterator[House]:
+    house = House(*make_contexts(tmp_path / "certs"))
+    house.broker.tick(asyncio.get_running_loop().time())
+    yield house
+    await house.close()
+
+
+def new_topics(number: int) -> bytes:
+    """As many messages as a little chunk holds, each to a topic that nobody knows yet."""
+    count = LITTLE // 60
+    chunk = b"".join(Publish(f"{number}/{n}" + "/abc" * 10, b"").encode(5) for n in range(count))
+    assert len(chunk) <= LITTLE
+    return chunk
+
+
+async def test_little_chunks_of_many_are_no_more_than_a_round(house: House):
+    await house.start()
+    counters = house.broker.counters
+    other = await house.join("other")
+    others = house.protocol("other")
+    there = await crowd(house)
+    await asyncio.sleep(0)
+    begun, received = counters.effort, counters.publish_received
+    for number, (_, protocol) in enumerate(there):
+        protocol.data_received(new_topics(number))
+    assert counters.effort - begun <= MOST
+    others.data_received(Pingreq().encode(5))  # of another user: no turn of theirs comes before it
+    assert isinstance(await other.hear(), Pingresp)
+    sent = CROWD * (LITTLE // 60)
+    assert counters.publish_received - received < sent / 2, "the rest waits for its turn"
+    await until(
+        lambda: counters.publish_received - received == sent,
+        lambda: f"{counters.publish_received - received} messages of {sent}",
+    )
+
+
+async def test_chunks_that_cost_little_do_not_wait_for_a_turn(house: House):
+    await house.start()
+    there = await crowd(house)
+    await asyncio.sleep(0)
+    house.network.is_round_over()
+    house.network.count(2 * EFFORT_A_ROUND)
+    served = 0
+    for _, protocol in there[:8]:
+        protocol.data_received(Pingreq().encode(5))
+        served += not protocol._turn_over
+    assert served == 8
+    for caller, _ in there[:8]:
+        assert isinstance(await caller.hear(), Pingresp)
+
+
+async def test_many_that_go_at_once_are_no_more_than_a_round(house: House):
+    await house.start()
+    counters = house.broker.counters
+    watcher = await house.join("watcher")
+    wanted = [Subscription("/".join("+" * depth) + "/#") for depth in range(1, 10)]
+    await watcher.say(Subscribe(1, wanted))
+    await watcher.hear()
+    readers = [await house.join(f"reader{number}") for number in range(30)]
+    for reader in readers:
+        await reader.say(Subscribe(1, wanted))
+        await reader.hear()
+    there = await crowd(house, Will("/".join("abcdefghij"), b"gone"))
+    await asyncio.sleep(0)
+    begun = counters.effort
+    for caller, protocol in there:
+        assert protocol._transport is not None
+        protocol._transport.pause_reading()
+        protocol.connection_lost(None)
+        caller.hang_up()
+    assert counters.effort - begun <= MOST
+    assert len(house.broker.clients) > 31
+    await until(
+        lambda: len(house.broker.clients) == 31,
+        lambda: f"{len(house.broker.clients)} clients",
+    )
+    for _ in there:
+        heard = await watcher.hear()
+        assert isinstance(heard, Publish) and heard.payload == b"gone"
