@@ -28,7 +28,7 @@ not read for longer than `oldest` is a new beginning; of what came since, the ap
 when. A command that comes in parts is as old as its first byte.
 
 A queue ends by a silence or by that pace, never by a time: a stream that is faster than `BURST`
-allows (125 Hz; QoS 2: 33 Hz without round trips) is never carried out without `sent-at`.
+allows (125 Hz) is never carried out without `sent-at`.
 
 The pace of somebody who steers is two gaps in a row that are no burst. A queue of QoS 1 may come
 one by one, each behind the acknowledgement of the one before, and a busy or distant client then
@@ -69,12 +69,8 @@ AHEAD = 0.25
 #: algorithm and delayed acknowledgements keep the second of a queue back for 40 ms.
 WAIT = 0.1
 
-#: Seconds between two messages of QoS 0 or 1 from which on it is no burst.
+#: Seconds between two messages from which on it is no burst.
 BURST = 0.008
-
-#: The same for QoS 2, whose acknowledgements cannot be withheld: messages take two round trips
-#: each, which come on top.
-BURST_QOS_2 = 0.03
 
 #: Such gaps in a row until a client counts as one that steers.
 STEADY = 2
@@ -132,6 +128,8 @@ class Arrivals:
 
     def __init__(self) -> None:
         self._paces: dict[Session, _Pace] = {}
+        #: Of those of QoS 2, how they come, before they are released.
+        self._coming: dict[Session, _Pace] = {}
         self._expected: OrderedDict[str, None] = OrderedDict()
 
     def judge(
@@ -172,19 +170,14 @@ class Arrivals:
         pace.was_held = False
         if pace.is_known:
             return Verdict.CARRY_OUT
-        burst = BURST_QOS_2 + 2 * contact.round_trip if qos == 2 else BURST
-        # Other messages may come between the two, and all of them without a pause.
-        is_steady = gap >= burst and contact.flowing < gap
-        pace.steady = pace.steady + 1 if is_steady else 0
-        if qos == 1 and pace.steady and now > pace.withheld_until:
-            # It may have waited for what it was sent meanwhile.
-            pace.steady = 1
-            self._withhold(pace, origin, now)
+        if qos < 2:
+            self._time(pace, origin, qos, gap, now)
+        else:
+            coming = self._coming.get(origin)
+            pace.steady = 0 if coming is None else coming.steady
         if pace.steady >= STEADY:
             pace.is_known = True
             pace.is_waiting = pace.is_queue = False
-            if origin.link is not None:
-                origin.link.withhold(0.0)
             return Verdict.CARRY_OUT
         if pace.is_waiting or pace.is_queue or gap < self.waiting_time(origin, oldest):
             pace.is_queue, pace.is_waiting = True, False
@@ -192,7 +185,22 @@ class Arrivals:
         pace.is_waiting = True
         return Verdict.WAIT
 
+    def _time(self, pace: _Pace, origin: Session, qos: int, gap: float, now: float) -> None:
+        """Does it come at the pace of somebody who steers, and does not wait for an answer?"""
+        # Other messages may come between the two, and all of them without a pause.
+        is_steady = gap >= BURST and _contact(origin).flowing < gap
+        pace.steady = pace.steady + 1 if is_steady else 0
+        if qos and pace.steady and now > pace.withheld_until:
+            # It may have waited for what it was sent meanwhile.
+            pace.steady = 1
+            self._withhold(pace, origin, now)
+        if pace.steady >= STEADY and origin.link is not None:
+            origin.link.withhold(0.0)
+
     def _begin(self, origin: Session, oldest: float, now: float) -> Verdict:
+        before = self._paces.get(origin)
+        if before is not None:
+            self._drop(before, origin, "another followed at once")
         pace = self._paces[origin] = _Pace(now)
         if self._expected and origin.client_id in self._expected:
             del self._expected[origin.client_id]
@@ -211,9 +219,22 @@ class Arrivals:
         return min(WAIT + 2 * _contact(origin).round_trip, oldest)
 
     def look(self, origin: Session, oldest: float, now: float) -> None:
-        """A command of QoS 2 has come, that is not released yet: was it held in here?"""
+        """A command of QoS 2 has come that is not released yet: only now its pace can be told, and
+        whether it was held in here."""
+        coming = self._coming.get(origin)
+        if coming is None or now - coming.last > oldest:
+            self._coming[origin] = _Pace(now)
+        else:
+            gap, coming.last = now - coming.last, now
+            if coming.steady < STEADY or gap < BURST:
+                self._time(coming, origin, 2, gap, now)
         pace = self._paces.get(origin)
-        if pace is not None and _contact(origin).held > oldest:
+        if pace is None:
+            return
+        if pace.is_waiting:  # its release may be withheld for longer than the first one waits
+            pace.is_queue, pace.is_waiting = True, False
+            self._drop(pace, origin, "another followed at once")
+        if _contact(origin).held > oldest:
             self._judge(pace, origin, 2, oldest, now)
 
     def is_old(self, origin: Session, now: float) -> None:
@@ -221,6 +242,7 @@ class Arrivals:
         pace = self._paces.get(origin)
         if pace is not None:
             self._drop(pace, origin, "what came behind it is old")
+        self._coming.pop(origin, None)
         self._paces[origin] = _Pace(now, is_queue=True)
 
     def waits(self, origin: Session, holder: Holder) -> None:
@@ -248,6 +270,7 @@ class Arrivals:
     def departed(self, session: Session) -> None:
         """Its connection has ended: the next one is a beginning."""
         self._paces.pop(session, None)
+        self._coming.pop(session, None)
 
 
 def _contact(origin: Session) -> Contact:

@@ -367,7 +367,7 @@ class Commands(ToRos):
         except ValueError as error:
             return self._object(message, f"was refused: {error}")
         if not why:
-            if self.rules.oldest < math.inf:
+            if self.rules.oldest < math.inf and sent_at(message.properties) is None:
                 self._arrivals.look(session, self.rules.oldest, self._around.broker.now)
             return super().inspect(message, session)
         if size_of(message.payload) > LITTLE or self._is_late_stop(message, session):
