@@ -355,7 +355,7 @@ class Connection:
             )
         if self.state is State.NEW and first == 0x47:  # the G of GET
             raise ProtocolError(
-                ReasonCode.MALFORMED_PACKET,
+                ReasonCode.PROTOCOL_ERROR,
                 "what it sends is HTTP; is it meant for a listener with protocol: websocket?",
             )
         if kind in _FLAGLESS and first & 0x0F:
