@@ -20,6 +20,13 @@ RELEASED: Final = datetime(2026, 1, 1, tzinfo=timezone.utc)
 #: Seconds that the wall clock may be off from one look to the next, as it is nudged by NTP.
 NUDGE: Final = 2.0
 
+#: Seconds after which half of what a `WorkClock` saw of the computer's load is forgotten, those
+#: that a thread may wait for its turn on a computer that has time, and the least share of the
+#: processor that is assumed for others.
+OF_LATE: Final = 0.1
+TURN_TAKES: Final = 0.0001
+LEAST_SHARE: Final = 0.25
+
 
 def is_unset(now: datetime | None = None) -> bool:
     """Whether the computer's clock, or the one given, is of before this program was made."""
@@ -42,13 +49,20 @@ class StepWatch:
 
 
 class WorkClock:
-    """Seconds that a thread has worked, or was ready to while others had the processor.
+    """Seconds that a thread left no other program of the computer, as far as it can tell.
 
-    It is the thread of the first call. Where the system does not tell, the second part is missing.
+    These are the ones in which it worked, or was ready to while others had the processor. When it
+    had to wait for the processor so did they: of the time in which it rested that part counts, too.
+
+    It is the thread of the first call. Where the system does not tell, only its work counts.
     """
 
     def __init__(self) -> None:
         self._file = -1
+        self._last = (0.0, 0.0, 0.0, 0.0)
+        # How much it worked and waited of late.
+        self._worked = self._waited = 0.0
+        self._sum = 0.0
 
     def __call__(self) -> float:
         """What it is now; by how much it grows is what it is for."""
@@ -57,8 +71,28 @@ class WorkClock:
                 self._file = os.open("/proc/thread-self/schedstat", os.O_RDONLY | os.O_CLOEXEC)
             except OSError:
                 return time.thread_time()
-        worked, waited, _ = os.pread(self._file, 100, 0).split()  # in nanoseconds
-        return (int(worked) + int(waited)) * 1e-9
+        worked, waited, turns = os.pread(self._file, 100, 0).split()  # in nanoseconds
+        return self.grow(time.monotonic(), int(worked) * 1e-9, int(waited) * 1e-9, float(turns))
+
+    def grow(self, now: float, worked: float, waited: float, turns: float) -> float:
+        """What it is at a time, in seconds as is what the thread worked and waited up to then.
+
+        `turns` are the times that it was given the processor, each of which takes a moment.
+        """
+        before, self._last = self._last, (now, worked, waited, turns)
+        if not before[0]:
+            return 0.0
+        seconds, worked, waited = now - before[0], worked - before[1], waited - before[2]
+        fade = 0.5 ** (seconds / OF_LATE)
+        self._worked = self._worked * fade + worked
+        kept_waiting = max(waited - (turns - before[3]) * TURN_TAKES, 0.0)
+        self._waited = self._waited * fade + kept_waiting
+        # The share of the processor that a program gets of what it needs.
+        ready = self._worked + self._waited
+        share = max(self._worked / ready, LEAST_SHARE) if ready else 1.0
+        rested = max(seconds - worked - waited, 0.0)
+        self._sum += worked + waited + rested * (1 - share)
+        return self._sum
 
     def close(self) -> None:
         """Nobody asks any more."""

@@ -5,9 +5,9 @@ publisher sends behind it: both are acknowledged later, and the publisher is rea
 is lost between two clients that both read. Rules say for how long; then `queue_full` decides.
 
 * A reader is waited for as long as its queue drains within PATIENCE at the pace of its
-  acknowledgements; the time in which the broker was busy does not count. Who reads nothing holds
-  its publishers for PATIENCE, once, until its queue was empty; who reads too slowly, for little
-  longer.
+  acknowledgements; the time in which the broker was busy does not count, nor the part of the rest
+  that a loaded computer gives to other programs than the reader. Who reads nothing holds its
+  publishers for PATIENCE, once, until its queue was empty; who reads too slowly, for little longer.
 * A publisher is held by all its readers together for no more than PUBLISHER_PATIENCE at once, and
   in the long run MESSAGE_PATIENCE a message: readers that conspire slow it to 100 messages a
   second, and no further.

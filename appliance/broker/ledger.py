@@ -94,7 +94,7 @@ class Ledger:
     refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
-    #: Seconds that the broker has worked, and not waited for something to do.
+    #: Seconds that the broker, or the computer under load, has left none of its clients.
     busy: Callable[[], float] = field(default=lambda: 0.0)
 
     def __post_init__(self) -> None:

@@ -72,9 +72,7 @@ def test_every_load_gives_sane_figures_on_both_brokers(cell: Cell) -> None:
     for figures in (row.ours, row.peer):
         assert figures is not None
         if isinstance(cell, FloodCell):
-            # On a busy computer the subscriber may be too slow to be waited for.
-            assert figures.beside_us is not None and figures.messages > figures.lost
-            figures = dataclasses.replace(figures, lost=0)
+            assert figures.beside_us is not None
         check_sane(figures)
     assert row.met is not None
 

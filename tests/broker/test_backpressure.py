@@ -23,6 +23,7 @@ from appliance.broker.backpressure import (
 from appliance.broker.broker import LOOKS_FOR_ONE, Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Limits
+from appliance.clock import WorkClock
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Disconnect,
@@ -390,6 +391,21 @@ def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: B
     receiver = Actor(reader, pace=1)
     play(broker, publisher, receiver)
     assert receiver.got == numbers(COUNT) and not broker.counters.publish_dropped
+
+
+@pytest.mark.parametrize("load", [0, 2], ids="{} others want the processor".format)
+def test_a_computer_under_load_is_not_the_readers_fault(join: Join, broker: Broker, load: int):
+    """Where the broker has to wait for the processor, the reader has to as well."""
+    clock = WorkClock()
+    broker.ledger.busy = lambda: clock.grow(
+        1 + broker.now, 0.1 * broker.now, load * 0.1 * broker.now, 0
+    )
+    reader = join("reader", version=4)
+    reader.subscribe("a", 1)
+    publisher = Actor(join("publisher", version=4), ["a"], COUNT)
+    receiver = Actor(reader, pace=2)
+    play(broker, publisher, receiver)
+    assert bool(broker.counters.publish_dropped) == (not load)
 
 
 def test_readers_that_conspire_cannot_stop_a_publisher(join: Join, broker: Broker):
