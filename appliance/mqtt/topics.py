@@ -200,10 +200,11 @@ class SubscriptionTree(Generic[V]):
         nodes = [self._root]
         wild = topic[:1] != "$"  # [MQTT-4.7.2-1]: no wildcard for the first level of a $ topic.
         levels = topic.split("/")
-        passed = len(levels) + 1
+        passed = len(levels)
         for level in levels:
             reached: list[_FilterNode[V]] = []
             for node in nodes:
+                passed += 1
                 children = node.children
                 child = children.get(level)
                 if child is not None:
@@ -218,9 +219,8 @@ class SubscriptionTree(Generic[V]):
             nodes = reached
             if not nodes:
                 break
-            passed += len(nodes)
             wild = True
-        self.passed = passed
+        self.passed = passed + len(nodes)
         for node in nodes:
             found.extend(node.values.values())
             child = node.children.get("#")  # `a/#` matches `a` too.
