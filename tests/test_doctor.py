@@ -333,6 +333,18 @@ def test_the_running_one_may_be_seen_after_others(here: Path) -> None:
     assert seen._is_done.is_set()
 
 
+def test_another_node_of_the_same_name() -> None:
+    seen_by = SimpleNamespace(
+        name="/me", nodes=lambda: ["/me", "/appliance"], topics=dict, elsewhere=set
+    )
+    seen = ros._Seen(seen_by, "/appliance")  # type: ignore[arg-type]
+    seen.look()
+    assert not seen.has_twin
+    seen_by.nodes = lambda: ["/me", "/appliance", "/appliance"]
+    seen.look()
+    assert seen.has_twin
+
+
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=1 << 30)
     monkeypatch.setattr(ros.shutil, "disk_usage", lambda folder: usage)

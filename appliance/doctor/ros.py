@@ -18,7 +18,7 @@ from appliance.doctor.finding import Finding
 from appliance.doctor.ros1 import ros1
 from appliance.environment import of_service
 from appliance.ros import discovery, fastdds, installation
-from appliance.ros.discovery import OPEN, OPEN_ADVICE
+from appliance.ros.discovery import OPEN, OPEN_ADVICE, TWIN, TWIN_ADVICE
 from appliance.ros.ros2 import Ros2Node, available
 
 #: Seconds in which other nodes are looked for: most are seen in a tenth of one, some take three.
@@ -231,6 +231,8 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         advice = "the same RMW_IMPLEMENTATION, ROS_DOMAIN_ID and discovery range for all of them"
         yield Finding("problem", subject, text, advice)
         return
+    if seen.has_twin:
+        yield Finding("warning", subject, f"{ours}: {TWIN}", TWIN_ADVICE)
     others = sorted(seen.nodes - {ours or ""})
     if not others:
         advice = (
@@ -258,13 +260,17 @@ class _Seen:
         self.topics: set[str] = set()
         #: Those of them on other computers.
         self.elsewhere: set[str] = set()
+        #: Whether there is another node that is called as the running appliance's.
+        self.has_twin = False
         self.problem = ""
         self._node = node
         self._ours = ours
         self._is_done = threading.Event()
 
     def look(self) -> None:
-        self.nodes = {name for name in self._node.nodes() if name != self._node.name}
+        names = self._node.nodes()
+        self.nodes = {name for name in names if name != self._node.name}
+        self.has_twin = self._ours is not None and names.count(self._ours) > 1
         self.topics = set(self._node.topics()) - _OF_EVERY_NODE
         self.elsewhere = self._node.elsewhere()
         if self.nodes - {self._ours} and (self._ours is None or self._ours in self.nodes):

@@ -34,6 +34,7 @@ from appliance.ros.commands import Commands
 from appliance.ros.convert import Converters
 from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.diagnostics import Diagnostics
+from appliance.ros.discovery import TWIN, TWIN_ADVICE
 from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.graph import CallRoutes, Calls
 from appliance.ros.lease import Leases
@@ -61,8 +62,10 @@ BATCH = 64
 #: one may have been replaced by another. At each look it is the turn of some topics.
 THOROUGH_LOOK = 5
 
-#: Every so many looks the other nodes are counted.
+#: Every so many looks the other nodes are counted; and how often in a row another node of the same
+#: name is there until it is told: one that was killed is seen for 20 s more.
 COUNTED_LOOK = 10
+TWIN_LOOKS = 15
 
 #: Seconds until ROS is tried again when it could not be joined or was lost; each time twice as
 #: many, up to the second of these.
@@ -106,6 +109,7 @@ class Bridge:
         """
         self.problem: str | None = None
         self.peers: int | None = None
+        self._twin_looks = 0
         self._was_joined = False
         self._joined_at: float | None = None
         self._retry = RETRY
@@ -532,8 +536,11 @@ class Bridge:
         self._was_joined = True
         self._joined_at = self._loop.time()
 
-    def _counted(self, peers: int) -> None:
+    def _counted(self, peers: int, has_twin: bool) -> None:
         self.peers = peers
+        self._twin_looks = self._twin_looks + 1 if has_twin else 0
+        if self._twin_looks == TWIN_LOOKS:
+            log.warning("%s: %s; %s", self._node.name, TWIN, TWIN_ADVICE)
 
     def _stopped(self, reason: str) -> None:
         before, self.problem = self.problem, reason
@@ -586,7 +593,9 @@ class Bridge:
             self._looks = 0
             self._post(self._joined)
         if self._looks % COUNTED_LOOK == 0:
-            self._post(self._counted, len(set(self._node.nodes()) - {self._node.name}))
+            names = self._node.nodes()
+            has_twin = names.count(self._node.name) > 1
+            self._post(self._counted, len(set(names) - {self._node.name}), has_twin)
         self._looks += 1
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()

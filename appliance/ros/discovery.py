@@ -29,6 +29,16 @@ OPEN_ADVICE = (
     "robot's own, or SROS 2 (README, Security)"
 )
 
+#: What two nodes of one name mean, and what to do, for the log and `doctor`.
+TWIN = (
+    "another node of this name is on the bus: two bridges there carry everything twice, and each "
+    "has leases and stop messages of its own"
+)
+TWIN_ADVICE = (
+    "give each a bridge.domain_id of its own, or, where both are meant, a bridge.node; one that "
+    "was killed is seen for 20 s more"
+)
+
 OPEN_ROS1 = (
     "ROS 1 is neither encrypted nor asks who comes: who reaches this computer and the Master can "
     "publish commands, past the users, rules and leases of MQTT; keep ROS on a network of its own"

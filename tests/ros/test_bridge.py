@@ -846,6 +846,28 @@ async def test_a_bus_that_comes_back_is_joined_again(house, monkeypatch):
     assert bridge.peers == 1
 
 
+async def test_another_node_of_the_same_name_is_told_once(house, caplog, monkeypatch):
+    """Two bridges on one domain carried everything twice, and nothing said so."""
+    monkeypatch.setattr("appliance.ros.bridge.COUNTED_LOOK", 1)
+    monkeypatch.setattr("appliance.ros.bridge.TWIN_LOOKS", 3)
+    house.start(to_mqtt("/a"))
+    name = house.node.name
+
+    async def look(names, times):
+        monkeypatch.setattr(house.node, "nodes", lambda: names)
+        for _ in range(times):
+            house.node.spin()
+            await house.settle()
+
+    await look([name, "/other"], 5)
+    await look([name, name], 2)  # one that was killed and is started again
+    await look([name], 1)
+    assert "another node of this name" not in caplog.text
+    await look([name, name], 6)
+    assert caplog.text.count("another node of this name") == 1
+    assert "bridge.domain_id" in caplog.text
+
+
 async def test_when_the_node_ends_nothing_is_bridged(house):
     bridge = house.start(both("/chat", type=STRING))
     house.node.fail("the daemon died")
