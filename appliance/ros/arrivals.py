@@ -80,6 +80,11 @@ STEADY = 2
 WITHHELD = 0.15
 TRY_AGAIN = 1.0
 
+#: Why a command is not carried out: it is of a queue; or one of the first two of what may be one,
+#: or a stream, which is as usual, and no reason to warn of anything.
+QUEUED = "others came with it at once, as of a queue"
+BEGINS = "a stream is carried out from its third command on"
+
 #: Clients of which is known that they left while they drove.
 EXPECTED = 1000
 
@@ -98,6 +103,9 @@ class _Pace:
     """How the commands of one client come, since its connection or its last silence began."""
 
     last: float
+    #: Whether the command that came last was its first; or the second of what may be a stream.
+    is_first: bool = True
+    begins: bool = False
     #: Gaps in a row that are no burst.
     steady: int = 0
     is_waiting: bool = False
@@ -145,9 +153,14 @@ class Arrivals:
         verdict = self._judge(pace, origin, qos, oldest, now)
         pace = self._paces[origin]
         pace.number, pace.verdict = number, verdict
-        if pace.is_queue:
-            self._drop(pace, origin, "another followed at once")
+        if verdict is Verdict.REFUSE:
+            self._drop(pace, origin, self.why(origin))
         return verdict
+
+    def why(self, origin: Session) -> str:
+        """Why its command was refused that was judged last."""
+        pace = self._paces.get(origin)
+        return BEGINS if pace is not None and pace.begins else QUEUED
 
     def _judge(
         self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
@@ -164,6 +177,7 @@ class Arrivals:
             return verdict
         gap = now - pace.last
         pace.last = now
+        pace.begins = False
         if is_held:
             pace.is_queue, pace.is_waiting, pace.steady = True, False, 0
             return Verdict.REFUSE
@@ -175,6 +189,8 @@ class Arrivals:
         else:
             coming = self._coming.get(origin)
             pace.steady = 0 if coming is None else coming.steady
+        pace.begins = pace.is_first and pace.steady > 0 and gap < WITHHELD
+        pace.is_first = False
         if pace.steady >= STEADY:
             pace.is_known = True
             pace.is_waiting = pace.is_queue = False
@@ -200,7 +216,7 @@ class Arrivals:
     def _begin(self, origin: Session, oldest: float, now: float) -> Verdict:
         before = self._paces.get(origin)
         if before is not None:
-            self._drop(before, origin, "another followed at once")
+            self._drop(before, origin, QUEUED)
         pace = self._paces[origin] = _Pace(now)
         if self._expected and origin.client_id in self._expected:
             del self._expected[origin.client_id]
@@ -233,7 +249,8 @@ class Arrivals:
             return
         if pace.is_waiting:  # its release may be withheld for longer than the first one waits
             pace.is_queue, pace.is_waiting = True, False
-            self._drop(pace, origin, "another followed at once")
+            begins = self._coming[origin].steady > 0 and now - pace.last < WITHHELD
+            self._drop(pace, origin, BEGINS if begins else QUEUED)
         if _contact(origin).held > oldest:
             self._judge(pace, origin, 2, oldest, now)
 

@@ -19,7 +19,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import HERE, Objection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.arrivals import AHEAD, SENT_AT, Verdict, sent_at
+from appliance.ros.arrivals import AHEAD, BEGINS, QUEUED, SENT_AT, Verdict, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.lease import Lease
@@ -46,8 +46,6 @@ COARSE = 0.02
 #: Seconds until it is looked again whether what a client has sent has been read.
 READ_SOON = 0.01
 
-#: Why a command is refused that is one of many.
-QUEUED = "others came with it at once, as of a queue"
 
 #: Bytes of a payload up to which it may be a stop message: so many for each byte of the message in
 #: CDR, names and digits and white space, and never less than the other.
@@ -80,6 +78,8 @@ class _Command:
     why: str
     #: What it was converted to, where that is known before its turn.
     cdr: bytes = b""
+    #: What is said where its verdict refuses it.
+    refusal: str = QUEUED
     #: Whether its client has ended its connection in good order since.
     has_left: bool = False
 
@@ -224,7 +224,7 @@ class Commands(ToRos):
             return command
         is_refused = command.why or command.verdict is Verdict.REFUSE
         if is_refused and not self._may_stop(message):
-            return self._expire(message, command.why or QUEUED, origin)
+            return self._expire(message, command.why or command.refusal, origin)
         is_kept = retain or (message.retain and self.rules.take_retained)
         if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
             self._is_awaited = True
@@ -246,22 +246,26 @@ class Commands(ToRos):
         # When it was received: what came in one chunk came at once, however long it takes.
         now = self._around.broker.now
         verdict = Verdict.CARRY_OUT
+        refusal = QUEUED
         try:
             why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)
             is_proven = sent_at(message.properties) is not None
         except ValueError as error:
             return self._object(message, f"was refused: {error}")
         if origin is not None:
-            # What waits would be overtaken by it.
-            self._forget(origin, why or "another followed at once")
             if why and origin.link is not None:
+                self._forget(origin, why)
                 self._arrivals.is_old(origin, now)
             elif not why and not is_proven and self.rules.oldest < math.inf:
                 number = self._around.broker.counters.messages_received
                 verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now, number)
-                if verdict is Verdict.WAIT:
-                    self._arrivals.waits(origin, self)
-        return _Command(message, origin, now, verdict, why)
+                if verdict is Verdict.REFUSE:
+                    refusal = self._arrivals.why(origin)
+            # What waits would be overtaken by it.
+            self._forget(origin, why or refusal)
+            if verdict is Verdict.WAIT:
+                self._arrivals.waits(origin, self)
+        return _Command(message, origin, now, verdict, why, refusal=refusal)
 
     def _finish(self, command: _Command) -> Objection | None:
         """Convert it and carry it out, if that is still to be; what the appliance itself fails in
@@ -285,7 +289,7 @@ class Commands(ToRos):
         if isinstance(cdr, Objection):
             return cdr
         if origin is not None and verdict is Verdict.REFUSE:
-            return self._expire(message, QUEUED, origin)
+            return self._expire(message, command.refusal, origin)
         if origin is not None and verdict is Verdict.WAIT:
             return self._let_wait(command, cdr, origin)
         return self._carry_out(message, cdr, origin)
@@ -429,9 +433,12 @@ class Commands(ToRos):
 
     def _expire(self, message: Message, why: str, origin: Session | None) -> Objection:
         self._count_expired(why, origin)
-        return self.objection(message, f"is too old: {why}")
+        return self.objection(message, f"{'may be' if why == BEGINS else 'is too'} old: {why}")
 
     def _count_expired(self, why: str, origin: Session | None) -> None:
+        if why == BEGINS:
+            self._mention("begins", "%s: of %s: %s", origin, why, level=logging.INFO)
+            return
         self.counters.expired += 1
         self.counters.last_error = f"a command was too old: {why}"
         self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
@@ -757,9 +764,9 @@ class Commands(ToRos):
 
     # The log
 
-    def _mention(self, what: str, text: str, *args: object) -> None:
+    def _mention(self, what: str, text: str, *args: object, level: int = logging.WARNING) -> None:
         """Log what may happen with every message once a minute."""
         now = self._around.entries.time()
         if now >= self._told.get(what, -math.inf):
             self._told[what] = now + REPORT_INTERVAL
-            self._tell(logging.WARNING, text, self, *args)
+            self._tell(level, text, self, *args)

@@ -1505,7 +1505,28 @@ async def test_a_qos_2_command_is_not_single_when_another_comes_that_is_released
     driver.say(Pubrel(8))
     await asyncio.sleep(0.3)
     assert house.robot.received == []
-    assert house.counters().expired == 2
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_a_stream_that_begins_is_no_reason_to_warn(house, caplog, qos):
+    house.start(CommandRules(expire=5))
+    caplog.set_level(logging.INFO)
+    driver = Driver(house.broker, "a")
+    driver.wire.connection = Contact()
+    for number in range(5):
+        driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None))
+        if qos == 2:
+            driver.say(Pubrel(number + 1))
+        await asyncio.sleep(0.02)
+    assert house.robot.received == [twist(0.5)] * 3
+    assert house.counters().expired == 0
+    assert house.counters().last_error is None
+    assert "a stream is carried out from its third command on" in caplog.text
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    driver.say(*[Publish(TOPIC, GO)] * 3)  # it is known
+    other = Driver(house.broker, "b")
+    other.say(*[Publish(TOPIC, GO)] * 3)  # and this is a queue
+    assert house.counters().expired == 3
 
 
 @pytest.mark.parametrize("pauses", [False, True])
