@@ -641,7 +641,7 @@ async def _say_often(fight: Fight, packets: list[bytes]) -> None:
 # --- subscriptions
 
 
-@attack(r"may not subscribe to .*(limits\.subscriptions|limits\.memory)")
+@attack(r"may not subscribe to .*limits\.(subscriptions|queue_bytes|(user\.)?memory)")
 async def subscription_bomb(fight: Fight) -> None:
     """A hundred thousand filters, 1,000 a client and one more, in packets as large as may be."""
 
@@ -677,7 +677,7 @@ async def deep_filters(fight: Fight) -> None:
     await fight.crowd(200, subscribe, 1.0)
 
 
-@attack(r"may not subscribe to .*limits\.(subscriptions|memory)")
+@attack(r"may not subscribe to .*limits\.(subscriptions|queue_bytes|(user\.)?memory)")
 async def long_filters(fight: Fight) -> None:
     """Filters of 65,535 bytes, a thousand a client, one of their characters beyond the BMP."""
 
@@ -1236,7 +1236,7 @@ async def hoarder(fight: Fight) -> None:
 
 
 @attack(
-    r"client '.*(as many as a user may have|limits\.(sessions|memory))",
+    r"client '.*limits\.(user\.)?(sessions|memory)",
     said_after=3.0,
     sessions=300,
 )
