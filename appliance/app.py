@@ -113,6 +113,8 @@ class App:
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
+        #: A SIGHUP came during the start.
+        self._reload_waits = asyncio.Event()
         self._certificates_due = asyncio.Event()
         self._status: status.Status | None = None
 
@@ -375,8 +377,12 @@ class App:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.request_stop)  # sets an event, and no more
+        # It would end the process; the start goes on with the files that it has read.
+        loop.add_signal_handler(signal.SIGHUP, self._reload_waits.set)
         await self.start()
         self._entries.signal("signal.reload", signal.SIGHUP, self._on_hangup)
+        if self._reload_waits.is_set():
+            self._on_hangup()
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
         assert self._status is not None
         pulse = Pulse(self.broker, self._listeners.network, self._inside, loop.time)
@@ -465,6 +471,7 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
 
     `ros_arguments` are those that stood behind `--ros-args`; they come after the configuration's.
     """
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until `App.run` knows it: it would end us
     _spare_the_old()
     notifier = Notifier.from_environment(os.environ)
     crashes = CrashReports(settings.crash_reports, settings)

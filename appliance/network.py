@@ -128,6 +128,7 @@ class Network:
         self._turns: deque[Turn] = deque()
         #: `Counters.effort` from which on it is to be asked whether the round is over.
         self.checkpoint = 0
+        self._next_turns: asyncio.Handle | None = None
         self._counting = False
         #: What each account has caused beyond the end of the round.
         self._beyond: dict[Account, int] = {}
@@ -191,7 +192,12 @@ class Network:
             self._schedule_turns()
 
     def _schedule_turns(self) -> None:
-        self.entries.soon("network.turns", self._run_turns, failed=self._schedule_turns)
+        """Run them in the next round, once: also when a fault comes after they were scheduled."""
+        if self._next_turns is not None:
+            self._next_turns.cancel()
+        self._next_turns = self.entries.soon(
+            "network.turns", self._run_turns, failed=self._schedule_turns
+        )
 
     def _run_turns(self) -> None:
         end = self.broker.counters.effort + EFFORT_A_ROUND

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
 from pathlib import Path
 
 import pytest
+import uvloop
 from appliance_process import ACL, ApplianceProcess
+from waiting import PATIENCE
 
+from appliance import config
 from appliance.access import Passwords
+from appliance.app import App
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -145,3 +150,31 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
             AssertionError, match=rf"127\.0\.0\.1:{port} .*in use already; `appliance doctor`"
         ):
             process.start()
+
+
+def test_a_reload_during_the_start_comes_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text(
+        "robot: r2d2\nbroker: {anonymous: true, listeners: [{bind: '127.0.0.1:0'}]}\n"
+        "bridge: {bus: none}\n"
+    )
+    (tmp_path / "acl.conf").write_text("topic #\n")
+    (tmp_path / "users.passwd").touch(0o600)
+    own = App.start
+    reloaded: list[object] = []
+
+    async def start(app: App) -> None:
+        os.kill(os.getpid(), signal.SIGHUP)
+        await own(app)
+
+    async def reload(app: App) -> list[str]:
+        reloaded.append(app.addresses)
+        app.request_stop()
+        return []
+
+    monkeypatch.setattr(App, "start", start)
+    monkeypatch.setattr(App, "reload", reload)
+    uvloop.run(asyncio.wait_for(App(config.load(file)).run(), PATIENCE))
+    assert len(reloaded) == 1 and reloaded[0]

@@ -481,6 +481,7 @@ FIRST: dict[str, tuple[str, ...]] = {
     "broker.abandon": ("flush",),
     "broker.end": ("connection.chunk",),
     "client.cut_off": ("connection.chunk", "broker.end"),
+    "client.shut": ("connection.chunk", "broker.end"),
     "connection.flush": ("connection.chunk",),
     "listener.reopen": ("listener.accept",),
 }
@@ -963,6 +964,53 @@ def test_who_could_not_be_let_in_is_cut_off(
 
     saboteur = Saboteur(monkeypatch)
     run(dial())
+    escaped.clear()
+
+
+def test_a_round_of_turns_that_fails_is_followed_by_one(tmp_path: Path, escaped: list[str]) -> None:
+    """Else each fault would let those with much to do have one round more in each of the loop's."""
+
+    class Busy:
+        faulty = False
+
+        def take_turn(self) -> None:
+            network.queue_turn(self)
+            if self.faulty:
+                self.faulty = False
+                raise SabotageError
+
+        def fault(self, entry: str, error: Exception) -> None:
+            raise error  # that is not to be, and no more than this is to come of it
+
+    async def run() -> None:
+        nonlocal network
+        house = House(*make_contexts(tmp_path))
+        network = house.network
+        scheduled = network.entries.soon
+        rounds = []
+
+        def soon(entry: str, *args: Any, **more: Any) -> asyncio.Handle:
+            handle = scheduled(entry, *args, **more)
+            rounds.extend([handle] if entry == "network.turns" else [])
+            return handle
+
+        network.entries.soon = soon  # type: ignore[method-assign]
+        members = [Busy() for _ in range(3)]
+        for member in members:
+            network.queue_turn(member)
+        for _ in range(5):
+            members[1].faulty = True
+            await until(lambda: not members[1].faulty, "a fault")
+            await asyncio.sleep(0)
+            begun = len(rounds)
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert len(rounds) - begun == 10
+        await house.close()
+
+    network: Any = None
+    asyncio.run(run())
+    assert len(escaped) > 0
     escaped.clear()
 
 

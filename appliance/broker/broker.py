@@ -220,13 +220,17 @@ class Broker:
             session = Session(identity.client_id, identity, self.ledger)
             self.sessions[identity.client_id] = session
         session.link = link
-        self.ledger.accounts.came(session)
-        session.connected_at = self.now
-        session.ends_at = None
-        session.set_will(will)
-        session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
-        session.expiry = expiry
-        self.store.session_saved(session)
+        try:
+            self.ledger.accounts.came(session)
+            session.connected_at = self.now
+            session.ends_at = None
+            session.set_will(will)
+            session.will_at = None  # [MQTT-3.1.3-9]: the will delay is over with the new connection
+            session.expiry = expiry
+            self.store.session_saved(session)
+        except Exception:
+            self.disconnect(session, link, publish_will=False)
+            raise
         return session, present
 
     def _make_room(self, account: Account, session: Session | None) -> None:
@@ -374,19 +378,24 @@ class Broker:
     def disconnect(
         self, session: Session, link: Link, *, publish_will: bool, expiry: int | None = None
     ) -> None:
-        """The connection behind `link` ended; nothing happens when another has taken over."""
+        """The connection behind `link` ended; nothing happens when another has taken over.
+
+        Each part of the end happens, whatever goes wrong in another one: who is gone does not count
+        as connected, and who waits for its departure, as a robot's stop, is told.
+        """
         if session.link is not link:
             return
         self.counters.effort += ENDING_EFFORT
+        faults = self.faults
         session.link = None
         session.is_told_full = False
         session.ended_well = not publish_will
-        session.forget_transient()
-        self._hand_over(session)
         if expiry is not None:
             session.expiry = min(expiry, self.limits.session_expiry)
+        faults.run("disconnect.transient", session.forget_transient, otherwise=None)
+        faults.run("disconnect.hand_over", self._hand_over, session, otherwise=None)
         if self.observer is not None:
-            self.observer.disconnected(session)
+            faults.run("disconnect.observer", self.observer.disconnected, session, otherwise=None)
         self._tell_departure(session)
         if not publish_will:
             session.set_will(None)
@@ -401,7 +410,7 @@ class Broker:
         self.schedule(session)
         if will is not None and not will.delay:
             self._publish_will(session)
-        self.store.session_saved(session)
+        faults.run("disconnect.store", self.store.session_saved, session, otherwise=None)
 
     def _tell_filled(self, session: Session, shortage: str) -> None:
         if session.ends_at is None:  # it is back, or has ended
@@ -430,14 +439,16 @@ class Broker:
         self.ledger.accounts.ended(session)
         self._publish_will(session)
         session.ends_at = None
+        # Each for itself: what is left of a session that has ended would be there for good.
+        faults = self.faults
         effort = ENDING_EFFORT
         for topic_filter in session.subscriptions:
-            self.router.leave(session, topic_filter)
+            faults.run("end.leave", self.router.leave, session, topic_filter, otherwise=None)
             effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
         self.counters.effort += effort
-        session.hand_over(None, self._giver(absent_too=True), sent=True)
-        session.clear()
-        self.store.session_removed(session)
+        faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
+        faults.run("end.clear", session.clear, otherwise=None)
+        faults.run("end.store", self.store.session_removed, session, otherwise=None)
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
@@ -445,6 +456,10 @@ class Broker:
         shares = {known[name] for name in session.subscriptions if name in known}
         if shares:
             session.hand_over(shares, self._giver(absent_too=False), sent=True)
+
+    def _hand_over_all(self, session: Session) -> None:
+        """A session is over: what groups gave it goes to the other members, absent ones too."""
+        session.hand_over(None, self._giver(absent_too=True), sent=True)
 
     def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
         """A way to give other members what one of a group leaves; True when that is settled."""

@@ -20,6 +20,7 @@ from appliance.broker.backpressure import (
 )
 from appliance.broker.broker import HELD_EFFORT, LATE, Broker
 from appliance.broker.handshake import (
+    Agreement,
     agree,
     connack_properties,
     is_text,
@@ -911,6 +912,38 @@ class Client:
             self._connect = packet
             self.refuse(error.code, str(error))
             return
+        try:
+            self._open(session, identity, present, packet, agreement, authentication)
+        except Exception:
+            # It has not logged in after all: CONNECT is what is refused.
+            self.broker.disconnect(session, self.output, publish_will=False)
+            self.session = None
+            raise
+        if self._closed:
+            return
+        log.info(
+            "%s connected: MQTT %s, keep alive %d s%s",
+            self,
+            VERSION_NAMES[packet.version],
+            agreement.keep_alive,
+            ", session continued" if present else "",
+        )
+        if self.broker.journal is not None:
+            address, secured = self.wire.address, self.wire.secured()
+            self.broker.journal.connected(session, address, packet.version, secured)
+        self.broker.connected(session)
+        self.receive(b"")  # what came behind CONNECT
+
+    def _open(
+        self,
+        session: Session,
+        identity: Identity,
+        present: bool,
+        packet: Connect,
+        agreement: Agreement,
+        authentication: Properties | None,
+    ) -> None:
+        """Begin to be the session's client, up to the CONNACK."""
         session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
@@ -939,20 +972,6 @@ class Client:
         )
         # In 3.1 the byte that says it is reserved.
         self._send(Connack(present and packet.version != V31, ReasonCode.SUCCESS, properties))
-        if self._closed:
-            return
-        log.info(
-            "%s connected: MQTT %s, keep alive %d s%s",
-            self,
-            VERSION_NAMES[packet.version],
-            agreement.keep_alive,
-            ", session continued" if present else "",
-        )
-        if self.broker.journal is not None:
-            address, secured = self.wire.address, self.wire.secured()
-            self.broker.journal.connected(session, address, packet.version, secured)
-        self.broker.connected(session)
-        self.receive(b"")  # what came behind CONNECT
 
     # --- turns, and bytes out ------------------------------------------------------------------
 
@@ -1015,6 +1034,7 @@ class Client:
     def fault(self) -> None:
         """Something went wrong in here: tell the client so (0x83), and end its connection."""
         if self._closed:
+            self._make_sure()
             return
         code = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
         if self.session is not None:
@@ -1027,17 +1047,23 @@ class Client:
 
     def cut_off(self) -> None:
         """Cut the connection, as not even its end went well; nothing refers to it any more."""
-        self._closed = True
-        self._work = None
-        self.broker.clients.discard(self)
-        session = self.session
-        if session is not None and session.link is self.output:
-            try:
-                self.broker.disconnect(session, self.output, publish_will=True)
-            except Exception as error:
-                self.broker.faults.caught("client.cut_off", error, self)
-                session.link = None
+        try:
+            self._shut()
+        except Exception as error:
+            self.broker.faults.caught("client.shut", error, self)
+        try:
+            self._make_sure()
+        except Exception as error:
+            self.broker.faults.caught("client.cut_off", error, self)
+            if self.session is not None and self.session.link is self.output:
+                self.session.link = None
         self.wire.abort()
+
+    def _make_sure(self) -> None:
+        """The connection has ended: so it has for its session, even if a fault came in between."""
+        self.broker.clients.discard(self)
+        if self.session is not None:
+            self.broker.disconnect(self.session, self.output, publish_will=True)
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
@@ -1061,6 +1087,8 @@ class Client:
             if self.session is not None:
                 log.info("%s: connection lost", self)
             self._leave("connection lost", publish_will=True)
+        else:
+            self._make_sure()
 
     def let_go(self, wire: Wire) -> None:
         """The connection is gone, and not to be held any longer: `wire` stands for it now."""
@@ -1076,22 +1104,27 @@ class Client:
         return True
 
     def _leave(self, why: str, *, publish_will: bool, expiry: int | None = None) -> None:
-        session = self.session
-        self._shut()
-        if session is not None:
-            if self.broker.journal is not None:
-                self.broker.journal.disconnected(session, self.wire.address, why)
-            self.broker.disconnect(session, self.output, publish_will=publish_will, expiry=expiry)
+        session, journal = self.session, self.broker.journal
+        try:
+            self._shut()
+            if session is not None and journal is not None:
+                journal.disconnected(session, self.wire.address, why)
+        finally:
+            if session is not None:
+                self.broker.disconnect(
+                    session, self.output, publish_will=publish_will, expiry=expiry
+                )
 
     def _shut(self) -> None:
+        """Take in nothing more, and give back what is held; may be called twice."""
         self._closed = True
         self._work = None
-        self._stop_waiting()
-        self._behind.clear()
-        self._behind_size = 0
-        self.connection.close()
         self._ledger.take(self.account, -self._held)
         self._ledger.input_bytes -= self._held
         self._held = 0
         self.broker.clients.discard(self)
+        self._stop_waiting()
+        self._behind.clear()
+        self._behind_size = 0
+        self.connection.close()
         self.output.end()

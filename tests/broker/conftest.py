@@ -19,6 +19,7 @@ from appliance.broker.ports import (
     Exchange,
     Identity,
     Limits,
+    Secured,
     UserLimits,
 )
 from appliance.broker.retained import retained_size
@@ -196,6 +197,9 @@ class FakeWire:
     def admit(self, account: Account) -> str:
         assert not self.closed
         return ""
+
+    def secured(self) -> Secured:
+        return Secured()
 
     def holds(self, size: int) -> None:
         pass

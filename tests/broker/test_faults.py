@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,6 +14,7 @@ from appliance.broker.faults import PLACES, Faults
 from appliance.broker.message import Message
 from appliance.broker.output import LONGEST_REASON
 from appliance.broker.ports import Decision, Features, InsideLink, Limits
+from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,
@@ -24,7 +27,7 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
-from broker.conftest import FakeAccess, FakeStore, Peer
+from broker.conftest import FakeAccess, FakeStore, Peer, check_accounts
 
 FAULT = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
 
@@ -208,7 +211,7 @@ def test_one_keep_alive_will_session_and_retained_message_that_fail(broker, stor
     broker.tick(1006.0)
     assert [m.topic for m in watcher.messages()] == ["will/a", "will/b", "will/c"]
     assert not any(f"gone-{n}" in broker.sessions for n in "abc")
-    assert broker.faults.by_entry == {"clock.session": 1}
+    assert broker.faults.by_entry == {"end.store": 1}
     assert not any(broker.retained.get(f"kept/{n}") for n in "abc")
     escaped.clear()
     broker.tick(1030.0)
@@ -373,4 +376,114 @@ def test_to_tell_of_a_fault_is_none(escaped):
     faults.caught("another", BrokenError("x" * 10_000_000))
     assert faults.count == 2 and len(faults.last) < 1000
     assert faults.run("third", fail, otherwise=7) == 7
+    escaped.clear()
+
+
+# --- faults at the beginning and at the end of a connection --------------------------------------
+
+
+def once(monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> None:
+    """Let a method fail the first time that it is called."""
+    own = getattr(owner, name)
+
+    def failing(*args: Any, **more: Any) -> Any:
+        monkeypatch.setattr(owner, name, own)
+        raise BrokenError(name)
+
+    monkeypatch.setattr(owner, name, failing)
+
+
+#: What the end of a connection consists of: the object and its method.
+PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
+    (lambda broker, peer: Session, "forget_transient"),
+    (lambda broker, peer: broker, "_hand_over"),
+    (lambda broker, peer: broker.observer, "disconnected"),
+    (lambda broker, peer: broker.journal, "disconnected"),
+    (lambda broker, peer: broker, "_publish_late"),
+    (lambda broker, peer: broker.store, "session_saved"),
+    (lambda broker, peer: broker.store, "session_removed"),
+    (lambda broker, peer: broker.router, "leave"),
+    (lambda broker, peer: peer.client, "_stop_waiting"),
+    (lambda broker, peer: peer.client.connection, "close"),
+    (lambda broker, peer: peer.client.output, "end"),
+]
+
+
+@pytest.mark.parametrize("expiry", [0, 60])
+@pytest.mark.parametrize("leaves", [False, True], ids=["lost", "disconnects"])
+@pytest.mark.parametrize(("whose", "name"), PARTS, ids=[name for _, name in PARTS])
+def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, name, leaves, expiry):
+    broker.observer, broker.journal = Mock(), Mock()
+    departed: list[str] = []
+    broker.departures.append(lambda session: departed.append(session.client_id))
+    keeps = {Property.SESSION_EXPIRY_INTERVAL: expiry}
+    other.subscribe("will", 1)
+    peer = join(broker, "a", properties=keeps, will=Will("will", b"w", 1))
+    peer.subscribe("x", 1)
+    account = peer.session.account
+    once(monkeypatch, whose(broker, peer), name)
+    if leaves:
+        try:
+            peer.send(Disconnect())
+        except BrokenError as error:  # as the wire does it
+            broker.fault("connection.chunk", error, peer.client)
+    else:
+        try:
+            peer.lose()
+        except BrokenError as error:
+            broker.fault("connection.lost", error, peer.client)
+    broker.flush()
+    assert peer.client not in broker.clients
+    assert account.connections == (1 if account is other.session.account else 0)
+    assert departed == ["a"]
+    session = broker.sessions.get("a")
+    if expiry:
+        assert session is not None and session.link is None and session.ends_at is not None
+    else:
+        assert session is None and not broker.router.shares
+    assert peer.client._held == 0
+    wills = [each for each in other.received() if isinstance(each, Publish)]
+    if name != "_publish_late":
+        assert len(wills) == (0 if leaves else 1)
+    monkeypatch.undo()
+    again = join(broker, "a", properties=keeps)
+    assert again.session.link is again.client.output
+    goes_on(broker, other)
+    check_accounts(broker)
+    escaped.clear()
+
+
+@pytest.mark.parametrize("present", [False, True])
+@pytest.mark.parametrize("name", ["session_saved", "reconnected", "set_will", "open", "accept"])
+def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
+    broker, other, monkeypatch, escaped, name, present
+):
+    keeps = {Property.SESSION_EXPIRY_INTERVAL: 60}
+    if present:
+        join(broker, "a", properties=keeps).lose()
+    peer = Peer(broker)
+    peer.say_connect("a", properties=keeps, will=Will("other/will", b"w", 1))
+    owner = {
+        "session_saved": broker.store,
+        "reconnected": Session,
+        "set_will": Session,
+        "open": peer.client.output,
+        "accept": peer.client.connection,
+    }[name]
+    once(monkeypatch, owner, name)
+    try:
+        peer.client.accept("user")
+    except BrokenError as error:
+        broker.fault("connection.turn", error, peer.client)
+    broker.flush()
+    assert peer.only(Connack).reason_code == FAULT
+    assert peer.wire.closed and peer.client not in broker.clients
+    session = broker.sessions.get("a")
+    assert session is None or session.link is None
+    assert not [each for each in other.received() if isinstance(each, Publish)]
+    monkeypatch.undo()
+    again = join(broker, "a", properties=keeps)
+    assert again.session.link is again.client.output
+    goes_on(broker, other)
+    check_accounts(broker)
     escaped.clear()
