@@ -682,6 +682,12 @@ class Broker:
         Of a group that is one of these if nobody in it has room.
         """
         size = message.size
+        if len(route.targets) == 1 and not route.shares:  # the most, in a flood
+            session, qos, _, _ = route.targets[0]
+            congestion = session.congestion
+            if congestion is None or not qos or session.link is None or not session.is_full(size):
+                return []
+            return [congestion] if congestion.patience() else []
         self._count_looks(route)
         full = [
             session

@@ -463,8 +463,10 @@ class Client:
             allowance.change(self._waits_since - now)
         self._waits_since = now
         if not congestions or allowance.used_up or self._hurries:
-            allowance.change(MESSAGE_PATIENCE)
-            self._stop_waiting()
+            if allowance.left < PUBLISHER_PATIENCE:
+                allowance.change(MESSAGE_PATIENCE)
+            if self._awaited:
+                self._stop_waiting()
             return False
         for congestion in self._awaited:
             if congestion not in congestions:

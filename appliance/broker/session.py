@@ -767,10 +767,14 @@ class Session:
     def is_full(self, size: int) -> bool:
         """Whether a QoS 1 or 2 message of so many bytes finds no room in the queue, or only such
         as others wait for."""
-        return (
-            len(self.queue) >= self.ledger.limits.queue_messages
-            or not self.fits(size)
-            or (self.congestion is not None and self.congestion.awaited)
+        ledger = self.ledger
+        if self.congestion is not None and self.congestion.awaited:
+            return True
+        if len(self.queue) >= ledger.limits.queue_messages:
+            return True
+        is_little = self.bytes + size <= ledger.half_queue
+        return not (is_little and ledger.queued_bytes + size <= ledger.plenty) and not self.fits(
+            size
         )
 
     def _is_crowded(self) -> bool:
