@@ -42,12 +42,12 @@ TWIST = "geometry_msgs/msg/Twist"
 
 #: Seconds: `expire` of the route, and what a busy computer may add to an age.
 EXPIRE = 0.5
-TOLERANCE = 0.7
+TOLERANCE = 0.4
 
 #: Commands a second of a stream, and the last that may be the first to move the robot: it is the
 #: third to come at this pace, and an interpreter that warms up sends some in one go before.
 RATE = 20
-FIRST_OF_A_STREAM = 6
+FIRST_OF_A_STREAM = 4
 
 #: How often it is tried whether new commands move the robot.
 TRIES = 4
