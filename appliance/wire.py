@@ -99,6 +99,7 @@ class ClientProtocol:
         self._is_lost = False
         # Input: what was received and waits, and what it waits for.
         self._held = _NOTHING
+        self._held_size = 0  # bytes of the chunk that it is the rest of, in the ledger
         self._frame = 0  # bytes of a WebSocket frame that is not complete
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
@@ -269,6 +270,7 @@ class ClientProtocol:
                 self._broker.fault("connection.last_chunk", error, self._client)
         self._transport = None
         self.keep(0)
+        self._let_go_of_held()
         if self._connection is not None:
             self._network.part(self._connection)
         if self._network.is_busy():
@@ -368,7 +370,7 @@ class ClientProtocol:
                 self._take_portion(data)
                 network.went_beyond(account, self._counters.effort - begun)
             else:
-                self._held = memoryview(data)
+                self._hold(data, 0)
                 self._read_later()
             return b""
         self._check_memory()
@@ -376,7 +378,7 @@ class ClientProtocol:
         if len(data) >= LARGE_CHUNK or len(data) > portion:
             self._read_later()
         if len(data) > portion:
-            self._held = memoryview(data)[portion:]
+            self._hold(data, portion)
         return data[:portion]
 
     def _check_publisher(self) -> None:
@@ -460,8 +462,9 @@ class ClientProtocol:
             return
         elif self._held:
             portion = bytes(self._held[: self._network.portion])
-            # An empty part would keep the whole.
-            self._held = self._held[self._network.portion :] or _NOTHING
+            self._held = self._held[self._network.portion :]
+            if not self._held:  # an empty part would keep the whole
+                self._let_go_of_held()
             self._take_portion(portion)
             self._read_later()
         else:
@@ -475,6 +478,17 @@ class ClientProtocol:
             ):
                 inflow.has_caught_up()
             self._transport.resume_reading()
+
+    def _hold(self, data: bytes, begin: int) -> None:
+        """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
+        self._held = memoryview(data)[begin:]
+        self._ledger.take(self.account, len(data) - self._held_size)
+        self._held_size = len(data)
+
+    def _let_go_of_held(self) -> None:
+        self._held = _NOTHING
+        self._ledger.take(self.account, -self._held_size)
+        self._held_size = 0
 
     def _take_portion(self, data: bytes) -> None:
         """Take in what is not to wait for a turn, or has had it."""
@@ -663,8 +677,9 @@ class ClientProtocol:
         self._timeout.cancel()
         self._network.count_output(self.account, -self._counted)
         self._network.count_output(account, self._counted)
-        self._ledger.take(self.account, -self._frame)
-        self._ledger.take(account, self._frame)
+        waits = self._frame + self._held_size
+        self._ledger.take(self.account, -waits)
+        self._ledger.take(account, waits)
         self.account = account
         return ""
 

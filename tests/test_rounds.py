@@ -129,3 +129,26 @@ async def test_many_that_go_at_once_are_no_more_than_a_round(house: House):
     for _ in there:
         heard = await watcher.hear()
         assert isinstance(heard, Publish) and heard.payload == b"gone"
+
+
+@pytest.mark.parametrize("end", ["taken in", "lost"])
+async def test_what_was_received_and_waits_is_counted_for_its_user(house: House, end: str):
+    await house.start()
+    ledger = house.broker.ledger
+    there = await crowd(house)
+    (caller, protocol), *_ = there
+    await asyncio.sleep(0)
+    before = ledger.queued_bytes
+    chunk = Publish("a", bytes(1000)).encode(5) * 100
+    house.network.is_round_over()
+    house.network.count(2 * EFFORT_A_ROUND)
+    protocol.data_received(chunk)
+    assert protocol._held and ledger.queued_bytes - before >= len(chunk)
+    assert protocol.account.bytes >= len(chunk)
+    if end == "lost":
+        protocol.connection_lost(None)
+        caller.hang_up()
+    await until(
+        lambda: not protocol._held and ledger.queued_bytes == before,
+        lambda: f"{ledger.queued_bytes - before} bytes that are counted",
+    )
