@@ -294,6 +294,22 @@ def _contact(origin: Session) -> Contact:
     return HERE if origin.link is None else origin.link.contact()
 
 
+def said_age(properties: Properties | None, now: float) -> float | None:
+    """How old a message is by its `sent-at`, in seconds, `now` being since 1970; None when it says
+    nothing.
+
+    ValueError: what it says is nonsense, or in the future.
+    """
+    made_at = sent_at(properties)
+    if made_at is None:
+        return None
+    age = now - made_at
+    if age < -AHEAD:
+        ahead = f"its {SENT_AT} is {-age:.1f} s in the future"
+        raise ValueError(f"{ahead}: set the clocks of the robot and its client")
+    return age
+
+
 def sent_at(properties: Properties | None) -> float | None:
     """When its client made the message, in seconds since 1970; None when it does not say.
 

@@ -25,6 +25,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -39,6 +40,7 @@ from appliance.entries import Entries
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.ros.arrivals import SENT_AT, said_age
 from appliance.ros.backlog import Backlog
 from appliance.ros.convert import TooLargeError
 from appliance.ros.payloads import (
@@ -531,8 +533,16 @@ class Switchboard:
         caller = call.caller
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
+        try:
+            age = said_age(message.properties, time.time())
+        except ValueError as error:
+            raise CallError("bad_request", str(error)) from None
         is_over = message.expires_at is not None and message.expires_at <= self._broker.now
-        if is_over or self._backlog.has(message, caller, offer.timeout, self._loop.time()):
+        if age is None:
+            is_over |= self._backlog.has(message, caller, offer.timeout, self._loop.time())
+        elif age > offer.timeout:
+            raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")
+        if is_over:
             # Nobody waits for its answer any more, and what it would do nobody expects now.
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
         size = len(call.payload)

@@ -19,7 +19,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import HERE, Objection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.arrivals import AHEAD, BEGINS, QUEUED, SENT_AT, Verdict, sent_at
+from appliance.ros.arrivals import BEGINS, QUEUED, SENT_AT, Verdict, said_age, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.lease import Lease
@@ -394,14 +394,10 @@ class Commands(ToRos):
         oldest = self.rules.oldest
         if oldest == math.inf:
             return ""
-        made_at = sent_at(message.properties)
-        if made_at is None:
+        age = said_age(message.properties, time.time())
+        if age is None or age <= oldest:
             return ""
-        age = time.time() - made_at
-        if age < -AHEAD:
-            ahead = f"its {SENT_AT} is {-age:.1f} s in the future"
-            raise ValueError(f"{ahead}: set the clocks of the robot and its client")
-        return f"it was sent {age:.1f} s before, by its {SENT_AT}" if age > oldest else ""
+        return f"it was sent {age:.1f} s before, by its {SENT_AT}"
 
     def _is_late_stop(self, message: Message, origin: Session | None) -> bool:
         """Whether a message that is too old stops the robot, and is carried out all the same.

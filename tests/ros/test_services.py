@@ -6,6 +6,7 @@ import asyncio
 import gc
 import json
 import logging
+import time
 
 import pytest
 from waiting import until
@@ -322,6 +323,29 @@ async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(hous
     assert codes == ["expired", "expired"] and switch.asked == []
     house.broker.publish(Late(again, 1.0), house.client("bob").session)  # within its time
     await until(lambda: switch.asked, "another client's call")
+
+
+@pytest.mark.parametrize(
+    ("ago", "code"), [(60.0, "expired"), (-60.0, "bad_request"), (0.0, None), (3.0, None)]
+)
+async def test_a_call_is_as_old_as_it_says(house, ago, code):
+    """Also the first of a client that was never seen, which may have queued it."""
+    house.start(service("/switch"))
+    switch = Switch(house)
+    house.node.spin()
+    await asyncio.sleep(0)
+    said = {
+        Property.RESPONSE_TOPIC: "answers/alice",
+        Property.USER_PROPERTY: [("sent-at", str(time.time() - ago))],
+    }
+    client = house.client("alice")
+    house.broker.publish(Message(CALL, b"", 1, properties=said), client.session)
+    if code is None:
+        await until(lambda: switch.asked, "the call")
+        return
+    await until(lambda: client.on("answers/alice"), "the error")
+    assert client.payloads("answers/alice")[0]["error"]["code"] == code
+    assert switch.asked == []
 
 
 async def test_patterns_follow_the_bus(house):
