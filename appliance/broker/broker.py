@@ -1019,7 +1019,7 @@ class Broker:
             except Exception as error:
                 self._abandon("flush.wait", error, output)
         if self._waiting:
-            self.store.hurry()
+            self.faults.run("commit.hurry", self.store.hurry, otherwise=None)
         return free
 
     def _committed(self, kept: bool) -> None:
@@ -1043,7 +1043,7 @@ class Broker:
             for output in waiting:
                 faults.run("commit.abandon", output.abandon, otherwise=None)
         if self._waiting:
-            self.store.hurry()
+            self.faults.run("commit.hurry", self.store.hurry, otherwise=None)
         self.flush()
 
     def _recover(self) -> None:

@@ -13,7 +13,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.faults import PLACES, Faults
 from appliance.broker.message import Message
 from appliance.broker.output import LONGEST_REASON
-from appliance.broker.ports import Decision, Features, InsideLink, Limits
+from appliance.broker.ports import Decision, Features, Identity, InsideLink, Limits
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
@@ -487,3 +487,34 @@ def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
     goes_on(broker, other)
     check_accounts(broker)
     escaped.clear()
+
+
+def test_who_waits_for_no_commit_is_written_to_when_the_store_cannot_be_hurried(
+    broker, store, other, escaped
+):
+    keeper = join(broker, "keeper", properties={Property.SESSION_EXPIRY_INTERVAL: 60})
+    other.subscribe("free", 0)
+    store.holding = True
+    store.hurry = fail
+    keeper.client.receive(
+        Subscribe(1, [Subscription("x", 1)]).encode(5) + Publish("free", b"1").encode(5)
+    )
+    broker.flush()
+    assert other.payloads() == [b"1"] and not keeper.received()
+    store.commit()
+    assert keeper.received()
+    assert set(broker.faults.by_entry) == {"commit.hurry"}
+    escaped.clear()
+
+
+def test_the_bytes_of_a_session_go_with_it_to_its_user(broker):
+    """As of one that was made for a plugin before anybody had logged in."""
+    accounts = broker.ledger.accounts
+    session = broker.attach("claimed", InsideLink())
+    broker.subscribe(session, Subscription("a/long/filter", 1))
+    held = session.bytes
+    before = accounts.inside.bytes
+    assert held
+    broker.claim(session, Identity("user", "claimed"))
+    assert accounts.of_user("user").bytes == held
+    assert accounts.inside.bytes == before - held
