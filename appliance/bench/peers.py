@@ -54,7 +54,7 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
 }
 QUEUES = f"max_inflight_messages {INFLIGHT}\nmax_queued_messages 0"  # of mosquitto
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
-START_SECONDS = 20.0
+START_SECONDS = 60.0
 STOP_SECONDS = 10.0
 
 
