@@ -683,7 +683,7 @@ async def _waits(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("clock.full")
 async def _fills(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
-    site.broker.ledger.filled.append(protocol._client.session)
+    site.broker.ledger.filled.append((protocol._client.session, "a limit"))
 
 
 @reach("bridge.sweep")
