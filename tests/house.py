@@ -166,4 +166,6 @@ class Caller:
         return b""
 
     def hang_up(self) -> None:
-        self.writer.transport.abort()
+        # asyncio's own, when it has closed behind its last bytes, cannot be aborted any more.
+        with contextlib.suppress(AttributeError):
+            self.writer.transport.abort()

@@ -20,7 +20,7 @@ import pytest
 
 from appliance import entries
 from appliance.broker.faults import Faults
-from appliance.ros import ros2
+from appliance.ros.contained import ContainedThread
 
 PACKAGE = Path(__file__).parents[1] / "appliance"
 
@@ -183,12 +183,12 @@ class Saboteur:
         def shielded(own, entry, faults, told):
             shield(own, entry, faults, Struck(entry, told))
 
-        contained = ros2.Ros2Node._contained
+        contained = ContainedThread._contained
 
         def of_the_node(own, entry, callback):
             return contained(own, entry, partial(first, entry, callback))
 
-        monkeypatch.setattr(ros2.Ros2Node, "_contained", of_the_node)
+        monkeypatch.setattr(ContainedThread, "_contained", of_the_node)
         monkeypatch.setattr(entries.Entries, "run", entered)
         monkeypatch.setattr(entries.Entries, "task", begun)
         monkeypatch.setattr(entries.Repeated, "__init__", repeated)

@@ -17,8 +17,12 @@ ROOT = Path(__file__).parents[1]
 #: The tests of what is compiled, as far as they run in their own process.
 TESTS = ["tests/broker", "tests/mqtt", "tests/test_tls.py", "tests/test_websocket.py"]
 
-#: They put a function of their own into a class, which a compiled one does not take.
-PATCHING = ["tests/broker/test_effort.py::test_to_leave_many_groups_takes_one_look_at_what_waits"]
+#: They put something of their own into a class or in its place, which a compiled one refuses.
+PATCHING = [
+    "tests/broker/test_effort.py::test_to_leave_many_groups_takes_one_look_at_what_waits",
+    "tests/broker/test_faults.py::test_an_end_comes_to_its_end",
+    "tests/broker/test_faults.py::test_a_fault_at_the_end_of_a_login_leaves_nobody_connected",
+]
 
 #: Prints where two of the compiled modules come from.
 WHERE = "from appliance import wire; from appliance.broker import client; print(wire, client)"

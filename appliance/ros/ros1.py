@@ -23,6 +23,7 @@ from time import monotonic
 from typing import Any
 
 from appliance.entries import Entries
+from appliance.ros.contained import ContainedThread
 from appliance.ros.definitions import PACKED, TypeDescription, UnknownTypeError
 from appliance.ros.node import (
     BusError,
@@ -125,7 +126,7 @@ def remappings(arguments: Iterable[str]) -> Iterator[str]:
         before = argument
 
 
-class Ros1Node:
+class Ros1Node(ContainedThread):
     """A RosNode on ROS 1. There can be one at a time in a process, as rospy is one.
 
     Messages come on threads of rospy's, one at a time for each subscription.
@@ -137,6 +138,7 @@ class Ros1Node:
         self, name: str = "appliance", namespace: str = "/", arguments: Sequence[str] = ()
     ) -> None:
         """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
+        super().__init__()
         self._arguments = list(remappings(arguments))
         said = dict(argument.split(":=", 1) for argument in self._arguments)
         space = os.environ.get("ROS_NAMESPACE", "") if namespace == "/" else namespace
@@ -190,6 +192,7 @@ class Ros1Node:
         failed: Callable[[str], None],
         entries: Entries | None = None,
     ) -> None:
+        self._entries = entries
         is_available, reason = available()
         if not is_available:
             failed(reason)
@@ -300,10 +303,7 @@ class Ros1Node:
                 callback = self._work.get(timeout=max(0.0, until - monotonic()))
             except queue.Empty:
                 return
-            try:
-                callback()
-            except Exception:  # it must not end the thread
-                log.exception("a fault on the ROS thread")
+            callback()
 
     def _leave(self) -> None:
         self._definitions.close()
@@ -314,7 +314,7 @@ class Ros1Node:
     def call_soon(self, callback: Callable[[], None]) -> None:
         if not self._is_running:
             raise BusError("ROS is not ready")
-        self._work.put(callback)
+        self._work.put(self._contained("ros.task", callback))
 
     # The graph
 
@@ -524,7 +524,8 @@ class Ros1Node:
         is_latched = qos.durability is Durability.TRANSIENT_LOCAL
         definition = self._definition(type_name)
         topic = self._resolve(topic)
-        return Subscription(self._rospy, self, topic, definition, is_latched, callback)
+        contained = self._contained("ros.message", callback)
+        return Subscription(self._rospy, self, topic, definition, is_latched, contained)
 
     def hear(self, topic: str, node: str, is_latched: bool) -> bool:
         """What a publisher says of itself; whether that is news."""

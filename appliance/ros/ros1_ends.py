@@ -261,7 +261,7 @@ class Service:
         answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._waiting.add(answer)
         try:
-            self._call_soon(partial(self._callback, request._buff, answer.put))
+            self._call_soon(partial(self._ask, request._buff, answer.put))
             response = answer.get()
         except BusError as error:
             raise self._error(str(error)) from error
@@ -270,6 +270,13 @@ class Service:
         if response is None:
             raise self._error("nobody on MQTT answered")
         return _of(self._response_class, response)
+
+    def _ask(self, request: bytes, respond: Respond) -> None:
+        try:
+            self._callback(request, respond)
+        except Exception:
+            respond(None)  # rospy's thread would wait for good
+            raise
 
     def destroy(self) -> None:
         self._own.shutdown("its route has ended")

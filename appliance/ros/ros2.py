@@ -17,6 +17,7 @@ from typing import Any
 
 from appliance.entries import Entries
 from appliance.ros import fastdds, installation, uncompiled
+from appliance.ros.contained import ContainedThread
 from appliance.ros.definitions import (
     CDR,
     TypeDescription,
@@ -97,7 +98,7 @@ def _resources(kind: str) -> Iterator[str]:
             yield from (entry.name for entry in index.iterdir())
 
 
-class Ros2Node:
+class Ros2Node(ContainedThread):
     """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
 
     wire = CDR
@@ -117,6 +118,7 @@ class Ros2Node:
 
         Other nodes are told from this one by their full name, which ROS wants to be unique.
         """
+        super().__init__()
         self.name = f"{namespace.rstrip('/')}/{name}"
         self._base_name = name
         self._namespace = namespace
@@ -133,7 +135,6 @@ class Ros2Node:
         self._clock: Any = None
         #: Who could be heard when the bus was joined.
         self._reach = Reach.NOBODY
-        self._entries: Entries | None = None
         #: Whether the loop's thread may take messages itself, as far as is known.
         self._takes_on_loop = True
         self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
@@ -255,24 +256,6 @@ class Ros2Node:
                 self._tell_fault("ros.task", error)
 
         executor.create_task(run)
-
-    def _contained(self, entry: str, callback: Callable[..., None]) -> Callable[..., None]:
-        def run(*args: Any) -> None:
-            try:
-                callback(*args)
-            except Exception as error:  # as in `call_soon`
-                self._tell_fault(entry, error)
-
-        return run
-
-    def _tell_fault(self, entry: str, error: Exception) -> None:
-        """Count, on the loop's thread, what was caught on this one."""
-        entries = self._entries
-        with suppress(RuntimeError):  # the loop is closed: there is nobody to hear it
-            if entries is not None:
-                entries.from_thread("ros.fault", entries.faults.caught, entry, error)
-                return
-        log.error("a fault on the ROS thread (%s)", entry, exc_info=error)
 
     # The graph
 

@@ -1,0 +1,39 @@
+"""What escapes on a thread of ROS is caught there, and counted on the loop's thread."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from appliance.entries import Entries
+
+log = logging.getLogger(__name__)
+
+
+class ContainedThread:
+    """What a node calls on its own threads; `entries` are the loop's, or None without one."""
+
+    def __init__(self) -> None:
+        self._entries: Entries | None = None
+
+    def _contained(self, entry: str, callback: Callable[..., None]) -> Callable[..., None]:
+        """The callback, whose exceptions end nothing else."""
+
+        def run(*args: Any) -> None:
+            try:
+                callback(*args)
+            except Exception as error:  # it would end the thread, or the whole process
+                self._tell_fault(entry, error)
+
+        return run
+
+    def _tell_fault(self, entry: str, error: Exception) -> None:
+        """Count, on the loop's thread, what was caught on this one."""
+        entries = self._entries
+        with suppress(RuntimeError):  # the loop is closed: there is nobody to hear it
+            if entries is not None:
+                entries.from_thread("ros.fault", entries.faults.caught, entry, error)
+                return
+        log.error("a fault on the ROS thread (%s)", entry, exc_info=error)
