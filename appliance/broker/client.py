@@ -458,16 +458,10 @@ class Client:
         """Let the message wait if readers have no room for it, and soon will."""
         congestions = self.broker.congestions(route, message) if route.allowed else []
         allowance = self._allowance
-        now = self._ledger.now
-        if self._awaited:
-            allowance.change(self._waits_since - now)
-        self._waits_since = now
         if not congestions or allowance.used_up or self._hurries:
-            if allowance.left < PUBLISHER_PATIENCE:
-                allowance.change(MESSAGE_PATIENCE)
-            if self._awaited:
-                self._stop_waiting()
+            self._get_on()
             return False
+        self._waits_since = now = self._ledger.now
         for congestion in self._awaited:
             if congestion not in congestions:
                 congestion.forget(self)
@@ -484,6 +478,13 @@ class Client:
         self._behind_size += _size(arrived)
         self.connection.pause()
         return True
+
+    def _get_on(self) -> None:
+        """A message waits for nobody, or not any more."""
+        if self._allowance.left < PUBLISHER_PATIENCE:
+            self._allowance.change(MESSAGE_PATIENCE)
+        if self._awaited:
+            self._stop_waiting()
 
     def _stop_waiting(self) -> None:
         for congestion in self._awaited:
@@ -536,6 +537,10 @@ class Client:
         if not behind:
             return
         limit = self._counters.effort + EFFORT_A_TURN
+        if self._awaited:
+            now = self._ledger.now
+            self._allowance.change(self._waits_since - now)
+            self._waits_since = now
         try:
             while behind and self._work is None:
                 if self._counters.effort > limit:
@@ -551,11 +556,15 @@ class Client:
                     self._on_packet(arrived)
                 if len(behind) > left:
                     break  # it waits again
+                if self._awaited:
+                    self._get_on()  # with nobody congested it was not asked about
         except ProtocolError as error:
             self.fail(error)
         self._came_at = 0.0
         if self._store.fresh:
             self._depend()
+        if self.connection.held + self._behind_size != self._held:
+            self._count_held()
 
     def hurry(self) -> None:
         """The connection is lost: what came over it is done without waiting for anybody."""

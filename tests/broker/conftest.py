@@ -184,6 +184,8 @@ class FakeWire:
         #: Whether it is not read until its next turn, and for how long it waits for that at most.
         self.stopped = False
         self.waits: float | None = None
+        #: Bytes of it that are counted, as it was told.
+        self.held = 0
 
     def authenticate(self, connect: Connect) -> None:
         self.asked = connect
@@ -202,7 +204,7 @@ class FakeWire:
         return Secured()
 
     def holds(self, size: int) -> None:
-        pass
+        self.held = size
 
     def is_behind(self) -> bool:
         return self.behind

@@ -177,6 +177,44 @@ def test_a_flood_loses_nothing(join: Join, broker: Broker, version: int, qos: in
     assert not broker.ledger.congested and not publisher.peer.client._behind
 
 
+@pytest.mark.parametrize("limits", [Limits(queue_bytes=100_000, inflight=20)])
+@pytest.mark.parametrize("rest", [0.0, 60.0], ids="{} s between them".format)
+@pytest.mark.parametrize("ending", ["reads", "leaves"])
+def test_a_wait_ends_with_the_congestion(join: Join, broker: Broker, rest: float, ending: str):
+    """Bursts of four messages, of which three have room: what is waited for the fourth ends when
+    the queue is empty, or nobody's, before the publisher tries again."""
+    reader, publisher = join("reader", version=4), join("publisher", version=4)
+    client = publisher.client
+    for burst in range(100):
+        if ending == "leaves" and burst:
+            reader = join("reader", version=4)
+        reader.subscribe("a", 1)
+        publisher.send(*(Publish("a", bytes(30_000), 1, False, False, n) for n in range(1, 5)))
+        assert client._awaited, f"burst {burst} was not waited for"
+        congestions = client._awaited
+        broker.ledger.now += 0.02
+        if ending == "leaves":
+            reader.lose()
+        else:
+            acknowledge_all(reader)
+        publisher.go_on()
+        if ending == "reads":
+            assert acknowledge_all(reader) == 1, f"burst {burst} lost a message"
+        assert len(publisher.received()) == 4
+        assert not client._awaited and not any(each._waiting for each in congestions)
+        assert not broker.ledger.congested
+        broker.ledger.now += rest
+    assert client._allowance.left > PUBLISHER_PATIENCE / 2
+    assert broker.counters.publish_dropped == 0 or ending == "leaves"
+
+
+def acknowledge_all(reader: Peer) -> int:
+    """Acknowledge the messages that it has received; returns how many these were."""
+    messages = [packet for packet in reader.received() if isinstance(packet, Publish)]
+    reader.send(*(Puback(message.packet_id) for message in messages))
+    return len(messages)
+
+
 @pytest.mark.parametrize("limits", [Limits(queue_messages=10, inflight=1)])
 @pytest.mark.parametrize("policy", ["refuse", "drop-oldest", "disconnect"])
 def test_every_policy_is_for_those_who_do_not_read(join: Join, broker: Broker, policy: str):
@@ -572,6 +610,27 @@ def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
     waiting.wait()
     assert len(waiting.received()) == sent + 3
     assert ledger.input_bytes == 0
+
+
+def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
+    """Not only once something else comes from the client: it may keep silent for hours."""
+    broker.use(Limits(queue_messages=10, inflight=1), broker.features)
+    reader, publisher = join("reader", version=4), join("publisher", version=4)
+    reader.subscribe("a", 1)
+    client, before = publisher.client, broker.ledger.input_bytes
+    publisher.send(*(Publish("a", bytes(20_000), 1, False, False, n) for n in range(1, 41)))
+    assert broker.ledger.input_bytes - before > 20 * 20_000
+    for _ in range(1000):
+        broker.ledger.now += STEP
+        acknowledge_all(reader)
+        if publisher.wire.laters:
+            publisher.go_on()
+            counted = client.connection.held + client._behind_size
+            assert client._held == counted == publisher.wire.held
+        if not client._behind:
+            break
+    assert not client._behind and not client._held
+    assert broker.ledger.input_bytes == before
 
 
 def test_what_waits_takes_no_memory_that_there_is_not(waiting: Peer, broker: Broker):
