@@ -31,7 +31,9 @@ def compiled() -> None:
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
     modules |= {Path(f"appliance/{name}.py") for name in ("network", "tls", "wire")}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
-    setup(ext_modules=mypycify(sorted(map(str, modules)), group_name="appliance"))
+    # "0" takes a minute less: for who looks whether it works, not how fast it is.
+    level = os.environ.get("APPLIANCE_OPTIMIZE", "3")
+    setup(ext_modules=mypycify(sorted(map(str, modules)), opt_level=level, group_name="appliance"))
 
 
 if os.environ.get("APPLIANCE_COMPILE") == "1":

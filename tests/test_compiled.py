@@ -43,7 +43,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps"]
     subprocess.run(
         [*pip, "--use-pep517", "--disable-pip-version-check", "-w", str(directory), str(source)],
-        env={**os.environ, "APPLIANCE_COMPILE": "1"},
+        env={**os.environ, "APPLIANCE_COMPILE": "1", "APPLIANCE_OPTIMIZE": "0"},
         check=True,
         timeout=1800,  # on one core that others share
     )
