@@ -24,6 +24,7 @@ from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
 from appliance.ros.lease import Lease
 from appliance.ros.node import BusError, QosProfile, RosNode
+from appliance.ros.payloads import unpacked_size
 from appliance.ros.rules import CommandRules, FieldLimits
 from appliance.ros.to_ros import AgainstRulesError, Surroundings, ToRos
 from appliance.ros.turns import LITTLE, size_of
@@ -300,6 +301,16 @@ class Commands(ToRos):
         message, origin = command.message, command.origin
         turns = self._around.turns
         if not turns.has_room(origin, size):
+            if self._may_stop(message) and unpacked_size(message.payload) <= self._stop_size:
+                # A stop is heard whoever fills the queue; the time it takes is its client's.
+                cdr = turns.now(partial(self._convert, message, origin))
+                if isinstance(cdr, Objection):
+                    return cdr
+                if cdr is not None and self._stops(cdr):
+                    command.cdr = cdr
+                    if origin is not None:
+                        self._drop_queued(origin, "a stop message followed")
+                    return self._finish(command)
             if origin is not None:
                 self._arrivals.waited(origin)
             why = "was refused: too much of its user waits to be converted"
@@ -361,9 +372,12 @@ class Commands(ToRos):
 
     def _may_stop(self, message: Message) -> bool:
         """Whether it can be the route's stop message, by its size."""
+        return len(message.payload) <= self._stop_size
+
+    @property
+    def _stop_size(self) -> int:
         stop = self._stop
-        most = 0 if stop is None else max(STOP_SIZE, STOP_BYTES * len(stop.example))
-        return len(message.payload) <= most
+        return 0 if stop is None else max(STOP_SIZE, STOP_BYTES * len(stop.example))
 
     def inspect(self, message: Message, session: Session) -> Objection | None:
         try:

@@ -4,6 +4,7 @@ about it in properties.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -225,6 +226,19 @@ def _compressor() -> Callable[[bytes], bytes]:
     from zstandard import ZstdCompressor
 
     return ZstdCompressor().compress
+
+
+def unpacked_size(payload: bytes) -> float:
+    """Bytes of the payload when it is decompressed, if it was compressed; infinity when unknown."""
+    if not payload.startswith(ZSTD_MAGIC):
+        return len(payload)
+    from zstandard import ZstdError, frame_content_size
+
+    try:
+        size = frame_content_size(payload)
+    except ZstdError:
+        return math.inf
+    return size if size >= 0 else math.inf
 
 
 def _decompressor(limits: InputLimits, encoding: Encoding) -> Callable[[bytes], bytes]:

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import pytest
 from waiting import until
+from zstandard import ZstdCompressor
 
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
@@ -37,6 +38,7 @@ from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.convert import Converter
 from appliance.ros.node import Durability, Endpoint, FakePeer, QosProfile
+from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
@@ -166,7 +168,14 @@ class Driver:
 
 class CommandHouse(House):
     def start(self, rules, **kw):
-        settings = RouteSettings("/cmd_vel", "ros", "r2d2{ros}", kw.pop("type", TWIST), rules=rules)
+        settings = RouteSettings(
+            "/cmd_vel",
+            "ros",
+            "r2d2{ros}",
+            kw.pop("type", TWIST),
+            compression=kw.pop("compression", "none"),
+            rules=rules,
+        )
         bridge = super().start(settings)
         self.robot = self.node.add_subscriber("/cmd_vel", kw.pop("found", TWIST))
         return bridge
@@ -1803,6 +1812,46 @@ async def test_a_large_queue_behind_connect(house):
     make_busy(house)
     single.drive(large(0.3))
     await until(lambda: house.robot.received == [twist(0.3)])
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["plain", "zstd"])
+@pytest.mark.parametrize("has_own", [False, True], ids=["", "behind its own"])
+async def test_a_stop_is_heard_whoever_has_filled_the_queue(house, has_own, packed):
+    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
+    make_busy(house)
+    loader, driver = Driver(house.broker, "loader"), Driver(house.broker, "a")
+    if has_own:
+        driver.steer(large(0.2))
+    turns = house.bridge._turns
+    session = loader.client.session
+    for size in (1_000_000, 50_000, 1100):
+        while turns.has_room(session, size + 100):
+            assert code(loader, large(0.1, size), properties=made(0)) == 0
+    assert code(loader, large(0.1, 1100), properties=made(0)) == 0x97
+    stop = b"{}" + b" " * 5000
+    assert code(driver, large(0.3, 5000), properties=made(0)) == 0x97, "it drives"
+    assert code(driver, b"[]" + b" " * 5000) == 0x99
+    assert house.robot.received == []
+    errors, expired = house.counters().errors, house.counters().expired
+    assert code(driver, ZstdCompressor().compress(stop) if packed else stop) == 0
+    assert house.robot.received == [STOP]
+    assert house.counters().errors == errors
+    if has_own:  # what it said before has been overtaken
+        await until(lambda: house.counters().expired == expired + 1)
+        assert twist(0.2) not in house.robot.received
+
+
+async def test_what_may_become_large_is_not_converted_out_of_turn(house, monkeypatch):
+    """A few bytes of zstd may be megabytes; so may those that do not say how much they are."""
+    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    monkeypatch.setattr(house.bridge._turns, "has_room", lambda *_: False)
+    monkeypatch.setattr(house.commands, "_read", lambda *_: pytest.fail("it was converted"))
+    huge = b"{}" + b" " * 1_000_000
+    silent = ZstdCompressor(write_content_size=False).compress(b"{}")
+    for payload in (huge, ZstdCompressor().compress(huge), silent, ZSTD_MAGIC + b"\xff"):
+        assert code(driver, payload, properties=made(0)) == 0x97
 
 
 async def test_large_commands_that_wait_are_bounded_and_end_with_their_route(house):
