@@ -87,9 +87,10 @@ class WorkClock:
         self._worked = self._worked * fade + worked
         kept_waiting = max(waited - (turns - before[3]) * TURN_TAKES, 0.0)
         self._waited = self._waited * fade + kept_waiting
-        # The share of the processor that a program gets of what it needs.
-        ready = self._worked + self._waited
-        share = max(self._worked / ready, LEAST_SHARE) if ready else 1.0
+        # The share of the processor that a program gets of what it needs. A moment in which it got
+        # all of it is assumed beside what was seen, which over a rest fades to less than that.
+        free = self._worked + TURN_TAKES
+        share = max(free / (free + self._waited), LEAST_SHARE)
         rested = max(seconds - worked - waited, 0.0)
         self._sum += worked + waited + rested * (1 - share)
         return self._sum

@@ -35,7 +35,7 @@ def test_a_moment_until_a_turn_is_no_load() -> None:
 @pytest.mark.parametrize("part", [0.05, 0.3])
 def test_who_gets_half_of_what_it_needs_leaves_half_of_the_rest(part: float) -> None:
     measured = grown(worked=part, waited=part, turns=0)
-    assert measured == pytest.approx(2 * part + (1 - 2 * part) / 2)
+    assert measured == pytest.approx(2 * part + (1 - 2 * part) / 2, abs=0.005)
 
 
 def test_others_are_taken_to_have_a_least_share() -> None:
@@ -49,6 +49,24 @@ def test_load_is_forgotten() -> None:
     before = clock.grow(2.0, 0.1, 0.8, 1)
     clock.grow(4.0, 0.2, 0.8, 2)
     assert clock.grow(5.0, 0.2, 0.8, 2) - before < 0.11
+
+
+@pytest.mark.parametrize("steps", [1, 10, 1000])
+def test_load_is_forgotten_over_a_rest(steps: int) -> None:
+    """Nothing new is seen then; what was seen before it says less and less."""
+    clock = WorkClock()
+    clock.grow(1.0, 0, 0, 0)
+    before = clock.grow(1.01, 0.0001, 0.009, 1)
+    for step in range(1, steps + 1):
+        grown = clock.grow(1.01 + 10.0 * step / steps, 0.0001, 0.009, 1)
+    assert grown - before < 1.0
+
+
+def test_a_load_of_just_now_is_not_forgotten_at_once() -> None:
+    clock = WorkClock()
+    clock.grow(1.0, 0, 0, 0)
+    before = clock.grow(1.1, 0.01, 0.09, 1)
+    assert clock.grow(1.3, 0.01, 0.09, 1) - before > 0.2 * (1 - LEAST_SHARE) - 0.01
 
 
 def test_it_grows_with_the_work_of_its_thread() -> None:
