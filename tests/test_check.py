@@ -11,6 +11,7 @@ import yaml
 from appliance import config
 from appliance.access import Passwords
 from appliance.check import Finding, check
+from appliance.check.commands import commands
 from appliance.init import initialise
 from appliance.ros import ros2
 
@@ -133,6 +134,33 @@ def test_all_mistakes_of_a_route_are_told(here: Path) -> None:
 SAFE = {"expire": "500 ms", "on_silence": {"after": "500 ms"}}
 
 
+@pytest.mark.parametrize("stamped", [False, True], ids=["AckermannDrive", "AckermannDriveStamped"])
+@pytest.mark.parametrize(
+    ("stop", "drives"),
+    [
+        ({}, False),
+        ({"speed": 0, "acceleration": 2.0}, False),
+        ({"speed": 0.0, "steering_angle": 0.2, "jerk": 1.0}, False),
+        ({"speed": 0.1}, True),
+        ({"speed": -1, "acceleration": 2.0}, True),
+    ],
+)
+def test_the_stop_of_a_robot_that_steers(
+    stop: dict[str, float], drives: bool, stamped: bool
+) -> None:
+    """It may brake as hard as it is told to, with its wheels where they are."""
+    route = {
+        "ros": "/a",
+        "to": "ros",
+        "type": "ackermann_msgs/msg/AckermannDrive" + ("Stamped" if stamped else ""),
+        "expire": "500 ms",
+        "on_silence": {"after": "500 ms", "publish": {"drive": stop} if stamped else stop},
+    }
+    settings = config.Settings.model_validate({"bridge": {"topics": [route]}})
+    findings = list(commands(settings))
+    assert [each.level for each in findings] == (["error"] if drives else []), findings
+
+
 @pytest.mark.parametrize("bus", ["ros2", "ros1"])
 @pytest.mark.parametrize(
     ("route", "level", "text"),
@@ -153,6 +181,26 @@ SAFE = {"expire": "500 ms", "on_silence": {"after": "500 ms"}}
             "this stop message drives",
         ),
         ({**SAFE, "on_silence": {"after": "1 s", "publish": {"linear": {"x": 0.0}}}}, "", ""),
+        (
+            {
+                **SAFE,
+                "ros": "/cmd_vel",
+                "type": None,
+                "on_silence": {"after": "1 s", "publish": {"mode": 1}},
+            },
+            "warning",
+            "this stop message drives",
+        ),
+        (
+            {
+                **SAFE,
+                "ros": "/cmd_vel",
+                "type": None,
+                "on_silence": {"after": "1 s", "publish": {"linear": {"x": 0.1}}},
+            },
+            "error",
+            "this stop message drives",
+        ),
         (
             {
                 "type": "std_msgs/msg/Float64",

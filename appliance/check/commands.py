@@ -12,6 +12,10 @@ from appliance.ros.rules import CommandRules
 
 #: Messages that are a velocity: the robot drives on with the last one, and zero stops it.
 _VELOCITIES = {"Twist", "TwistStamped", "AckermannDrive", "AckermannDriveStamped"}
+#: Those of them that say how it gets to its speed, too.
+_BY_SPEED = {"AckermannDrive", "AckermannDriveStamped"}
+#: What the others have fields of, whose numbers are all velocities.
+_TWIST = {"linear", "angular", "twist"}
 _VELOCITY_TOPIC = "cmd_vel"
 
 #: Seconds of a driver's silence, or of a command's age, that are long for a robot that moves.
@@ -41,9 +45,8 @@ def commands(settings: Settings) -> Iterator[Finding]:
                 yield Finding("warning", subject, text)
         for key, seconds in _long(route):
             yield Finding("warning", subject, f"{key}: the robot may drive on for {seconds:g} s")
-        if moves and route.on_silence is not None and _is_motion(route.on_silence.publish):
-            text = "on_silence.publish: this stop message drives: its numbers are not all 0"
-            yield Finding("error", subject, text)
+        if moves and route.on_silence is not None:
+            yield from _driving_stop(route, route.on_silence.publish, subject)
 
 
 def stop_message(rules: CommandRules, converter: Converter) -> str:
@@ -78,6 +81,22 @@ def _long(route: TopicRoute) -> Iterator[tuple[str, float]]:
         yield "on_silence.after", route.on_silence.after
     if route.expire is not None and route.expire > _LONG and _moves(route):
         yield "expire", route.expire
+
+
+def _driving_stop(route: TopicRoute, stop: object, subject: str) -> Iterator[Finding]:
+    """What is against the stop message of what drives a robot."""
+    name = "" if route.type is None else route.type.rpartition("/")[2]
+    if name in _BY_SPEED:
+        # How hard it brakes, and where the wheels point meanwhile, is no motion.
+        drive = stop.get("drive") if isinstance(stop, dict) and "Stamped" in name else stop
+        speed = drive.get("speed") if isinstance(drive, dict) else None
+        if _is_motion(speed):
+            text = "on_silence.publish: this stop message drives: its speed is not 0"
+            yield Finding("error", subject, text)
+    elif _is_motion(stop):
+        text = "on_silence.publish: this stop message drives: its numbers are not all 0"
+        is_twist = name in _VELOCITIES or (isinstance(stop, dict) and _TWIST.intersection(stop))
+        yield Finding("error" if is_twist else "warning", subject, text)
 
 
 def _is_motion(value: object) -> bool:
