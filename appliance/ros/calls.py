@@ -533,18 +533,7 @@ class Switchboard:
         caller = call.caller
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
-        try:
-            age = said_age(message.properties, time.time())
-        except ValueError as error:
-            raise CallError("bad_request", str(error)) from None
-        is_over = message.expires_at is not None and message.expires_at <= self._broker.now
-        if age is None:
-            is_over |= self._backlog.has(message, caller, offer.timeout, self._loop.time())
-        elif age > offer.timeout:
-            raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")
-        if is_over:
-            # Nobody waits for its answer any more, and what it would do nobody expects now.
-            raise CallError("expired", "it was sent some time ago, before a connection was lost")
+        self._check_age(offer, caller, message)
         size = len(call.payload)
         try:
             self.limits.input.check_size(size, call.encoding)
@@ -562,6 +551,28 @@ class Switchboard:
             either = " or ".join(offer.encodings)
             text = f"a call of {offer.name} may be {either}, not {call.encoding}"
             raise CallError("bad_request", text)
+
+    def _check_age(self, offer: Offer, caller: Session, message: Message) -> None:
+        """Nobody waits for the answer of an old call any more, and what it would do nobody expects.
+
+        To cancel is how an action is stopped: that is done whatever it says of its age, and only
+        not where MQTT itself has expired it [MQTT-3.3.2-5].
+        """
+        is_over = message.expires_at is not None and message.expires_at <= self._broker.now
+        try:
+            age = said_age(message.properties, time.time())
+        except ValueError as error:
+            if not offer.is_cancel:
+                raise CallError("bad_request", str(error)) from None
+            age = 0.0
+        if age is None:
+            # Asked also where it does not matter: what comes behind an old one is as old.
+            is_old = self._backlog.has(message, caller, offer.timeout, self._loop.time())
+            is_over |= is_old and not offer.is_cancel
+        elif age > offer.timeout and not offer.is_cancel:
+            raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")
+        if is_over:
+            raise CallError("expired", "it was sent some time ago, before a connection was lost")
 
     def _check_bytes(self, caller: Session, size: int) -> None:
         own, total = self._bytes[user_of(caller)], self._bytes.total()

@@ -83,6 +83,8 @@ class _Command:
     refusal: str = QUEUED
     #: Whether its client has ended its connection in good order since.
     has_left: bool = False
+    #: Whether what it says of its age is wrong, and `why` says so.
+    is_wrong: bool = False
 
 
 class _Stop:
@@ -221,11 +223,9 @@ class Commands(ToRos):
         if self._is_left or (retain and not self.rules.take_retained):
             return None
         command = self._judge(message, retain, origin)
-        if isinstance(command, Objection):
-            return command
         is_refused = command.why or command.verdict is Verdict.REFUSE
         if is_refused and not self._may_stop(message):
-            return self._expire(message, command.why or command.refusal, origin)
+            return self._refuse(command, command.why or command.refusal)
         is_kept = retain or (message.retain and self.rules.take_retained)
         if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
             self._is_awaited = True
@@ -240,9 +240,7 @@ class Commands(ToRos):
             return turns.now(partial(self._finish, command))
         return self._queue(command, size)
 
-    def _judge(
-        self, message: Message, retain: bool, origin: Session | None
-    ) -> _Command | Objection:
+    def _judge(self, message: Message, retain: bool, origin: Session | None) -> _Command:
         """What is to become of it, as far as that is known without a look into the payload."""
         # When it was received: what came in one chunk came at once, however long it takes.
         now = self._around.broker.now
@@ -251,8 +249,8 @@ class Commands(ToRos):
         try:
             why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)
             is_proven = sent_at(message.properties) is not None
-        except ValueError as error:
-            return self._object(message, f"was refused: {error}")
+        except ValueError as error:  # unless it stops the robot, which is seen in its payload
+            return _Command(message, origin, now, verdict, str(error), is_wrong=True)
         if origin is not None:
             if why and origin.link is not None:
                 self._forget(origin, why)
@@ -279,7 +277,7 @@ class Commands(ToRos):
     def _convert_and_carry_out(self, command: _Command) -> Objection | None:
         message, origin = command.message, command.origin
         if command.why and not self._is_late_stop(message, origin):
-            return self._expire(message, command.why, origin)
+            return self._refuse(command, command.why)
         cdr = command.cdr or self._convert(message, origin)
         verdict = command.verdict
         if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self._stops(cdr)):
@@ -383,14 +381,22 @@ class Commands(ToRos):
         try:
             why = self._old_by_itself(message)
         except ValueError as error:
+            if self._is_heard_late(message, session):
+                return None
             return self._object(message, f"was refused: {error}")
         if not why:
             if self.rules.oldest < math.inf and sent_at(message.properties) is None:
                 self._arrivals.look(session, self.rules.oldest, self._around.broker.now)
             return super().inspect(message, session)
-        if size_of(message.payload) > LITTLE or self._is_late_stop(message, session):
-            return None  # a large one is looked at when it is its turn
+        if self._is_heard_late(message, session):
+            return None
         return self._expire(message, why, session)
+
+    def _is_heard_late(self, message: Message, session: Session) -> bool:
+        """Whether it stops the robot, or may: a large one is looked at when it is its turn."""
+        if size_of(message.payload) > LITTLE:
+            return self._may_stop(message)
+        return self._is_late_stop(message, session)
 
     def _carry_out(self, message: Message, cdr: bytes, origin: Session | None) -> Objection | None:
         objection = self._publish(cdr, message)
@@ -440,6 +446,11 @@ class Commands(ToRos):
         is_unknown = retain and rules.expire is not None and message.expires_at is None
         is_old = is_will or is_unknown or message.age > oldest
         return "it was sent some time before" if is_old else ""
+
+    def _refuse(self, command: _Command, why: str) -> Objection:
+        if command.is_wrong:
+            return self._object(command.message, f"was refused: {why}")
+        return self._expire(command.message, why, command.origin)
 
     def _expire(self, message: Message, why: str, origin: Session | None) -> Objection:
         self._count_expired(why, origin)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 import pytest
 from waiting import until
@@ -306,3 +307,21 @@ async def test_the_server_of_a_goal_vanishes_after_the_last_route(house, monkeyp
     for _ in range(4):
         house.node.spin()
     assert house.node.clients == []
+
+
+@pytest.mark.parametrize("sent_at", ["-6", "+0.4", "+3600", "yesterday"])
+async def test_a_cancel_is_heard_however_old_it_says_to_be(house, sent_at):
+    """It is how an action is stopped."""
+    walks, client = await begin(house)
+    goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
+    text = sent_at if sent_at.isalpha() else str(time.time() + float(sent_at))
+    client.send(
+        STOP,
+        {"goal_id": goal},
+        response_topic=f"answers/{client.name}",
+        correlation_data=b"c",
+        user_property=[("sent-at", text)],
+    )
+    await until(lambda: walks.cancelled, "the goal is cancelled")
+    walks.finish()
+    await until(lambda: house.counters().under_way == 0, "it has ended")

@@ -2076,3 +2076,26 @@ async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, sta
     bridge.replace(routes)
     house.node.spin()
     assert say(b) == 0
+
+
+@pytest.mark.parametrize("size", [0, 2000])
+@pytest.mark.parametrize("off", ["0.3 s ahead", "an hour ahead", "milliseconds", "no zone"])
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(house, qos, off, size):
+    house.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
+    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+    other.steer()
+    now = time.time()
+    text = {
+        "0.3 s ahead": str(now + 0.3),
+        "an hour ahead": str(now + 3600),
+        "milliseconds": str(int(now * 1000)),
+        "no zone": "2026-05-28T20:26:40",
+    }[off]
+    for payload in (b"{}", GO):
+        driver.drive(payload + b" " * size, qos=qos, properties=said(text))
+        if qos == 2:
+            driver.say(Pubrel(7))
+    await until(lambda: house.robot.received == [twist(0.5), STOP])
+    await until(lambda: house.counters().errors == 1)  # what is no stop is refused as before
+    assert "sent-at" in house.counters().last_error
