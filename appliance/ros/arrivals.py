@@ -106,6 +106,10 @@ class _Pace:
     #: Whether the command that came last was its first; or the second of what may be a stream.
     is_first: bool = True
     begins: bool = False
+    #: Before what came last, and the longest since the beginning: for a route whose `oldest` is
+    #: shorter, that was a silence.
+    gap: float = math.inf
+    longest: float = 0.0
     #: Gaps in a row that are no burst.
     steady: int = 0
     is_waiting: bool = False
@@ -148,9 +152,19 @@ class Arrivals:
         `number` is the message's, which may have several routes; -1 when it is not known.
         """
         pace = self._paces.get(origin)
-        if pace is not None and pace.number == number >= 0:
+        is_same = pace is not None and pace.number == number >= 0
+        if pace is not None and pace.longest > oldest:
+            # Known by a route with a longer `oldest` only: for this one it begins.
+            gap = pace.gap if is_same else now - pace.last
+            verdict = self._begin(origin, oldest, now)
+            if gap < self.waiting_time(origin, oldest):
+                began = self._paces[origin]
+                began.is_queue, began.is_waiting = True, False
+                verdict = Verdict.REFUSE
+        elif pace is not None and is_same:
             return pace.verdict
-        verdict = self._judge(pace, origin, qos, oldest, now)
+        else:
+            verdict = self._judge(pace, origin, qos, oldest, now)
         pace = self._paces[origin]
         pace.number, pace.verdict = number, verdict
         if verdict is Verdict.REFUSE:
@@ -175,7 +189,8 @@ class Arrivals:
                 pace.is_queue, pace.is_waiting, verdict = True, False, Verdict.REFUSE
             pace.was_held = is_held
             return verdict
-        gap = now - pace.last
+        gap = pace.gap = now - pace.last
+        pace.longest = max(pace.longest, gap)
         pace.last = now
         pace.begins = False
         if is_held:

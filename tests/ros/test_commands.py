@@ -2099,3 +2099,23 @@ async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(house, qos, off, siz
     await until(lambda: house.robot.received == [twist(0.5), STOP])
     await until(lambda: house.counters().errors == 1)  # what is no stop is refused as before
     assert "sent-at" in house.counters().last_error
+
+
+@pytest.mark.parametrize("presses", [0, 4])
+def test_what_is_known_by_a_long_expire_is_not_known_by_a_short_one(presses):
+    """A route of lights that takes commands of 10 s, and one that drives, of 0.5 s."""
+    sender = Sender()
+    lights = 10.0
+    for _ in range(presses):
+        sender.now += 1.2
+        sender.arrivals.judge(sender, 0, lights, sender.now)
+    for _ in range(6):
+        sender.say(0.05)
+    assert sender.moved
+    sender.moved.clear()
+    sender.now += 3
+    sender.arrivals.judge(sender, 0, lights, sender.now)
+    for _ in range(20):
+        sender.say(0, "old")
+    sender.rest(1)
+    assert sender.moved == []
