@@ -444,6 +444,9 @@ class Broker:
         effort = ENDING_EFFORT
         for topic_filter in session.subscriptions:
             faults.run("end.leave", self.router.leave, session, topic_filter, otherwise=None)
+            share = self.router.shares.get(topic_filter)
+            if share is not None and share.members.pop(session, None) is not None:
+                self.router.changed()  # or the group would go on to give it what comes
             effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
         self.counters.effort += effort
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)

@@ -409,6 +409,43 @@ PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
 ]
 
 
+@pytest.mark.parametrize("others", [0, 1])
+def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, escaped, others):
+    """Whatever fails: what the group has goes to who is there, and not to it again."""
+    member = Peer(broker, 4)
+    member.connect("member", clean=False)
+    member.subscribe("$share/g/t", 1)
+    member.slow()
+    second = Peer(broker, 4)
+    for number in range(30):
+        other.publish("t", b"%d" % number, 1)
+    if others:
+        second.connect("second")
+        second.subscribe("$share/g/t", 1)
+    leave, calls = broker.router.leave, []
+
+    def fails_once(router, session, topic_filter):
+        calls.append(topic_filter)
+        if len(calls) == 1:
+            fail()
+        leave(session, topic_filter)
+
+    monkeypatch.setattr(type(broker.router), "leave", fails_once)
+    session = member.session
+    member.lose()
+    Peer(broker, 4).connect("member", clean=True)  # ends the one before
+    assert calls == ["$share/g/t"]
+    assert all(session not in share.members for share in broker.router.shares.values())
+    assert not session.queue and not session.inflight
+    other.publish("t", b"after", 1)
+    assert not session.queue
+    if others:
+        waiting = len(second.session.inflight) + len(second.session.queue)
+        assert waiting == 31, "what was left, and what came then"
+    assert escaped
+    escaped.clear()
+
+
 @pytest.mark.parametrize("expiry", [0, 60])
 @pytest.mark.parametrize("leaves", [False, True], ids=["lost", "disconnects"])
 @pytest.mark.parametrize(("whose", "name"), PARTS, ids=[name for _, name in PARTS])
