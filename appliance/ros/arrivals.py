@@ -249,16 +249,19 @@ class Arrivals:
         """Seconds that a first command waits: until then the next of a queue would have come."""
         return min(WAIT + 2 * _contact(origin).round_trip, oldest)
 
-    def look(self, origin: Session, oldest: float, now: float) -> None:
+    def look(self, origin: Session, oldest: float, now: float, number: int = -1) -> None:
         """A command of QoS 2 has come that is not released yet: only now its pace can be told, and
-        whether it was held in here."""
+        whether it was held in here. The number is its own, once for all its routes."""
         coming = self._coming.get(origin)
+        if coming is not None and coming.number == number >= 0:
+            return
         if coming is None or now - coming.last > oldest:
             self._coming[origin] = _Pace(now)
         else:
             gap, coming.last = now - coming.last, now
             if coming.steady < STEADY or gap < BURST:
                 self._time(coming, origin, 2, gap, now)
+        self._coming[origin].number = number
         pace = self._paces.get(origin)
         if pace is None:
             return
@@ -286,12 +289,12 @@ class Arrivals:
         for holder in holders:
             holder.drop_waiting(origin, why)
 
-    def waited(self, origin: Session) -> None:
-        """The command that waits has none behind it."""
+    def waited(self, origin: Session, holder: Holder) -> None:
+        """The command that waits there has none behind it, or waits no longer."""
         pace = self._paces.get(origin)
         if pace is not None:
-            pace.is_waiting = False
-            pace.holders = []
+            pace.holders = [other for other in pace.holders if other is not holder]
+            pace.is_waiting = pace.is_waiting and bool(pace.holders)
 
     def expect(self, client_id: str) -> None:
         """The client left in the midst of driving, and may have queued what it commanded since."""

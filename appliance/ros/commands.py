@@ -283,7 +283,7 @@ class Commands(ToRos):
         if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self._stops(cdr)):
             # Who says stop is heard at once, whatever comes with it.
             if origin is not None:
-                self._arrivals.waited(origin)
+                self._arrivals.waited(origin, self)
             verdict = Verdict.CARRY_OUT
         if isinstance(cdr, Objection):
             return cdr
@@ -310,7 +310,7 @@ class Commands(ToRos):
                         self._drop_queued(origin, "a stop message followed")
                     return self._finish(command)
             if origin is not None:
-                self._arrivals.waited(origin)
+                self._arrivals.waited(origin, self)
             why = "was refused: too much of its user waits to be converted"
             return self._object(message, why, ReasonCode.QUOTA_EXCEEDED)
         self._queued.setdefault(origin, deque()).append(command)
@@ -386,7 +386,9 @@ class Commands(ToRos):
             return self._object(message, f"was refused: {error}")
         if not why:
             if self.rules.oldest < math.inf and sent_at(message.properties) is None:
-                self._arrivals.look(session, self.rules.oldest, self._around.broker.now)
+                broker = self._around.broker
+                number = broker.counters.messages_received
+                self._arrivals.look(session, self.rules.oldest, broker.now, number)
             return super().inspect(message, session)
         if self._is_heard_late(message, session):
             return None
@@ -470,7 +472,7 @@ class Commands(ToRos):
         ledger = self._around.broker.ledger
         size = message.size + len(cdr)
         if not ledger.fits(origin.account, size):
-            self._arrivals.waited(origin)
+            self._arrivals.waited(origin, self)
             return self._object(message, "was refused: there is no memory for it to wait in")
         ledger.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
@@ -520,7 +522,7 @@ class Commands(ToRos):
             else:
                 self._forget(origin, "what came with it was read late")
             return
-        self._arrivals.waited(origin)
+        self._arrivals.waited(origin, self)
         self._carry_out_waiting(origin)
 
     def _carry_out_waiting(self, origin: Session) -> None:

@@ -1077,7 +1077,7 @@ class Sender:
 
     def _pass_to(self, now):
         if self.held is not None and now >= self.due:
-            self.arrivals.waited(self)
+            self.arrivals.waited(self, self)
             self.moved.append(self.held)
             self.held = None
         self.now = now
@@ -2119,3 +2119,29 @@ def test_what_is_known_by_a_long_expire_is_not_known_by_a_short_one(presses):
         sender.say(0, "old")
     sender.rest(1)
     assert sender.moved == []
+
+
+async def test_a_route_that_cannot_convert_the_first_of_a_queue_lets_no_other_carry_it_out(house):
+    rules = CommandRules(expire=0.5)
+    House.start(
+        house,
+        RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
+        RouteSettings("/number", "ros", TOPIC, INT, rules=rules),
+        RouteSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=rules),
+    )
+    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    driver = Driver(house.broker, "a")
+    driver.say(Publish(TOPIC, GO), *[Publish("r2d2/lamp", GO)] * 5)
+    await asyncio.sleep(0.3)  # longer than a first command waits
+    assert robot.received == []
+
+
+def test_a_qos_2_command_of_two_routes_is_looked_at_once():
+    sender = Sender(2)
+    verdicts = []
+    for number in range(6):
+        sender.now += 0.05
+        for _ in range(2):
+            sender.arrivals.look(sender, sender.OLDEST, sender.now, number)
+        verdicts.append(sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, number))
+    assert verdicts[2:] == [Verdict.CARRY_OUT] * 4
