@@ -183,16 +183,23 @@ def test_size_and_time_until_the_first_client_is_answered(binary, box):
     house.stop()
     settings = house.directory / "appliance.yaml"
     settings.write_text(settings.read_text().replace("127.0.0.1:0", f"127.0.0.1:{port}", 1))
-    # On a quiet computer it takes about this long; what else runs there is not to be counted.
-    took: list[float] = []
-    while len(took) < 8 and min(took, default=2) >= 2:
-        took.append(_seconds_until_answered(house, context, port))
-    assert min(took) < 2, took
+
+    def seconds(*command):
+        return _seconds_until_answered(house, command, context, port)
+
+    # A start in two seconds is meant for a computer where the same start takes one from source. The
+    # least of several counts: what else runs on the computer is not to be counted.
+    from_source = (sys.executable, "-m", "appliance", "run", "-c", settings)
+    alone, installed = [], []
+    while len(alone) < 6 and (not alone or min(alone) >= max(2, 2 * min(installed))):
+        installed.append(seconds(*from_source))
+        alone.append(seconds(*house.command("run", "-c", house.config)))
+    assert min(alone) < max(2, 2 * min(installed)), (alone, installed)
 
 
-def _seconds_until_answered(house, context, port):
+def _seconds_until_answered(house, command, context, port):
     """The CPU time of the boot loader and of what it starts; one works after the other."""
-    house._run(house.command("run", "-c", house.config))
+    house._run(command)
     try:
         eventually(lambda: _answers(house, context, port), "an answer to CONNECT", timeout=60)
         loader = psutil.Process(house.pid)
