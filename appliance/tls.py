@@ -417,6 +417,8 @@ class TlsTransport:
         """As of the TCP connection, and what asyncio's TLS transports know."""
         if name in _TLS_INFO:
             return _TLS_INFO[name](self._tls)
+        if name == "has_unread":  # what has come and was not handed on, be it a part of a record
+            return self._waits or self._cut or len(self._rest) > 0
         return self._tcp.get_extra_info(name, default)
 
     def get_protocol(self) -> asyncio.BaseProtocol:

@@ -234,7 +234,10 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if payload:  # [MQTT-6.0.0-2]
             self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
         self._answer(frames.data_to_send())
-        self._protocol.keep(len(frames.reader.buffer))
+        kept = len(frames.reader.buffer)
+        if kept and events:  # of the next one
+            self._protocol.keep(0)
+        self._protocol.keep(kept)
         error = frames.parser_exc
         if is_text:
             self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
@@ -339,7 +342,10 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         return self._transport.get_write_buffer_size()
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """What the transport below knows."""
+        """What the transport below knows; `has_unread`: whether any of the two keeps what has come
+        and was not handed on, be it a part of a frame."""
+        if name == "has_unread" and (self._held or self._frames.reader.buffer):
+            return True
         return self._transport.get_extra_info(name, default)
 
 

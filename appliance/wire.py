@@ -470,12 +470,7 @@ class ClientProtocol:
         else:
             inflow = self._client.inflow
             inflow.read(self._loop.time())
-            # What TLS has kept meanwhile is not seen like this.
-            if (
-                inflow.is_behind
-                and self._tls is None
-                and not contact(self._transport.get_extra_info("socket")).has_unread
-            ):
+            if inflow.is_behind and not self._reached().has_unread:
                 inflow.has_caught_up()
             self._transport.resume_reading()
 
@@ -517,9 +512,12 @@ class ClientProtocol:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""
         ledger = self._ledger
         grown = size - self._frame
+        inflow, connection = self._client.inflow, self._client.connection
+        if size and not inflow.unfinished:
+            inflow.unfinished = self._loop.time()
+        elif not size and self._frame and not (connection.unfinished or connection.paused):
+            inflow.unfinished = 0.0  # what the frame held is done, or it was a ping
         self._frame = size
-        if size and not self._client.inflow.unfinished:
-            self._client.inflow.unfinished = ledger.now
         ledger.take(self.account, grown)
         if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
             reason = (
@@ -781,13 +779,21 @@ class ClientProtocol:
         """How the computer at the other end answers."""
         if self._transport is None:
             return HERE
-        known = contact(self._transport.get_extra_info("socket"))
+        known = self._reached()
         has_unread = known.has_unread or bool(self._held) or self._sends_on
         now = self._ledger.now  # of the chunk that is being taken in, if one is
         inflow = self._client.inflow
         held = inflow.held(now, has_unread=has_unread)
         flowing = inflow.flowing(now)
         return replace(known, has_unread=has_unread, flowing=flowing, held=held)
+
+    def _reached(self) -> Contact:
+        """What the system and the transport know of the other end."""
+        assert self._transport is not None
+        known = contact(self._transport.get_extra_info("socket"))
+        if not known.has_unread and self._transport.get_extra_info("has_unread"):
+            return replace(known, has_unread=True)
+        return known
 
     def probe(self) -> None:
         """Have it answer within two seconds, if it can."""

@@ -6,13 +6,16 @@ import asyncio
 import contextlib
 import socket
 import ssl
+from collections.abc import Callable
 from pathlib import Path
 
 from waiting import PATIENCE
 
 from appliance import certs
 from appliance.broker.broker import Broker
+from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Limits, Refusal
+from appliance.broker.session import Session
 from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
@@ -169,3 +172,17 @@ class Caller:
         # asyncio's own, when it has closed behind its last bytes, cannot be aborted any more.
         with contextlib.suppress(AttributeError):
             self.writer.transport.abort()
+
+
+class Watches:
+    """Does something with each message that comes."""
+
+    def __init__(self, house: House, published: Callable[[Message], None]) -> None:
+        house.broker.observer = self  # type: ignore[assignment]
+        self._published = published
+
+    def published(self, session: Session, message: Message) -> None:
+        self._published(message)
+
+    def disconnected(self, session: Session) -> None:
+        """That is of no interest."""

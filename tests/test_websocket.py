@@ -14,7 +14,7 @@ from typing import Any
 import paho.mqtt.client as paho
 import pytest
 import uvloop
-from house import Caller, House, make_contexts
+from house import Caller, House, Watches, make_contexts
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from waiting import PATIENCE, until
 from websockets.asyncio.client import ClientConnection, connect
@@ -22,6 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Response
 
+from appliance.broker.message import Message
 from appliance.broker.ports import Limits
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.connection import MAXIMUM_CONTROL
@@ -665,3 +666,79 @@ async def test_paho(house: House, tls, version):
     numbers = sorted(int(payload.rstrip(b"\0")) for payload in received)
     assert numbers == list(range(30))
     await until(lambda: not house.network.open)
+
+
+# --- how old what comes is -----------------------------------------------------------------------
+
+
+async def open_by_hand(house: House, tls: bool = False) -> Caller:
+    """A client that has logged in, for frames by hand."""
+    await house.start()
+    caller = await shake_hands(house, tls)
+    await caller.say(frame(Connect("a").encode(5)))
+    assert (await hear_frame(caller))[0] == BINARY
+    return caller
+
+
+@pytest.mark.parametrize(("tls", "in_frames"), [(False, True), (True, True), (True, False)])
+async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls, in_frames):
+    """Of what was sent at once most waits above the socket, and that is not seen at the socket."""
+    packet = Publish("x", b"go").encode(5)
+    if in_frames:
+        caller, packet = await open_by_hand(house, tls), frame(packet)
+    else:
+        await house.start()
+        caller = await house.join("a", tls=tls)
+    wire = house.protocol("a")
+    held: list[float] = []
+
+    def published(_: Message) -> None:
+        held.append(wire.contact().held)
+        if len(held) == 1:
+            wire._rest(0.5)  # as when it publishes too fast
+
+    Watches(house, published)
+    if in_frames:
+        caller.writer.write(packet * 400)
+    else:
+        for _ in range(1000):
+            caller.writer.write(packet)  # a record each
+    await until(lambda: len(held) == (400 if in_frames else 1000))
+    late = [seconds for seconds in held if seconds > 0.4]
+    assert late and held[-len(late) :] == late  # and none behind them is taken for new
+
+
+async def test_a_frame_in_two_segments_is_as_old_as_the_first(house: House):
+    """Not as the last look at the clock, which may be a second ago."""
+    caller = await open_by_hand(house)
+    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+    ages: list[float] = []
+    Watches(house, lambda message: ages.append(message.age))
+    command = frame(Publish("x", b"go").encode(5))
+    begun = loop.time()
+    house.broker.ledger.now = begun - 60
+    await caller.say(command[:5])
+    await until(lambda: wire._frame)
+    await caller.say(command[5:])
+    await until(lambda: ages)
+    assert ages[0] <= loop.time() - begun
+
+
+@pytest.mark.parametrize("behind", [0, 5])
+async def test_a_ping_in_two_segments_makes_nothing_old(house: House, behind):
+    caller = await open_by_hand(house)
+    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+    ages: list[float] = []
+    Watches(house, lambda message: ages.append(message.age))
+    ping = frame(b"abcd", Opcode.PING)
+    await caller.say(ping[:3])
+    await until(lambda: wire._frame)
+    await asyncio.sleep(0.5)
+    begun = loop.time()
+    command = frame(Publish("x", b"go").encode(5))
+    await caller.say(ping[3:] + command[:behind])
+    assert await hear_frame(caller) == (PONG, b"abcd")
+    assert behind or not wire._client.inflow.unfinished
+    await caller.say(command[behind:])
+    await until(lambda: ages)
+    assert ages[0] <= loop.time() - begun

@@ -157,6 +157,8 @@ class Client:
         self._came_at = 0.0
         #: Since when what came waits for an answer of somebody else; 0 when nothing does.
         self._awaits_since = 0.0
+        #: When the first of what the connection keeps while it is paused came; 0 when it is not.
+        self._left_since = 0.0
         self._allowance = Allowance(PUBLISHER_PATIENCE)
         #: For answers about who else may receive its messages.
         self._rights_allowance = Allowance(RIGHTS_PATIENCE)
@@ -219,18 +221,27 @@ class Client:
         if self._store.fresh:
             self._depend()
         held = connection.held
-        if held or inflow.unfinished:
-            self._note_unfinished(now)
+        if held or inflow.unfinished or self._left_since:
+            self._note_unfinished(data, now)
         if held + self._behind_size != self._held:
             self._count_held()
 
-    def _note_unfinished(self, now: float) -> None:
-        """Know when a packet that is not whole began to come."""
-        inflow = self.inflow
-        if not self.connection.unfinished:
+    def _note_unfinished(self, data: bytes, now: float) -> None:
+        """Know when a packet that is not whole began to come: what was left, when it was left."""
+        inflow, connection = self.inflow, self.connection
+        has_completed = self._heard_at == now
+        came_at = now if data else self._left_since or now
+        if connection.paused:  # what it keeps may be the beginning of a packet, and may be more
+            if has_completed:
+                inflow.unfinished = 0.0
+                self._left_since = came_at
+            self._left_since = self._left_since or came_at
+            return
+        self._left_since = 0.0
+        if not connection.unfinished:
             inflow.unfinished = 0.0
-        elif not inflow.unfinished or self._heard_at == now:
-            inflow.unfinished = now
+        elif not inflow.unfinished or has_completed:
+            inflow.unfinished = came_at
 
     def _completing(self, data: bytes, effort: int) -> Iterator[Event]:
         """What comes in; what has come in parts, slowly, is as old as the first of them."""

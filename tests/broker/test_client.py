@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
+from appliance.broker import client
 from appliance.broker.broker import Broker
+from appliance.broker.message import Message
 from appliance.broker.ports import Action, Limits
+from appliance.broker.subscribing import Step, subscribe
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Auth,
@@ -822,3 +827,38 @@ def test_an_absent_client_without_room_is_no_reason_to_refuse_what_others_take(
     assert [m.payload for m in taker.drain()] == [b"0", b"1", b"2", b"3"]
     taker.lose()
     assert publisher.publish("a", b"4", 2) == 0x97
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_packet_cut_in_two_is_as_old_as_its_first_byte(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch, waits: bool
+):
+    """Also when what is before it takes some turns."""
+    ages = []
+    publish_to = Broker.publish_to
+
+    def told(self: Broker, targets: Any, route: Any, message: Message, origin: Any) -> int:
+        ages.append(message.age)
+        return publish_to(self, targets, route, message, origin)
+
+    def slow(*args: Any, **options: Any) -> Iterator[Step]:
+        yield None
+        yield from subscribe(*args, **options)
+
+    monkeypatch.setattr(Broker, "publish_to", told)
+    monkeypatch.setattr(client, "subscribe", slow)
+    peer = Peer(broker, 4)
+    peer.connect("a")
+    command = Publish("x", b"go", 1, packet_id=7).encode(4)
+    if waits:
+        peer.send(Subscribe(1, [Subscription("x")]).encode(4) + command[:5])
+    else:
+        peer.send(command[:5])
+    broker.ledger.now += 3
+    if waits:
+        peer.go_on()
+    broker.ledger.now += 0.05
+    peer.send(command[5:] + command[:5])
+    broker.ledger.now += 0.05
+    peer.send(command[5:])
+    assert ages == [pytest.approx(3.05), 0.0]
