@@ -15,6 +15,7 @@ import struct
 import termios
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from appliance.broker.ports import Contact
 
@@ -131,10 +132,18 @@ def allow_files(needed: int) -> None:
         )
 
 
-#: Where `tcpi_last_data_recv`, `tcpi_last_ack_recv` (milliseconds) and `tcpi_rtt` (microseconds)
-#: are in Linux's `struct tcp_info`, and the first bytes of it, with all of them.
-_LAST_DATA, _LAST_ACK, _ROUND_TRIP = 52, 56, 68
-_TCP_INFO_SIZE = 104
+#: Where `tcpi_last_data_recv`, `tcpi_last_ack_recv` (milliseconds), `tcpi_rtt` (microseconds) and
+#: `tcpi_bytes_received` are in Linux's `struct tcp_info`, and the first bytes of it, with all of
+#: them; systems before 4.1 have not the last one.
+_LAST_DATA, _LAST_ACK, _ROUND_TRIP, _RECEIVED = 52, 56, 68, 128
+_TCP_INFO_SIZE = 136
+
+#: `SO_MEMINFO`, of which the first two numbers are the memory that unread bytes take, and the most.
+_MEMORY = 55
+_MEMORY_SIZE = 36
+
+#: Bytes of a Unix socket, or where that is not known, that may be all that fits.
+_MUCH = 4096
 
 #: Seconds of silence after which a probe is sent, and between two of them: the least there is.
 _PROBE_AFTER = 1
@@ -143,9 +152,7 @@ _PROBE_AFTER = 1
 def contact(connection: socket.socket) -> Contact:
     """What the system knows of the computer at the other end; a Unix socket's is this one."""
     try:
-        (unread,) = struct.unpack(
-            "i", fcntl.ioctl(connection.fileno(), termios.FIONREAD, b"\0" * 4)
-        )
+        unread = _unread(connection)
         if connection.family == socket.AF_UNIX:
             return Contact(has_unread=unread > 0)
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
@@ -155,6 +162,41 @@ def contact(connection: socket.socket) -> Contact:
     except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
         return Contact(silence=math.inf)
     return Contact(round_trip / 1e6, min(data, ack) / 1e3, unread > 0, unheard=data / 1e3)
+
+
+class Inbox(NamedTuple):
+    """What the system has received of a connection, as `Inflow.look` takes it."""
+
+    unread: bool
+    full: bool
+    received: int
+    round_trip: float
+
+
+def inbox(connection: socket.socket) -> Inbox:
+    """How much of what has come is not read, and whether the other end may keep more back for that:
+    its window is much smaller than it may be."""
+    try:
+        waits = _unread(connection)
+        if connection.family == socket.AF_UNIX:
+            return Inbox(waits > 0, waits > _MUCH, 0, 0.0)
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
+        (round_trip,) = struct.unpack_from("=I", info, _ROUND_TRIP)
+        (received,) = struct.unpack_from("=Q", info.ljust(_TCP_INFO_SIZE, b"\0"), _RECEIVED)
+    except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
+        return Inbox(unread=False, full=False, received=0, round_trip=0.0)
+    try:
+        memory = connection.getsockopt(socket.SOL_SOCKET, _MEMORY, _MEMORY_SIZE)
+        taken, most = struct.unpack_from("=II", memory)
+        full = 4 * taken > most
+    except (OSError, struct.error):  # before 4.12
+        full = waits > _MUCH
+    return Inbox(waits > 0, full, received, round_trip / 1e6)
+
+
+def _unread(connection: socket.socket) -> int:
+    (size,) = struct.unpack("i", fcntl.ioctl(connection.fileno(), termios.FIONREAD, b"\0" * 4))
+    return int(size)
 
 
 class Probe:

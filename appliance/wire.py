@@ -15,13 +15,14 @@ from typing import cast
 from appliance import farewell, tls
 from appliance.broker.accounts import Account
 from appliance.broker.client import Client
+from appliance.broker.inflow import PAUSE_BEHIND
 from appliance.broker.ports import HERE, Contact, Exchange, Identity, Refusal, Secured
 from appliance.entries import contained, contained_made
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.network import PUBLISH_BURST, Network
-from appliance.sockets import Probe, contact
+from appliance.sockets import Probe, contact, inbox
 from appliance.websocket import WebSocket
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
@@ -107,6 +108,7 @@ class ClientProtocol:
         self._turns_taken = 0  # without a second's rest
         self._turned_at = 0.0
         self._resting: asyncio.TimerHandle | None = None
+        self._looks: asyncio.TimerHandle | None = None  # whether it has caught up
         self._choked = False
         self._logging_in = False
         self._who: Identity | Refusal | None = None  # what came of it, not told yet
@@ -260,6 +262,8 @@ class ClientProtocol:
         self._ledger.now = self._loop.time()
         if self._waits is not None:
             self._waits.cancel()
+        if self._looks is not None:
+            self._looks.cancel()
         if not self._closing:
             self._closing = True
             held, self._held = bytes(self._held), _NOTHING
@@ -470,9 +474,31 @@ class ClientProtocol:
         else:
             inflow = self._client.inflow
             inflow.read(self._loop.time())
-            if inflow.is_behind and not self._reached().has_unread:
-                inflow.has_caught_up()
+            if inflow.is_behind:
+                self._see_whether_caught_up()
             self._transport.resume_reading()
+
+    def _see_whether_caught_up(self) -> None:
+        """Look whether all is read of what the client has said while it was not, now and later."""
+        if self._transport is None:
+            return
+        known = inbox(self._transport.get_extra_info("socket"))
+        if self._transport.get_extra_info("has_unread"):
+            known = known._replace(unread=True)
+        inflow = self._client.inflow
+        seconds = inflow.look(self._loop.time(), **known._asdict())
+        if seconds and inflow.is_watched:  # else nobody has asked
+            self._look_after(seconds)
+
+    def _look_after(self, seconds: float) -> None:
+        if self._looks is None:
+            self._looks = self._entries.later(
+                "connection.look", seconds, self._look_again, served=self
+            )
+
+    def _look_again(self) -> None:
+        self._looks = None
+        self._see_whether_caught_up()
 
     def _hold(self, data: bytes, begin: int) -> None:
         """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
@@ -779,21 +805,16 @@ class ClientProtocol:
         """How the computer at the other end answers."""
         if self._transport is None:
             return HERE
-        known = self._reached()
+        known = contact(self._transport.get_extra_info("socket"))
         has_unread = known.has_unread or bool(self._held) or self._sends_on
+        has_unread = has_unread or bool(self._transport.get_extra_info("has_unread"))
         now = self._ledger.now  # of the chunk that is being taken in, if one is
         inflow = self._client.inflow
         held = inflow.held(now, has_unread=has_unread)
         flowing = inflow.flowing(now)
+        if held:
+            self._look_after(PAUSE_BEHIND)
         return replace(known, has_unread=has_unread, flowing=flowing, held=held)
-
-    def _reached(self) -> Contact:
-        """What the system and the transport know of the other end."""
-        assert self._transport is not None
-        known = contact(self._transport.get_extra_info("socket"))
-        if not known.has_unread and self._transport.get_extra_info("has_unread"):
-            return replace(known, has_unread=True)
-        return known
 
     def probe(self) -> None:
         """Have it answer within two seconds, if it can."""

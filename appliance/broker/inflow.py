@@ -3,6 +3,11 @@
 What a client has queued comes without a pause. Who says something now and then has pauses between,
 in which all that it had to say is there, whole. So the end of such a pause is when what has come
 since was said at the earliest; unless it had come before and was not read.
+
+While a client is not read, what it says fills what the system keeps for it, and then it keeps the
+rest back itself. That comes a round trip after it is read again, as fast as the network takes it.
+So who had to keep something back has caught up when little has come for longer than that, and
+nothing that came is left unread.
 """
 
 from __future__ import annotations
@@ -18,6 +23,10 @@ A_BYTE = 0.8e-6
 #: soon.
 PAUSE_BEHIND = 0.02
 
+#: Bytes that are little, in two round trips and that pause: who has something to catch up with
+#: sends several full packets of the network in one.
+LITTLE = 4096
+
 #: The smallest PUBLISH has so many bytes.
 SHORTEST = 5
 
@@ -32,6 +41,9 @@ class Inflow:
         "_caught_up",
         "_held",
         "_held_since",
+        "_is_kept_back",
+        "_quiet_since",
+        "_received",
         "_resumed",
         "began",
         "is_watched",
@@ -53,6 +65,11 @@ class Inflow:
         self._held_since = 0.0
         self._resumed = -math.inf
         self._caught_up = 0.0
+        #: Whether it may have kept back what it had to say; since when little has come, 0 while
+        #: that is not known, and the bytes that had come until then.
+        self._is_kept_back = False
+        self._quiet_since = 0.0
+        self._received = 0
 
     def came(self, data: bytes, now: float) -> None:
         """A chunk has come."""
@@ -65,8 +82,6 @@ class Inflow:
         pause = PAUSE_BEHIND if is_behind else PAUSE
         if gap > pause + len(data) * A_BYTE and not self.unfinished and not is_held:
             self.began = now
-            if gap > PAUSE_BEHIND:
-                self.has_caught_up()
         self.last = now
 
     def not_read(self, now: float) -> None:
@@ -74,7 +89,7 @@ class Inflow:
         if not self._held_since:
             self._held_since = now
             if self._caught_up and now > self._caught_up:
-                self._held = 0.0
+                self._has_caught_up()
             self._caught_up = 0.0
 
     def read(self, now: float) -> None:
@@ -84,9 +99,35 @@ class Inflow:
             self._held_since = 0.0
             self._resumed = now
 
-    def has_caught_up(self) -> None:
-        """Nothing that had come before is left to be read."""
-        self._held = self._caught_up = 0.0
+    def look(
+        self, now: float, *, unread: bool, full: bool, received: int, round_trip: float
+    ) -> float:
+        """See whether it has caught up; returns after how many seconds to look again, 0 for not.
+
+        `unread`: something that has come is not read; `full`: so much that it may keep the rest
+        back. `received`: the bytes that have come, in all.
+        """
+        if self._held_since or not self._held:
+            return 0.0
+        if not (unread or full or self._is_kept_back):
+            self._has_caught_up()
+            return 0.0
+        self._is_kept_back |= full
+        if unread or full:
+            self._quiet_since = 0.0
+            return PAUSE_BEHIND
+        if not self._quiet_since or received - self._received > LITTLE:
+            self._quiet_since, self._received = now, received
+        left = self._quiet_since + 2 * round_trip + PAUSE_BEHIND - now
+        if left > 0:
+            return left
+        self._has_caught_up()
+        return 0.0
+
+    def _has_caught_up(self) -> None:
+        """Nothing that it had to say before is left to be read."""
+        self._held = self._caught_up = self._quiet_since = 0.0
+        self._is_kept_back = False
 
     @property
     def is_behind(self) -> bool:
@@ -98,8 +139,8 @@ class Inflow:
         if self._held_since:
             return self._held + now - self._held_since
         if self._caught_up and now > self._caught_up:
-            self.has_caught_up()
-        if self._held and not has_unread and not self._caught_up:
+            self._has_caught_up()
+        if self._held and not (has_unread or self._is_kept_back or self._caught_up):
             self._caught_up = now  # with what has come until now
         return self._held
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from appliance.broker.inflow import A_BYTE, PAUSE, PAUSE_BEHIND, Inflow
+from appliance.broker.inflow import A_BYTE, LITTLE, PAUSE, PAUSE_BEHIND, Inflow
 
 COMMAND = b"0" * 60
 
@@ -31,6 +31,11 @@ class Sending:
 
     def age(self, *, has_unread=False):
         return self.held(self.now, has_unread=has_unread)
+
+    def see(self, *, unread=False, full=False, received=0, round_trip=0.0):
+        return self.look(
+            self.now, unread=unread, full=full, received=received, round_trip=round_trip
+        )
 
 
 def test_what_comes_at_once_flows_since_its_first_byte():
@@ -125,5 +130,65 @@ def test_who_pauses_has_nothing_left_of_before():
         assert inflow.flowing(inflow.now) == 0
         inflow.now += 0.01
         inflow.read(inflow.now)
+        assert inflow.see(unread=True) == PAUSE_BEHIND
         assert inflow.age(has_unread=True) == pytest.approx(0.01)
-        inflow.now += 2 * PAUSE_BEHIND
+        inflow.now += PAUSE_BEHIND
+        assert inflow.see() == 0
+        assert inflow.age() == 0
+
+
+def test_no_work_of_ours_is_a_pause_of_its_own():
+    """There is more of what it has said before than is read in one go."""
+    inflow = Sending()
+    inflow.not_read(inflow.now)
+    inflow.now += 1
+    inflow.read(inflow.now)
+    for _ in range(9):
+        assert inflow.see(unread=True) == PAUSE_BEHIND
+        inflow.hear(3 * PAUSE_BEHIND)
+        assert inflow.age(has_unread=True) == 1
+    assert inflow.age() == 1
+    inflow.hear(3 * PAUSE_BEHIND)
+    assert inflow.age() == 0
+
+
+@pytest.mark.parametrize("round_trip", [0.005, 0.03, 0.1, 1.0])
+def test_what_it_kept_back_comes_a_round_trip_after_it_is_read_again(round_trip):
+    inflow = Sending()
+    inflow.not_read(inflow.now)
+    inflow.now += 1
+    inflow.read(inflow.now)
+    assert inflow.see(unread=True, full=True, round_trip=round_trip) == PAUSE_BEHIND
+    inflow.hear(0, bytes(60_000))
+    assert inflow.age() == 1
+    received = 60_000
+    for _ in range(5):  # it is more than fits into one flight
+        inflow.now += PAUSE_BEHIND
+        inflow.see(received=received, round_trip=round_trip)
+        inflow.hear(round_trip, bytes(14_000))
+        received += 14_000
+        assert inflow.age() == 1
+    inflow.now += PAUSE_BEHIND
+    pause = inflow.see(received=received, round_trip=round_trip)
+    assert pause == pytest.approx(2 * round_trip + PAUSE_BEHIND)
+    inflow.hear(pause / 2)
+    assert inflow.age() == 1
+    inflow.now += pause / 2 + 0.001
+    # Who goes on with little has nothing else to say.
+    assert inflow.see(received=received + LITTLE, round_trip=round_trip) == 0
+    inflow.hear(0)
+    assert inflow.age() == 0
+
+
+def test_who_has_not_caught_up_before_it_is_not_read_again_has_it_all_before_it():
+    inflow = Sending()
+    for _ in range(3):
+        inflow.not_read(inflow.now)
+        inflow.now += 0.3
+        assert inflow.see(full=True) == 0  # nothing to be seen while it is not read
+        inflow.read(inflow.now)
+        inflow.see(unread=True, full=True, round_trip=0.1)
+        inflow.hear(0, bytes(60_000))
+        inflow.now += 0.1
+        assert inflow.see(received=60_000, round_trip=0.1)
+    assert inflow.age() == pytest.approx(0.9)
