@@ -139,10 +139,17 @@ class Arrivals:
     """
 
     def __init__(self) -> None:
+        #: Of the message for ROS that came last, of all clients' and whatever route it has.
+        self.number = 0
         self._paces: dict[Session, _Pace] = {}
         #: Of those of QoS 2, how they come, before they are released.
         self._coming: dict[Session, _Pace] = {}
         self._expected: OrderedDict[str, None] = OrderedDict()
+
+    def count(self) -> int:
+        """A message for ROS has come; returns its number, which is one for all its routes."""
+        self.number += 1
+        return self.number
 
     def judge(
         self, origin: Session, qos: int, oldest: float, now: float, number: int = -1

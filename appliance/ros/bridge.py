@@ -376,8 +376,9 @@ class Bridge:
 
     def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         size = size_of(message.payload)
+        number = self._around.arrivals.count()
         for receiver in self._receivers.get(message.topic, ()):
-            self._turns_for(receiver, message, retain, origin, size)
+            self._turns_for(receiver, message, retain, origin, number, size)
 
     def _turns_for(
         self,
@@ -385,6 +386,7 @@ class Bridge:
         message: Message,
         retain: bool,
         origin: Session | None,
+        number: int,
         size: int,
     ) -> None:
         """Hand it over now or, when it is large and others wait, when it is its turn.
@@ -392,7 +394,7 @@ class Bridge:
         What has waited was acknowledged before: that it cannot be converted is told by its route.
         """
         turns = self._turns
-        work = partial(self._hand_over, receiver, message, retain, origin)
+        work = partial(self._hand_over, receiver, message, retain, origin, number)
         if isinstance(receiver, Commands) or (size <= LITTLE and not turns.waits(origin)):
             work()  # where there are rules, what comes is judged first, and waits then
         elif turns.has_room(origin, size):
@@ -403,10 +405,15 @@ class Bridge:
             self._object(receiver.objection(message, why, ReasonCode.QUOTA_EXCEEDED))
 
     def _hand_over(
-        self, receiver: ToRos, message: Message, retain: bool, origin: Session | None
+        self,
+        receiver: ToRos,
+        message: Message,
+        retain: bool,
+        origin: Session | None,
+        number: int,
     ) -> None:
         try:
-            objection = receiver.receive(message, retain, origin)
+            objection = receiver.receive(message, retain, origin, number)
         except Exception as error:
             objection = receiver.fault(message, error)
         if objection is not None:

@@ -22,7 +22,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.arrivals import BEGINS, QUEUED, SENT_AT, Verdict, said_age, sent_at
 from appliance.ros.convert import ConversionError, Converter, Converters
 from appliance.ros.flows import REPORT_INTERVAL, Route, Tell
-from appliance.ros.lease import Lease
+from appliance.ros.lease import OVERTAKEN, Lease
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.payloads import unpacked_size
 from appliance.ros.rules import CommandRules, FieldLimits
@@ -59,6 +59,7 @@ class _Waiting:
     """A first command, converted, that waits whether there is a queue behind it."""
 
     message: Message
+    number: int
     cdr: bytes
     #: What of it is counted, in bytes.
     size: int
@@ -73,6 +74,8 @@ class _Command:
 
     message: Message
     origin: Session | None
+    #: Of `Arrivals`: which of two came first, on whatever topics.
+    number: int
     at: float
     verdict: Verdict
     #: Why it is not to be carried out, if it does not stop the robot.
@@ -95,6 +98,7 @@ class _Stop:
         self._converter = converter
         self._payload = payload.encode()
         self.example = self.cdr()
+        self._says = self._said_by(self.example)
 
     def cdr(self) -> bytes:
         """The message, made anew: it may say "now"."""
@@ -105,10 +109,13 @@ class _Stop:
         if abs(len(cdr) - len(self.example)) > LITTLE:
             return False  # as long as no frame's name is
         try:
-            one, other = (self._converter.to_dict(message) for message in (cdr, self.example))
-        except ConversionError:  # of another type, from before a reload
+            return self._said_by(cdr) == self._says
+        except ConversionError:  # of another type, from before a reload or of another route
             return False
-        return all(one[name] == other[name] for name in one if name != "header")
+
+    def _said_by(self, cdr: bytes) -> dict[str, object]:
+        fields = self._converter.to_dict(cdr)
+        return {name: value for name, value in fields.items() if name != "header"}
 
 
 def check_rules(
@@ -157,7 +164,7 @@ class Commands(ToRos):
         self._drivers: dict[Session, tuple[bytes, float]] = {}
         self._has_stopped = False
         self._arrivals = around.arrivals
-        #: The lease that an exclusive route has joined.
+        #: The lease that the route has joined.
         self._joined: Lease | None = None
         #: First commands of clients, see `Arrivals`.
         self._waiting: dict[Session, _Waiting] = {}
@@ -167,8 +174,9 @@ class Commands(ToRos):
         self._asked: dict[Session, float] = {}
         #: Whether a stop message is overdue, which ROS would not take.
         self._must_stop = False
-        #: Whether the topic had a retained message before there was anybody on ROS to have it.
-        self._is_awaited = False
+        #: The number of the topic's retained message, where it came before there was anybody on ROS
+        #: to have it.
+        self._awaited: int | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._told: dict[str, float] = {}
 
@@ -208,7 +216,7 @@ class Commands(ToRos):
         for origin in list(self._waiting):
             self._forget(origin, "the route ends")
         if self._is_driven:
-            self._publish_stop("the route ends")
+            self._stop_now("the route ends")
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -216,19 +224,21 @@ class Commands(ToRos):
         self._part_with_lease()
         self._source = None
 
-    def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
+    def receive(
+        self, message: Message, retain: bool, origin: Session | None, number: int
+    ) -> Objection | None:
         """What is known of a command when it comes is judged then; a large one is converted when it
         is its turn, and what is wrong with it is returned only if that is now.
         """
         if self._is_left or (retain and not self.rules.take_retained):
             return None
-        command = self._judge(message, retain, origin)
+        command = self._judge(message, retain, origin, number)
         is_refused = command.why or command.verdict is Verdict.REFUSE
         if is_refused and not self._may_stop(message):
             return self._refuse(command, command.why or command.refusal)
         is_kept = retain or (message.retain and self.rules.take_retained)
         if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
-            self._is_awaited = True
+            self._awaited = number
             return None
         size = size_of(message.payload)
         if size <= LITTLE and origin not in self._queued:
@@ -240,7 +250,9 @@ class Commands(ToRos):
             return turns.now(partial(self._finish, command))
         return self._queue(command, size)
 
-    def _judge(self, message: Message, retain: bool, origin: Session | None) -> _Command:
+    def _judge(
+        self, message: Message, retain: bool, origin: Session | None, number: int
+    ) -> _Command:
         """What is to become of it, as far as that is known without a look into the payload."""
         # When it was received: what came in one chunk came at once, however long it takes.
         now = self._around.broker.now
@@ -250,13 +262,12 @@ class Commands(ToRos):
             why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)
             is_proven = sent_at(message.properties) is not None
         except ValueError as error:  # unless it stops the robot, which is seen in its payload
-            return _Command(message, origin, now, verdict, str(error), is_wrong=True)
+            return _Command(message, origin, number, now, verdict, str(error), is_wrong=True)
         if origin is not None:
             if why and origin.link is not None:
                 self._forget(origin, why)
                 self._arrivals.is_old(origin, now)
             elif not why and not is_proven and self.rules.oldest < math.inf:
-                number = self._around.broker.counters.messages_received
                 verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now, number)
                 if verdict is Verdict.REFUSE:
                     refusal = self._arrivals.why(origin)
@@ -264,7 +275,7 @@ class Commands(ToRos):
             self._forget(origin, why or refusal)
             if verdict is Verdict.WAIT:
                 self._arrivals.waits(origin, self)
-        return _Command(message, origin, now, verdict, why, refusal=refusal)
+        return _Command(message, origin, number, now, verdict, why, refusal=refusal)
 
     def _finish(self, command: _Command) -> Objection | None:
         """Convert it and carry it out, if that is still to be; what the appliance itself fails in
@@ -280,7 +291,7 @@ class Commands(ToRos):
             return self._refuse(command, command.why)
         cdr = command.cdr or self._convert(message, origin)
         verdict = command.verdict
-        if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self._stops(cdr)):
+        if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self.stops(cdr)):
             # Who says stop is heard at once, whatever comes with it.
             if origin is not None:
                 self._arrivals.waited(origin, self)
@@ -291,7 +302,7 @@ class Commands(ToRos):
             return self._expire(message, command.refusal, origin)
         if origin is not None and verdict is Verdict.WAIT:
             return self._let_wait(command, cdr, origin)
-        return self._carry_out(message, cdr, origin)
+        return self._carry_out(message, cdr, origin, command.number)
 
     # Large commands, which wait for their turn to be converted
 
@@ -304,10 +315,8 @@ class Commands(ToRos):
                 cdr = turns.now(partial(self._convert, message, origin))
                 if isinstance(cdr, Objection):
                     return cdr
-                if cdr is not None and self._stops(cdr):
+                if cdr is not None and self.stops(cdr):
                     command.cdr = cdr
-                    if origin is not None:
-                        self._drop_queued(origin, "a stop message followed")
                     return self._finish(command)
             if origin is not None:
                 self._arrivals.waited(origin, self)
@@ -324,10 +333,9 @@ class Commands(ToRos):
         cdr = self._convert(message, origin)
         if isinstance(cdr, Objection):
             return cdr
-        if origin is not None and self._stops(cdr):
-            self._drop_queued(origin, "a stop message followed")
-            return self._finish(command)
         command.cdr = cdr
+        if self.stops(cdr):
+            return self._finish(command)
         return self._queue(command, max(len(cdr), len(message.payload)))
 
     def _have_turn(self, command: _Command) -> None:
@@ -349,10 +357,12 @@ class Commands(ToRos):
             if command.has_left and origin is self._source:
                 self._source = None
                 if self._is_driven:
-                    self._publish_stop(f"{origin} has left")
+                    self._stop_now(f"{origin} has left")
 
     def _why_late(self, command: _Command) -> str:
         """Why a command that was new has become too old in the queue; empty when it has not."""
+        if self._lease.is_overtaken(command.number):
+            return OVERTAKEN
         oldest = self.rules.oldest
         waited = self._around.entries.time() - command.at
         try:
@@ -400,8 +410,10 @@ class Commands(ToRos):
             return self._may_stop(message)
         return self._is_late_stop(message, session)
 
-    def _carry_out(self, message: Message, cdr: bytes, origin: Session | None) -> Objection | None:
-        objection = self._publish(cdr, message)
+    def _carry_out(
+        self, message: Message, cdr: bytes, origin: Session | None, number: int
+    ) -> Objection | None:
+        objection = self._publish(cdr, message, number)
         if objection is None:
             self._commanded(cdr, origin)
         return objection
@@ -432,7 +444,7 @@ class Commands(ToRos):
         if expires_at is not None and expires_at <= self._around.broker.now:
             return False
         try:
-            return self._stops(super()._read(out[0], message, origin))
+            return self.stops(super()._read(out[0], message, origin))
         except ConversionError:
             return False
 
@@ -477,7 +489,8 @@ class Commands(ToRos):
         ledger.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)
-        self._waiting[origin] = _Waiting(message, cdr, size, command.at, due, timer)
+        waiting = _Waiting(message, command.number, cdr, size, command.at, due, timer)
+        self._waiting[origin] = waiting
         return None
 
     def _wait_until(self, when: float, origin: Session) -> asyncio.TimerHandle:
@@ -529,8 +542,10 @@ class Commands(ToRos):
         waiting = self._wait_no_longer(origin)
         if waiting is None:
             return
-        if self.decide(origin):
-            self._carry_out(waiting.message, waiting.cdr, origin)
+        if self._lease.is_overtaken(waiting.number):
+            self._count_expired(OVERTAKEN, origin)
+        elif self.decide(origin):
+            self._carry_out(waiting.message, waiting.cdr, origin, waiting.number)
         else:
             self.counters.refused += 1
 
@@ -543,11 +558,11 @@ class Commands(ToRos):
         try:
             limited, has_changed = self._limits.apply(cdr)
         except ConversionError as error:
-            if self._stops(cdr):
+            if self.stops(cdr):
                 return cdr
             raise AgainstRulesError("", f"it is against the route's rules: {error}") from None
         if has_changed:
-            if self._stops(cdr):  # clamped, it might move the robot
+            if self.stops(cdr):  # clamped, it might move the robot
                 return cdr
             self.counters.clamped += 1
             self._mention("clamped", "%s: numbers in a command of %s were clamped", origin)
@@ -567,10 +582,10 @@ class Commands(ToRos):
                 self._drivers.pop(origin, None)
         self._has_stopped = True  # the stop message of the start would come late
         self._must_stop = False
-        self._is_awaited = False
+        self._awaited = None
         is_free = self.rules.exclusive and lease.holder is None
         # Who stops does not command: a stop is let through from an old queue as well.
-        if is_free and origin is not None and origin.link and not self._stops(cdr):
+        if is_free and origin is not None and origin.link and not self.stops(cdr):
             lease.holder = origin
             self._around.broker.guards_changed()
             self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)
@@ -587,17 +602,26 @@ class Commands(ToRos):
         holder = self._lease.holder if self.rules.exclusive else None
         return None if holder is None else holder.client_id
 
+    @property
+    def is_exclusive(self) -> bool:
+        """As `Lease` has it: whether one client commands at a time."""
+        return self.rules.exclusive
+
+    def watch(self) -> None:
+        """As `Lease` has it: look when its holder has been silent for too long."""
+        self._arm()
+
     def _share_lease(self) -> None:
         self._part_with_lease()
         super()._share_lease()
-        if self.rules.exclusive and not self._is_left:
-            self._lease.join(self._arm)
+        if not self._is_left:
+            self._lease.join(self)
             self._joined = self._lease
 
     def _part_with_lease(self) -> None:
         joined, self._joined = self._joined, None
         if joined is not None:
-            joined.part(self._arm)
+            joined.part(self)
             self._around.broker.guards_changed()
 
     def _release(self, why: str) -> None:
@@ -624,19 +648,20 @@ class Commands(ToRos):
         if session is self._source:
             self._source = None
             if self._is_driven:
-                self._publish_stop(f"{session} has left")
+                self._stop_now(f"{session} has left")
         driven = self._drivers.pop(session, None)
         if driven is not None and not self._is_stop(driven[0]):
             # Its library may have queued what it commanded since, and marks none of it as old.
             self._arrivals.expect(session.client_id)
 
-    def _stops(self, cdr: bytes) -> bool:
+    def stops(self, cdr: bytes) -> bool:
         """Whether it is the route's stop message, or says the same."""
-        return self._stop is not None and (cdr == self._stop.example or self._stop.is_like(cdr))
+        stop = self._stop
+        return stop is not None and (cdr == stop.example or stop.is_like(cdr))
 
     def _is_stop(self, cdr: bytes) -> bool:
         """Whether who said it last does not drive."""
-        return self.rules.on_silence is None or self._stops(cdr)
+        return self.rules.on_silence is None or self.stops(cdr)
 
     def _first_due(self) -> float:
         """When the silence since the last command, or of the lease's holder, is too long."""
@@ -689,7 +714,7 @@ class Commands(ToRos):
             elif is_over or silence >= on_silence.after:
                 who = self._source or "a retained command"
                 after = min(silence, on_silence.after)
-                self._publish_stop(f"{who} fell silent for {after:g} s")
+                self._stop_now(f"{who} fell silent for {after:g} s")
         if on_silence is not None and on_silence.disconnect:
             self._ask_silent(min(silence, on_silence.after) if is_over else on_silence.after)
             self._disconnect_silent()
@@ -735,13 +760,23 @@ class Commands(ToRos):
         if self._is_left:
             return
         if not self._has_stopped:
+            # It is for what was before the route, and overtakes nothing that has come since.
             self._publish_stop("there is somebody to hear it")
-        if self._is_awaited:
-            self._is_awaited = False
-            # What is retained now: it may have been replaced, or taken back.
-            message = self._around.broker.retained.get(self.mqtt)
-            if message is not None:
-                self.receive(message, True, None)
+        awaited, self._awaited = self._awaited, None
+        if awaited is None:
+            return
+        if self._lease.is_overtaken(awaited):
+            self._count_expired(OVERTAKEN, None)
+            return
+        # What is retained now: it may have been replaced, or taken back.
+        message = self._around.broker.retained.get(self.mqtt)
+        if message is not None:
+            self.receive(message, True, None, awaited)
+
+    def _stop_now(self, why: str) -> None:
+        """Publish the stop message: nothing that has come until now is carried out any more."""
+        self._lease.stop(self._arrivals.number + 1)
+        self._publish_stop(why)
 
     def _publish_stop(self, why: str) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""

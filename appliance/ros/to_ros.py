@@ -16,7 +16,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.arrivals import Arrivals
 from appliance.ros.convert import ConversionError, Converters
 from appliance.ros.flows import Echo, Flow, Route, Tell
-from appliance.ros.lease import Lease, Leases
+from appliance.ros.lease import OVERTAKEN, Lease, Leases
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
 from appliance.ros.payloads import CONTENT_TYPE, check, claim, unpacker
 from appliance.ros.qos import publisher_qos
@@ -135,15 +135,22 @@ class ToRos(Flow):
             del broker.guards[self.mqtt]
         broker.guards_changed()
 
-    def receive(self, message: Message, retain: bool, origin: Session | None) -> Objection | None:
-        """A message from MQTT, of that session; returns what is wrong with it, which is told.
+    def receive(
+        self, message: Message, retain: bool, origin: Session | None, number: int
+    ) -> Objection | None:
+        """A message from MQTT, of that session, which came with that number; returns what is wrong
+        with it, which is told.
 
         With `retain` it is from before the route: it may be an old command, and does not reach ROS.
         """
         if retain:
             return None
+        if self._lease.is_overtaken(number):  # while it waited for its turn
+            self.counters.expired += 1
+            self._tell_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
+            return None
         cdr = self._convert(message, origin)
-        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message)
+        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message, number)
 
     def _convert(self, message: Message, origin: Session | None) -> bytes | Objection:
         """The message's CDR, or what is wrong with it, which is told."""
@@ -160,7 +167,7 @@ class ToRos(Flow):
             problem = f"cannot be converted: {error}"
             return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
 
-    def _publish(self, cdr: bytes, message: Message) -> Objection | None:
+    def _publish(self, cdr: bytes, message: Message, number: int) -> Objection | None:
         """Publish on ROS what the message was converted to; returns why that failed."""
         out = self._out
         if out is None:
@@ -171,6 +178,8 @@ class ToRos(Flow):
             out[1].publish(cdr)
         except BusError as error:
             return self._object(message, f"could not be published: {error}")
+        finally:  # who says stop is not driven on, also when ROS does not take it
+            self._lease.said(cdr, number)
         self.counters.messages += 1
         self.counters.bytes += len(message.payload)
         return None
