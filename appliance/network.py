@@ -18,7 +18,7 @@ from appliance.clock import WorkClock
 from appliance.entries import Entries
 from appliance.farewell import Farewell
 from appliance.mqtt.packets import Connect
-from appliance.turns import Turn
+from appliance.turns import Charged, Turn
 
 #: Messages that are few: after more than these it is checked whether who sends them has to wait.
 FEW_MESSAGES = 64
@@ -181,9 +181,20 @@ class Network:
         """So much was done for one of them nevertheless."""
         self._beyond[account] = self._beyond.get(account, 0) + effort
 
-    def count(self, effort: int) -> None:
-        """So much was done, see `Counters.effort`."""
-        self.broker.counters.effort += effort
+    def count(self, effort: int, charged: Charged) -> None:
+        """So much was done for it, see `Counters.effort`."""
+        counters = self.broker.counters
+        counters.effort += effort
+        if self._counting and counters.effort > self.checkpoint:
+            self.went_beyond(charged.account, effort)
+
+    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
+        """Whether a chunk is to be taken apart in a turn, see `Turns`."""
+        if not is_little:
+            return self.is_busy()
+        if self.broker.counters.effort <= self.checkpoint or not self.is_round_over():
+            return False
+        return not self.may_go_beyond(charged.account)
 
     def queue_turn(self, member: Turn) -> None:
         """Call `take_turn` when it is the member's."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
 from appliance.entries import Faulty, contained, contained_made
-from appliance.turns import Turns
+from appliance.turns import Charged, Turns
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -33,7 +33,7 @@ PIECE = 2 * RECORD_SIZE
 RECORDS_A_TURN = 256
 RECORD_EFFORT = 1
 
-#: Bytes of a chunk that are not worth a look at whether others have to be served first.
+#: Bytes of a chunk that are little: it may be read although others have to be served.
 LITTLE = 4096
 
 #: Seconds that a client gets to read the last bytes before its connection is cut.
@@ -113,6 +113,7 @@ class TlsTransport:
         self._turns = turns
         #: What arrived and OpenSSL was not given, and whether that or OpenSSL has more to read.
         self._rest = _NOTHING
+        self._set_apart = 0  # bytes that it takes, as the protocol was told
         self._waits = False
         self._queued = False
         self._incoming = ssl.MemoryBIO()
@@ -166,8 +167,11 @@ class TlsTransport:
             if not self._open:
                 if not self._connected:
                     self._handshake_received(data)
-            elif self._waits or (len(data) > LITTLE and self._turns.is_busy()):
+            elif self._waits or self._turns.has_to_wait(
+                cast(Charged, self._protocol), is_little=len(data) <= LITTLE
+            ):
                 self._rest = memoryview(bytes(self._rest) + data if self._rest else data)
+                self._count_rest()
                 self._wait()
             else:
                 self._take(data)
@@ -187,8 +191,10 @@ class TlsTransport:
                 view = view[PIECE:]
                 self._read(parts)
             self._rest = view or _NOTHING  # an empty part would keep the whole
+        if self._rest or self._set_apart:
+            self._count_rest()
         if len(parts) > 1:
-            self._turns.count(RECORD_EFFORT * len(parts))
+            self._turns.count(RECORD_EFFORT * len(parts), cast(Charged, self._protocol))
         if parts:
             self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
         if self._waits and not self._ended:
@@ -216,6 +222,13 @@ class TlsTransport:
         except ssl.SSLError as error:
             self._ended = True
             self._error = error.with_traceback(None)
+
+    def _count_rest(self) -> None:
+        """Tell the protocol what memory is taken by what OpenSSL was not given: a whole chunk."""
+        size = len(cast(bytes, self._rest.obj))
+        if size != self._set_apart:
+            self._set_apart = size
+            cast(Charged, self._protocol).set_apart(size)
 
     def _wait(self) -> None:
         """Read nothing more until the others have had their turn."""

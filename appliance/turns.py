@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from appliance.broker.accounts import Account
 from appliance.entries import Entries
 
 
@@ -17,16 +18,30 @@ class Turn(Protocol):
         """Count what escaped while it was served, and end it; never raises."""
 
 
+class Charged(Protocol):
+    """Who is charged for what a layer below it does, and for what that keeps."""
+
+    @property
+    def account(self) -> Account:
+        """The user it has logged in as, or that of strangers."""
+
+    def set_apart(self, size: int) -> None:
+        """The layers below keep so many bytes that were received and not taken apart yet."""
+
+
 class Turns(Protocol):
     """What all connections share: who has much to do waits until others have had their turn."""
 
     entries: Entries
 
-    def count(self, effort: int) -> None:
-        """So much was done, see `Counters.effort`."""
+    def count(self, effort: int, charged: Charged) -> None:
+        """So much was done for it, see `Counters.effort`."""
 
-    def is_busy(self) -> bool:
-        """Whether as much was done as one round of the event loop is for."""
+    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
+        """Whether a chunk is to be taken apart in a turn, as so much else was done in this round.
+
+        A little one has to wait only when its user has had a share beyond the end of the round.
+        """
 
     def queue_turn(self, member: Turn) -> None:
         """Call `take_turn` when it is the member's."""

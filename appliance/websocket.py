@@ -14,8 +14,9 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
+from appliance.broker.accounts import Account
 from appliance.entries import contained, contained_made
-from appliance.turns import Turns
+from appliance.turns import Charged, Turns
 
 #: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
 PATH = "/mqtt"
@@ -27,10 +28,16 @@ HEAD_LIMIT = 16 * 1024
 #: What the names of the headers begin with that a WebSocket is asked for with.
 _OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
 
-#: Bytes of frames that are taken apart before it is looked at whether others have to be served: at
-#: worst, as frames may be empty, a millisecond's work. And the effort of a frame.
+#: Bytes that these may hold in all: the library takes a microsecond for each, and more.
+OWN_HEADERS_LIMIT = 1024
+
+#: The effort of a request for a WebSocket, see `Counters.effort`: it may have a hundred headers.
+HEAD_EFFORT = 100
+
+#: Bytes of frames that are little, and that are taken apart in one go: at worst, as frames may be
+#: empty, two milliseconds' work. And the effort of a frame, where they are many.
 PORTION = 2048
-FRAME_EFFORT = 2
+FRAME_EFFORT = 3
 
 #: Frames of one connection in its turn.
 FRAMES_A_TURN = 256
@@ -42,7 +49,7 @@ _library_log = logging.getLogger(f"{__name__}.frames")
 _library_log.setLevel(logging.ERROR)
 
 
-class Upper(Protocol):
+class Upper(Charged, Protocol):
     """What can be above a WebSocket: an `asyncio.Protocol` that answers for the connection."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -103,6 +110,9 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._head = bytearray()
         #: Received, and not yet taken apart.
         self._held = _NOTHING
+        #: Bytes that TLS below has kept, and that are kept here beside them.
+        self._below = 0
+        self._set_apart = 0
         self._reading = True
         self._writing = True
         #: The answer to the last ping, while it cannot be written.
@@ -124,10 +134,29 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Hand on what the frames hold, whole or in part."""
         self._held = memoryview(bytes(self._held) + data if self._held else data)
-        if len(self._held) > PORTION and (self._queued or self._turns.is_busy()):
+        is_little = len(self._held) <= PORTION
+        if self._queued or self._turns.has_to_wait(self._protocol, is_little=is_little):
             self._take_later()
         else:
             self._take()
+        self._count_held()
+
+    def _count_held(self) -> None:
+        """Tell what is above what memory is taken by what is not taken apart: a whole chunk."""
+        size = len(cast(bytes, self._held.obj)) + len(self._head)
+        if size != self._set_apart:
+            self._set_apart = size
+            self._protocol.set_apart(self._below + size)
+
+    @property
+    def account(self) -> Account:
+        """Whose user is charged for what TLS does below."""
+        return self._protocol.account
+
+    def set_apart(self, size: int) -> None:
+        """TLS below keeps so many bytes."""
+        self._below = size
+        self._protocol.set_apart(size + self._set_apart)
 
     def _take(self) -> None:
         """Take apart what is there, until others have their turn; reading is paused then."""
@@ -154,6 +183,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         """The others have had their turn."""
         self._queued = False
         self._take()
+        self._count_held()
         if not self._reading or self._transport.is_closing():
             return
         if self._frames.close_rcvd is not None:
@@ -165,10 +195,11 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         """Answer the HTTP request once it is complete; returns what came behind it."""
         head = self._head
         head += data
-        end = head.find(b"\r\n\r\n") + 4
+        end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
         if not head[:1].isupper():
             self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
         elif end > 3:
+            self._turns.count(HEAD_EFFORT, self._protocol)
             # The library would read frames before the answer to the request, so it gets the two
             # one after the other.
             self._frames.receive_data(bytes(head[:end]))
@@ -191,10 +222,18 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if request.path.partition("?")[0] != PATH:
             self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
             return False
+        size = 0
         for name, value in request.headers.raw_items():
+            if not name.lower().startswith(_OWN_HEADERS):
+                continue
             # What is not ASCII is for other headers, and the library would stumble over it.
-            if name.lower().startswith(_OWN_HEADERS) and not value.isascii():
+            if not value.isascii():
                 self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
+                return False
+            size += len(value)
+            if size > OWN_HEADERS_LIMIT:
+                what = f"{name} and the like hold more than {OWN_HEADERS_LIMIT} bytes"
+                self._refuse(400, f"not a WebSocket request: {what}")
                 return False
         response = frames.accept(request)
         if response.status_code != 101:
@@ -223,7 +262,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         events = frames.events_received()
         self._frames_left -= len(events)
         if len(events) > 1:
-            self._turns.count(FRAME_EFFORT * len(events))
+            self._turns.count(FRAME_EFFORT * len(events), self._protocol)
         for frame in events:
             assert not isinstance(frame, Request | Response)
             if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]

@@ -102,6 +102,7 @@ class ClientProtocol:
         self._held = _NOTHING
         self._held_size = 0  # bytes of the chunk that it is the rest of, in the ledger
         self._frame = 0  # bytes of a WebSocket frame that is not complete
+        self._below = 0  # bytes that TLS and WebSocket have not taken apart
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
         self._in_turn = False
@@ -275,6 +276,8 @@ class ClientProtocol:
         self._transport = None
         self.keep(0)
         self._let_go_of_held()
+        self._ledger.take(self.account, -self._below)
+        self._below = 0
         if self._connection is not None:
             self._network.part(self._connection)
         if self._network.is_busy():
@@ -534,6 +537,12 @@ class ClientProtocol:
             return MAXIMUM_CONTROL
         return self._client.connection.maximum_packet_size + MAXIMUM_CONTROL
 
+    def set_apart(self, size: int) -> None:
+        """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
+        if not self._is_lost:
+            self._ledger.take(self.account, size - self._below)
+            self._below = size
+
     def keep(self, size: int) -> None:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""
         ledger = self._ledger
@@ -701,7 +710,7 @@ class ClientProtocol:
         self._timeout.cancel()
         self._network.count_output(self.account, -self._counted)
         self._network.count_output(account, self._counted)
-        waits = self._frame + self._held_size
+        waits = self._frame + self._below + self._held_size
         self._ledger.take(self.account, -waits)
         self._ledger.take(account, waits)
         self.account = account

@@ -26,7 +26,7 @@ from appliance import certs, tls
 from appliance.broker.faults import Faults
 from appliance.entries import Entries
 from appliance.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
-from appliance.turns import Turn
+from appliance.turns import Charged, Turn
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -43,11 +43,11 @@ class Turns:
         self.effort = 0
         self.busy = False
 
-    def count(self, effort: int) -> None:
+    def count(self, effort: int, charged: Charged) -> None:
         self.effort += effort
 
-    def is_busy(self) -> bool:
-        return self.busy
+    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
+        return self.busy and not is_little
 
     def queue_turn(self, member: Turn) -> None:
         asyncio.get_running_loop().call_soon(member.take_turn)
@@ -112,9 +112,13 @@ class Served(asyncio.Protocol):
         self.heard: list[str] = []
         self.data = bytearray()
         self.chunks = 0
+        self.set_aside = 0
         self.error: Exception | None = None
         self.lost = asyncio.Event()
         self.on_data = on_data or (lambda served, data: None)
+
+    def set_apart(self, size):
+        self.set_aside = size
 
     def connection_made(self, transport):
         self.transport = transport
@@ -396,6 +400,7 @@ async def test_while_others_have_to_be_served_a_chunk_waits(house: House):
     await caller.put(caller.seal(bytes(8000)) * 1)
     await until(lambda: queued)
     assert served.data == b"little"
+    assert served.set_aside > 8000
     served.transport.pause_reading()
     queued.pop().take_turn()
     assert served.data == b"little", "who has paused reading is handed nothing"
@@ -405,6 +410,7 @@ async def test_while_others_have_to_be_served_a_chunk_waits(house: House):
     while queued:
         queued.pop().take_turn()
     await until(lambda: len(served.data) == 8006)
+    assert served.set_aside == 0
 
 
 async def test_what_the_protocol_can_ask(house: House):

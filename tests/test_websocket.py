@@ -9,7 +9,7 @@ import random
 import threading
 import tracemalloc
 from collections.abc import AsyncIterator, Iterable
-from typing import Any
+from typing import Any, cast
 
 import paho.mqtt.client as paho
 import pytest
@@ -42,6 +42,8 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.network import EFFORT_A_ROUND
+from appliance.websocket import FRAME_EFFORT
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -243,6 +245,16 @@ async def test_paths(house: House, caplog):
         (b"GET /mqtt\r\n\r\n", b"400 ", b"invalid HTTP request line"),
         (REQUEST.replace(b"n: 13", b"n: 12"), b"400 ", b"Sec-WebSocket-Version"),
         (REQUEST.replace(b"dGhl", b"?"), b"400 ", b"Sec-WebSocket-Key"),
+        (
+            REQUEST.replace(b"l: mqtt", b"l: " + b"a, " * 400 + b"mqtt"),
+            b"400 ",
+            b"Sec-WebSocket-Protocol and the like hold more than 1024 bytes",
+        ),
+        (
+            REQUEST.replace(b"n: Upgrade", b"n: " + b"a, " * 2600 + b"Upgrade"),
+            b"400 ",
+            b"Connection and the like hold more than 1024 bytes",
+        ),
         (b"GET /mqtt HTTP/1.1\r\nCookie: " + b"x" * 20_000, b"431 ", b"longer than 16384 bytes"),
         (
             b"GET /mqtt HTTP/1.1\r\n" + b"A: b\r\n" * 200 + b"\r\n",
@@ -521,6 +533,48 @@ async def test_a_flood_of_empty_frames_leaves_others_their_turn(house: House):
         answers += 1
     assert (await end)[0] == BINARY
     assert answers > 20
+
+
+async def test_little_chunks_of_many_frames_take_turns(house: House):
+    """All in one round of the loop; what waits is counted for its user, and others do not wait."""
+    await house.start()
+    crowd = [await join(house, f"web-{n}", username="mallory") for n in range(30)]
+    await join(house, "alice", username="alice")
+    ends = {name: house.protocol(name) for name in ("alice", *(f"web-{n}" for n in range(30)))}
+    alice: Any = ends.pop("alice")._transport
+    ledger = house.broker.ledger
+    account = ends["web-0"].account
+    await until(lambda: not house.network.is_busy())
+    before, held, effort = ledger.queued_bytes, account.bytes, ledger.counters.effort
+    chunk = frame(b"", Opcode.BINARY, fin=False) + frame(b"", Opcode.CONT, fin=False) * 339
+    for end in ends.values():
+        cast(Any, end._transport).data_received(chunk)
+    cost = ledger.counters.effort - effort
+    assert cost < 3 * 340 * FRAME_EFFORT + EFFORT_A_ROUND, cost
+    waiting = sum(bool(cast(Any, end._transport)._held) for end in ends.values())
+    assert waiting >= 20
+    assert ledger.queued_bytes - before >= waiting * len(chunk)
+    assert account.bytes - held >= waiting * len(chunk)
+    received = ledger.counters.messages_received
+    alice.data_received(frame(Pingreq().encode(5)))
+    assert ledger.counters.messages_received == received + 1
+    await until(lambda: not any(cast(Any, end._transport)._held for end in ends.values()))
+    await until(lambda: ledger.queued_bytes == before and account.bytes == held)
+    assert len(crowd) == len(house.network.open) - 1
+
+
+async def test_what_waits_below_a_lost_connection_is_given_back(house: House):
+    await house.start()
+    caller = await shake_hands(house, tls=True)
+    await caller.say(frame(Connect("web", username="mallory").encode()))
+    await hear_frame(caller)
+    end = house.protocol("web")
+    before = house.broker.ledger.queued_bytes
+    cast(Any, end._transport).pause_reading()
+    cast(Any, end._transport).data_received(frame(bytes(3000)))
+    end.abort()
+    assert house.broker.ledger.queued_bytes >= before + 3000
+    await until(lambda: house.broker.ledger.queued_bytes == 0)
 
 
 async def test_packets_behind_connect_wait_for_the_login(house: House):

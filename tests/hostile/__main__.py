@@ -1,7 +1,8 @@
-"""python tests/hostile [--seconds 20] [--only NAME …] [--plain | --tls | --both] [--list]
+"""python tests/hostile [--seconds 20] [--only NAME …] [--plain|--tls|--websocket|--both] [--list]
 
-Each attack on a new appliance, over plain TCP and over TLS, with a healthy client beside it. Prints
-a table and what is wrong; the exit code is 1 when something is.
+Each attack on a new appliance, over plain TCP, TLS and WebSocket, with a healthy client beside it
+that is connected the same way. Prints a table and what is wrong; the exit code is 1 when something
+is.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from arena import MIB, Arena, Outcome
 from attacks import ATTACKS
+from combat import BOTH
+from witness import Over
 
 _HEAD = (
-    f"{'attack':<26} {'over':<5} {'round trip: p50':>15} {'p99':>7} {'max':>7}  "
+    f"{'attack':<26} {'over':<9} {'round trip: p50':>15} {'p99':>7} {'max':>7}  "
     f"{'RSS before':>10} {'max':>6} {'bound':>6}  {'log lines':>9} {'on it':>6}"
 )
 
@@ -29,7 +32,7 @@ def row(outcome: Outcome) -> str:
     seen = outcome.seen
     times = [seen.percentile(0.5) * 1000, seen.percentile(0.99) * 1000, seen.worst * 1000]
     return (
-        f"{outcome.attack.name:<26} {outcome.transport:<5} {times[0]:>15.1f} {times[1]:>7.1f} "
+        f"{outcome.attack.name:<26} {outcome.transport:<9} {times[0]:>15.1f} {times[1]:>7.1f} "
         f"{times[2]:>7.1f}  {outcome.base // MIB:>10} {outcome.peak // MIB:>6} "
         f"{outcome.bound // MIB:>6}  {outcome.log_lines:>9} {outcome.about_it:>6}"
         f"  {'FAILED' if outcome.problems else 'ok'}"
@@ -42,10 +45,11 @@ def main() -> int:
     parser.add_argument("--only", action="append", metavar="NAME", help="may hold * and ?")
     parser.add_argument("--list", action="store_true", help="what there is, and do nothing")
     ways = parser.add_mutually_exclusive_group()
-    ways.add_argument("--plain", dest="ways", action="store_const", const=[False])
-    ways.add_argument("--tls", dest="ways", action="store_const", const=[True])
-    ways.add_argument("--both", dest="ways", action="store_const", const=[None])
-    parser.set_defaults(ways=[False, True])
+    for over in Over:
+        name = over.name.lower()
+        ways.add_argument(f"--{name}", dest="ways", action="store_const", const=[(over,)])
+    ways.add_argument("--both", dest="ways", action="store_const", const=[BOTH], help="TLS, plain")
+    parser.set_defaults(ways=[(over,) for over in Over])
     arguments = parser.parse_args()
     wanted = arguments.only or ["*"]
     chosen = [
@@ -67,9 +71,11 @@ def main() -> int:
         contextlib.closing(Arena(Path(directory))) as arena,
     ):
         for attack in chosen:
-            for tls in arguments.ways:
+            for ways in arguments.ways:
+                if attack.over is not None and attack.over not in ways:
+                    continue
                 try:
-                    outcome = arena.run(attack, tls, arguments.seconds)
+                    outcome = arena.run(attack, ways, arguments.seconds)
                 except AssertionError as error:
                     print(f"{error}  FAILED", flush=True)
                     failed += 1

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 from appliance_process import ApplianceProcess
 from combat import USER, Attack, Attacker
-from witness import Report, Target, Witness
+from witness import Over, Report, Target, Witness
 
 MIB = 1 << 20
 
@@ -39,6 +39,9 @@ LIMITS: dict[str, Any] = {
     "connection_rate": 100_000,
     "connect_timeout": "1 s",
 }
+
+#: That for WebSocket comes first: the appliance runs when it listens on the other two.
+LISTENERS: list[dict[str, Any]] = [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
 
 #: What the process may take beyond the configured limits, in bytes: the objects and buffers of a
 #: thousand connections with TLS, and what the allocator does not give back at once.
@@ -79,7 +82,10 @@ class Arena:
             directory,
             users={USER: "knows the password"},
             acl=ACL,
-            broker={"audit": {"path": "audit.log", "size": "1 MiB", "keep": 1}},
+            broker={
+                "audit": {"path": "audit.log", "size": "1 MiB", "keep": 1},
+                "listeners": [{"bind": "127.0.0.1:0", "protocol": "websocket"}, *LISTENERS],
+            },
         )
         self._audit = directory / "audit.log"
         self._settings: dict[str, Any] = yaml.safe_load(self._appliance.config.read_text())
@@ -93,8 +99,8 @@ class Arena:
                 process.end()
         self._witness = self._attacker = None
 
-    def run(self, attack: Attack, tls: bool | None, seconds: float) -> Outcome:
-        """The attack over TLS, over plain TCP or, when `tls` is None, over both at once."""
+    def run(self, attack: Attack, ways: tuple[Over, ...], seconds: float) -> Outcome:
+        """The attack with its connections made over these in turn."""
         appliance = self._appliance
         limits = LIMITS | attack.limits
         self._settings["broker"]["limits"] = limits
@@ -106,7 +112,7 @@ class Arena:
         problems: list[str] = []
         appliance.start()
         try:
-            fought = self._fight(attack, tls, max(seconds, attack.at_least))
+            fought = self._fight(attack, ways, max(seconds, attack.at_least))
         except (AssertionError, OSError, EOFError) as error:
             self.close()
             raise AssertionError(f"{attack.name}: {error!r}") from error
@@ -149,25 +155,27 @@ class Arena:
                 at = log.index(sign)
                 problems.append(f"in the log: {log[max(0, at - 300) : at + 1000]}")
                 break
-        over = {None: "both", True: "TLS", False: "plain"}[tls]
+        over = "+".join(way.value for way in ways)
         sizes = base, peak, bound
         return Outcome(attack, over, seen, *sizes, len(lines), about_it, took, counts, problems)
 
     def _fight(
-        self, attack: Attack, tls: bool | None, seconds: float
+        self, attack: Attack, ways: tuple[Over, ...], seconds: float
     ) -> tuple[Report, Counter[str], str, int, int, float]:
         """What the healthy client and the attacker report, memory before and at most, seconds."""
         appliance = self._appliance
         self._witness = witness = self._witness or Witness()
         self._attacker = attacker = self._attacker or Attacker()
         ports = appliance.port, appliance.plain_port
-        target = Target(*ports, appliance.ca, dict(appliance.passwords))
-        witness.begin(target, tls=tls is not False)
+        web_ports = re.findall(r"listening for WebSocket on \S+:(\d+)$", appliance.log, re.M)
+        passwords = dict(appliance.passwords)
+        target = Target(*ports, appliance.ca, passwords, int(web_ports[-1]))
+        witness.begin(target, ways[0])
         base = _status(appliance.pid, "VmRSS")
         # The peak is counted from here on; see proc(5), clear_refs.
         Path(f"/proc/{appliance.pid}/clear_refs").write_text("5")
         began = time.monotonic()
-        counts, failure = attacker.attack(attack.name, target, tls, seconds)
+        counts, failure = attacker.attack(attack.name, target, ways, seconds)
         took = time.monotonic() - began
         time.sleep(AFTERMATH)
         seen = witness.report()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import math
 import random
 import socket
@@ -11,7 +12,8 @@ import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from combat import PATIENCE, ROUND_TRIP, USER, Attack, Fight, Line, encode4, encode5
+from combat import BOTH, PATIENCE, ROUND_TRIP, USER, Attack, Fight, Line, WebLine, encode4, encode5
+from witness import BINARY, CONTINUATION, PING, PONG, UPGRADE, Over, frame
 
 from appliance.mqtt.codec import Property, encode_varint
 from appliance.mqtt.connection import MAXIMUM_CONTROL
@@ -48,6 +50,7 @@ def attack(
     said_after: float = 0.0,
     p99: float = math.inf,
     worst: float = ROUND_TRIP,
+    over: Over | None = None,
     **limits: Any,
 ) -> Callable[[Run], Run]:
     """Enter a function into ATTACKS under its name."""
@@ -55,7 +58,7 @@ def attack(
     def enter(run: Run) -> Run:
         name = run.__name__.replace("_", "-")
         what = " ".join((run.__doc__ or "").split())
-        bounds = p99, worst
+        bounds = p99, worst, over
         ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after, *bounds)
         return run
 
@@ -255,7 +258,7 @@ async def long_pairs(fight: Fight) -> None:
     await _forbidden_properties(fight, _pairs(PAIRS, 300), 20)
 
 
-@attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
+@attack(rf"{CLIENT}", at_least=2.0, over=Over.TLS, **BOUNDED)
 async def tls_records(fight: Fight) -> None:
     """Twenty clients whose TLS records hold one byte each."""
 
@@ -263,7 +266,7 @@ async def tls_records(fight: Fight) -> None:
         loop = asyncio.get_running_loop()
         incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         tls = fight.target.context().wrap_bio(incoming, outgoing, server_hostname="localhost")
-        with await fight.raw(tls=True) as sock:
+        with await fight.raw(Over.TLS) as sock:
 
             async def receive() -> None:
                 data = await asyncio.wait_for(loop.sock_recv(sock, 65536), PATIENCE)
@@ -429,14 +432,14 @@ async def garbage_flood(fight: Fight) -> None:
     await fight.together(*(come_and_go() for _ in range(32)))
 
 
-@attack(rf"{ADDRESS}: no TLS connection")
+@attack(rf"{ADDRESS}: no TLS connection", over=Over.TLS)
 async def tls_flood(fight: Fight) -> None:
     """TLS handshakes one behind the other, whole ones, and ones that end in the middle."""
 
     async def whole() -> None:
         while fight.on:
             try:
-                line = await fight.dial(tls=True)
+                line = await fight.dial(Over.TLS)
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
                 continue
@@ -450,7 +453,7 @@ async def tls_flood(fight: Fight) -> None:
         loop = asyncio.get_running_loop()
         while fight.on:
             try:
-                sock = await fight.raw(tls=True)
+                sock = await fight.raw(Over.TLS)
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
                 continue
@@ -465,7 +468,9 @@ async def tls_flood(fight: Fight) -> None:
     await fight.together(*(whole() for _ in range(12)), *(half() for _ in range(12)))
 
 
-@attack(rf"{ADDRESS}: no (TLS connection|complete CONNECT)", at_least=1.4, short=False)
+@attack(
+    rf"{ADDRESS}: no (TLS connection|complete CONNECT)", at_least=1.4, short=False, over=Over.TLS
+)
 async def tls_half_open(fight: Fight) -> None:
     """Hundreds of TLS handshakes that stop after, or drip, their first message."""
     hello = _client_hello(fight)
@@ -475,7 +480,7 @@ async def tls_half_open(fight: Fight) -> None:
         async for round_ in fight.rounds(0.02):
             if len(socks) < 900 and fight.within(0.8):
                 for _ in range(20):
-                    sock = await fight.raw(tls=True)
+                    sock = await fight.raw(Over.TLS)
                     socks.append(sock)
                     part = hello if round_ % 2 else hello[: len(hello) // 2]
                     await loop.sock_sendall(sock, part)
@@ -492,7 +497,7 @@ async def wrong_passwords(fight: Fight) -> None:
     async def guess(worker: int) -> None:
         async for number in fight.rounds():
             try:
-                line = await fight.dial(tls=False if fight.tls is None else None)
+                line = await fight.dial(Over.PLAIN if fight.ways == BOTH else None)
             except (OSError, asyncio.TimeoutError):
                 continue
             user = USER if number % 2 else f"{USER}{number}"
@@ -504,6 +509,216 @@ async def wrong_passwords(fight: Fight) -> None:
             fight.lines.discard(line)
 
     await fight.together(*(guess(number) for number in range(100)))
+
+
+# --- over WebSocket
+
+#: What is asked of the attacks on what is below MQTT.
+WEB: dict[str, Any] = {"over": Over.WEBSOCKET, **BOUNDED}
+
+
+async def _web(fight: Fight, client_id: str) -> WebLine:
+    line = await fight.join(client_id)
+    assert isinstance(line, WebLine)
+    return line
+
+
+async def _push_forever(fight: Fight, clients: int, data: bytes, count: int, what: str) -> None:
+    """Clients that send the same frames again and again, and come again when they are cut off."""
+
+    async def push(number: int) -> None:
+        async for turn in fight.rounds(0.02):
+            line = await _web(fight, f"web-{number}-{turn}")
+            while fight.on and line.open:
+                await line.push(data)
+                fight.counts[what] += count
+                fight.counts["pongs"] += line.pongs
+                line.pongs = 0
+                await asyncio.sleep(0)
+
+    await fight.together(*(push(number) for number in range(clients)))
+    assert fight.counts[what]
+
+
+async def _push_at_once(
+    fight: Fight, chunks: list[bytes], pause: float, begin: bytes = b""
+) -> None:
+    """245 clients that each send one of the chunks, all in one moment, again and again."""
+
+    async def stay(number: int) -> Line:
+        line = await _web(fight, f"web-{number}")
+        await line.push(begin)
+        return line
+
+    lines = await fight.crowd(245, stay, 0.5)
+    async for turn in fight.rounds(pause):
+        for line in lines:
+            if line.open:
+                line.transport.write(chunks[turn % len(chunks)])
+        fight.counts["chunks"] += len(lines)
+    assert any(line.open for line in lines), "nobody is left"
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **WEB)
+async def web_bytes(fight: Fight) -> None:
+    """Twenty clients whose frames hold one byte each, as fast as they are read."""
+    ping = Pingreq().encode(5)
+    data = (frame(ping[:1]) + frame(ping[1:])) * 5000
+    await _push_forever(fight, 20, data, 10_000, "frames")
+
+
+@attack(rf"{CLIENT}", at_least=2.5, **WEB)
+async def web_bytes_at_once(fight: Fight) -> None:
+    """245 clients that send 2,000 bytes of one-byte frames, all in one moment."""
+    ping = Pingreq().encode(5)
+    await _push_at_once(fight, [(frame(ping[:1]) + frame(ping[1:])) * 142], 0.3)
+
+
+@attack(rf"{CLIENT}", at_least=2.5, **WEB)
+async def web_segments(fight: Fight) -> None:
+    """245 clients whose frames come a byte at a time, in segments of their own."""
+    data = frame(encode5(Publish(AREA, bytes(10), 1, packet_id=1)))
+    await _push_at_once(fight, [data[at : at + 1] for at in range(len(data))], 0.01)
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **WEB)
+async def web_fragments(fight: Fight) -> None:
+    """Twenty clients with one message of empty fragments, without an end."""
+    data = frame(b"", BINARY, last=False) + frame(b"", CONTINUATION, last=False) * 10_000
+    again = data + frame(b"", CONTINUATION)
+    await _push_forever(fight, 20, again, 10_000, "fragments")
+
+
+@attack(rf"{CLIENT}", at_least=2.5, **WEB)
+async def web_fragments_at_once(fight: Fight) -> None:
+    """245 clients that each send 2,040 bytes of empty fragments, all in one moment."""
+    chunk = frame(b"", CONTINUATION, last=False) * 340
+    await _push_at_once(fight, [chunk], 0.3, frame(b"", BINARY, last=False))
+
+
+@attack(rf"{CLIENT}", at_least=2.0, **WEB)
+async def web_pings(fight: Fight) -> None:
+    """Twenty clients that send pings, empty ones and the largest, as fast as they are read."""
+    data = frame(b"", PING) * 5000 + frame(bytes(125), PING) * 500
+    await _push_forever(fight, 20, data, 5500, "pings")
+    assert fight.counts["pongs"], "no ping was answered"
+
+
+@attack(rf"{CLIENT}", at_least=2.5, **WEB)
+async def web_pings_at_once(fight: Fight) -> None:
+    """245 clients that each send 2,040 bytes of pings, or of pongs, all in one moment."""
+    await _push_at_once(fight, [frame(b"", PING) * 340, frame(b"", PONG) * 340], 0.3)
+
+
+@attack(r"not the WebSocket protocol: a frame that is too large", at_least=2.0, **WEB)
+async def web_giants(fight: Fight) -> None:
+    """Frames that announce 2^63 bytes, or what is just allowed; those of the latter are dripped."""
+    sizes = [1 << 63, (1 << 63) - 1, 1 << 31, 16 << 20]
+    heads = [b"\x82\xff" + size.to_bytes(8, "big") + bytes(4) for size in sizes]
+
+    async def come(number: int) -> Line:
+        line = await _web(fight, f"web-{number}")
+        await line.push(heads[number % 4] + bytes(2000))
+        fight.counts["heads"] += 1
+        return line
+
+    while fight.on:
+        await fight.crowd(245, come, 1.0)
+        for line in list(fight.lines):
+            if line.open:
+                line.transport.write(bytes(1000))
+            else:
+                fight.lines.discard(line)
+        await asyncio.sleep(0.05)
+
+
+@attack(rf"{ADDRESS}: no complete CONNECT within", at_least=2.0, **WEB)
+async def web_strangers(fight: Fight) -> None:
+    """245 strangers who send all kinds of frames and never log in."""
+    chunks = [
+        frame(b"", PING) * 340,
+        frame(b"", BINARY) * 340,
+        frame(b"", BINARY, last=False) + frame(b"", CONTINUATION, last=False) * 338,
+        frame(fight.connect_packet("stranger")[:1]) + frame(bytes(125), PONG) * 15,
+    ]
+
+    async def come(number: int) -> Line:
+        line = await fight.dial()
+        assert isinstance(line, WebLine)
+        await line.push(chunks[number % 4])
+        return line
+
+    async for _ in fight.rounds(0.2):
+        await fight.crowd(245 - len(fight.lines), come, 1.0)
+        for number, line in enumerate(list(fight.lines)):
+            if line.open:
+                line.transport.write(chunks[number % 2])
+                fight.counts["chunks"] += 1
+            else:
+                fight.lines.discard(line)
+
+
+@attack(rf"{ADDRESS}: no complete CONNECT within", at_least=2.0, **WEB)
+async def web_requests_dripped(fight: Fight) -> None:
+    """245 strangers whose requests for a WebSocket come a byte at a time."""
+    requests = itertools.cycle([UPGRADE, UPGRADE[:-2] + _headers(15_000)])
+    loop = asyncio.get_running_loop()
+
+    async def drip() -> None:
+        while fight.on:
+            request = next(requests)
+            with contextlib.suppress(OSError, asyncio.TimeoutError), await fight.raw() as sock:
+                for at in range(len(request)):
+                    await loop.sock_sendall(sock, request[at : at + 1])
+                    fight.counts["bytes"] += 1
+                    await asyncio.sleep(0.005)
+
+    await fight.together(*(drip() for _ in range(245)))
+
+
+@attack(rf"{ADDRESS}: no WebSocket connection", at_least=2.0, connect_timeout="10 s", **WEB)
+async def web_headers(fight: Fight) -> None:
+    """The last byte of 245 requests with as many headers as may be, all in one moment."""
+    loop = asyncio.get_running_loop()
+    begin = UPGRADE[:-2]
+    # All but the last byte, a line feed.
+    requests = itertools.cycle(
+        [
+            begin + _headers(15_000) + b"\r",
+            begin + _headers(15_000, 120) + b"\r",
+            begin + b"Sec-WebSocket-Protocol: " + b"a," * 4000 + b"a\r\n\r",
+            begin + b"Sec-WebSocket-Extensions: " + b"a;b=c," * 1300 + b"a\r\n\r",
+            begin + b"Connection: " + b"a, " * 2600 + b"a\r\n\r",
+            b"GET " + b"/" * 8000 + b" HTTP/1.1\r\n\r",
+        ]
+    )
+
+    async def wait(_: int) -> Line:
+        sock = await fight.raw()
+        _, line = await loop.create_connection(lambda: Line(sock), sock=sock)
+        fight.lines.add(line)
+        await line.send(next(requests))
+        return line
+
+    while fight.on:
+        lines = await fight.crowd(245, wait, 1.0)
+        await asyncio.sleep(0.1)  # for the broker to have read them
+        for line in lines:
+            line.say(b"\n")
+        fight.counts["requests"] += len(lines)
+        await asyncio.sleep(0.2)
+        for line in lines:
+            fight.counts["answered"] += line.received > 0
+            line.hang_up()
+            fight.lines.discard(line)
+    assert fight.counts["answered"]
+
+
+def _headers(size: int, count: int = 0) -> bytes:
+    """So many bytes of headers: so many, or as many as there can be."""
+    if not count:
+        return b"a:\r\n" * (size // 4)
+    return (b"a: " + b"b" * (size // count - 5) + b"\r\n") * count
 
 
 # --- behind a login: who does not listen

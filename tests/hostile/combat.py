@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import math
 import multiprocessing
@@ -22,7 +23,7 @@ from multiprocessing.connection import Connection
 from typing import Any, cast
 
 import uvloop
-from witness import Target
+from witness import HEAD_END, PONG, UPGRADE, Over, Target, frame, take_frame
 
 from appliance.mqtt.packets import V5, V311, Connect, Packet
 
@@ -87,11 +88,21 @@ class Line(asyncio.Protocol):
     def say(self, *packets: bytes) -> None:
         """Send, without a care for how much waits; nothing when the broker has closed."""
         if self.open:
-            self.transport.write(packets[0] if len(packets) == 1 else b"".join(packets))
+            self.write(packets[0] if len(packets) == 1 else b"".join(packets))
+
+    def write(self, data: bytes) -> None:
+        """Send so many bytes of MQTT."""
+        self.transport.write(data)
 
     async def send(self, data: bytes) -> None:
         """Send as fast as the broker reads."""
         self.say(data)
+        await self._room.wait()
+
+    async def push(self, data: bytes) -> None:
+        """Send the bytes as they are, whatever is below MQTT, as fast as the broker reads."""
+        if self.open:
+            self.transport.write(data)
         await self._room.wait()
 
     async def hear(self, count: int) -> bool:
@@ -119,21 +130,64 @@ class Line(asyncio.Protocol):
             self.socket.shutdown(socket.SHUT_WR)
 
 
+class WebLine(Line):
+    """One over WebSocket: what is said goes out in one frame, and what frames hold is received."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock)
+        #: The answer to the request is there.
+        self.upgraded = asyncio.Event()
+        self.pongs = 0
+        self._frames = bytearray()
+
+    def data_received(self, data: bytes) -> None:
+        self._frames += data
+        if not self.upgraded.is_set():
+            end = self._frames.find(HEAD_END)
+            if end < 0:
+                return
+            del self._frames[: end + len(HEAD_END)]
+            self.upgraded.set()
+        while (taken := take_frame(self._frames)) is not None:
+            opcode, payload = taken
+            self.pongs += opcode == PONG
+            if opcode < 8:
+                super().data_received(payload)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self.upgraded.set()
+
+    def write(self, data: bytes) -> None:
+        self.transport.write(frame(data))
+
+    async def upgrade(self) -> None:
+        """Ask for the WebSocket, and wait for it."""
+        self.transport.write(UPGRADE)
+        await asyncio.wait_for(self.upgraded.wait(), PATIENCE)
+        if not self.open:
+            raise ConnectionError("no WebSocket connection")
+
+
+#: What every other connection is made over where nothing else is said.
+BOTH = (Over.TLS, Over.PLAIN)
+
+
 class Fight:
     """One attack on one broker, for so many seconds.
 
-    `tls` is None for both: every other connection then is one with TLS.
+    Its connections are made over each of `ways` in turn.
     """
 
-    def __init__(self, target: Target, tls: bool | None, seconds: float) -> None:
+    def __init__(self, target: Target, ways: tuple[Over, ...], seconds: float) -> None:
         self.target = target
-        self.tls = tls
+        self.ways = ways
         self.seconds = seconds
         #: What was done how often, for the report.
         self.counts: Counter[str] = Counter()
         self.lines: set[Line] = set()
         self._context = target.context()
-        self._turn = False
+        self._next_way = itertools.cycle(ways)
         self._loop = asyncio.get_running_loop()
         self._end = self._loop.time() + seconds
 
@@ -154,21 +208,14 @@ class Fight:
             number += 1
             await asyncio.sleep(pause)
 
-    def next_tls(self) -> bool:
-        if self.tls is not None:
-            return self.tls
-        self._turn = not self._turn
-        return self._turn
-
-    async def raw(self, *, tls: bool | None = None, receive_buffer: int = 0) -> socket.socket:
+    async def raw(self, over: Over | None = None, *, receive_buffer: int = 0) -> socket.socket:
         """A TCP connection to one of the listeners, with nothing said on it."""
-        secure = self.next_tls() if tls is None else tls
+        port = self.target.port_of(over or next(self._next_way))
         sock = socket.socket()
         try:
             sock.setblocking(False)
             if receive_buffer:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-            port = self.target.port if secure else self.target.plain_port
             await asyncio.wait_for(self._loop.sock_connect(sock, ("127.0.0.1", port)), PATIENCE)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except BaseException:
@@ -177,22 +224,26 @@ class Fight:
         self.counts["connections"] += 1
         return sock
 
-    async def dial(self, *, tls: bool | None = None, receive_buffer: int = 0) -> Line:
-        """A connection with its TLS handshake, if any, done.
+    async def dial(self, over: Over | None = None, *, receive_buffer: int = 0) -> Line:
+        """A connection with its handshake, be it of TLS or WebSocket, done.
 
         Raises:
             OSError: the broker does not take it.
         """
-        secure = self.next_tls() if tls is None else tls
-        sock = await self.raw(tls=secure, receive_buffer=receive_buffer)
+        over = over or next(self._next_way)
+        sock = await self.raw(over, receive_buffer=receive_buffer)
+        kind = WebLine if over is Over.WEBSOCKET else Line
+        secure = over is Over.TLS
         _, line = await self._loop.create_connection(
-            lambda: Line(sock),
+            lambda: kind(sock),
             sock=sock,
             ssl=self._context if secure else None,
             server_hostname="localhost" if secure else None,
             ssl_handshake_timeout=PATIENCE if secure else None,
         )
         self.lines.add(line)
+        if isinstance(line, WebLine):
+            await line.upgrade()
         return line
 
     async def join(
@@ -201,7 +252,6 @@ class Fight:
         *,
         version: int = V5,
         receive_buffer: int = 0,
-        tls: bool | None = None,
         packet: bytes = b"",
         **fields: Any,
     ) -> Line:
@@ -210,7 +260,7 @@ class Fight:
         Raises:
             OSError: the broker does not take it.
         """
-        line = await self.dial(tls=tls, receive_buffer=receive_buffer)
+        line = await self.dial(receive_buffer=receive_buffer)
         line.say(packet or self.connect_packet(client_id, version=version, **fields))
         if not await line.hear(4) or line.first[3]:
             raise ConnectionError(f"'{client_id}' is not let in: {line.first.hex()}")
@@ -278,7 +328,7 @@ class Attack:
     (seconds) nothing comes of it, and with less than `said_after` too little for the log to tell:
     the buffers on the way take that long to fill. `short` is whether it is worth a second in CI,
     beside the others. `p99` is what 99 of 100 round trips of the healthy client may take, and
-    `worst` what the longest may, in seconds.
+    `worst` what the longest may, in seconds. `over` is what it is for, when not for everything.
     """
 
     name: str
@@ -291,6 +341,7 @@ class Attack:
     said_after: float = 0.0
     p99: float = math.inf
     worst: float = ROUND_TRIP
+    over: Over | None = None
 
 
 def encode(version: int, *packets: Packet) -> bytes:
@@ -316,10 +367,10 @@ class Attacker:
         end.close()
 
     def attack(
-        self, name: str, target: Target, tls: bool | None, seconds: float
+        self, name: str, target: Target, ways: tuple[Over, ...], seconds: float
     ) -> tuple[Counter[str], str]:
         """What was done how often, and what went wrong, when the attack is over."""
-        self._pipe.send((name, target, tls, seconds))
+        self._pipe.send((name, target, ways, seconds))
         assert self._pipe.poll(seconds + 3 * PATIENCE), "the attack does not come to its end"
         counts, failure = self._pipe.recv()
         return counts, failure
@@ -337,14 +388,14 @@ def _serve(pipe: Connection) -> None:
     os.nice(10)
     logging.disable(logging.CRITICAL)  # asyncio's, of connections that end in every way there is
     while True:
-        name, target, tls, seconds = pipe.recv()
-        pipe.send(uvloop.run(_fight(ATTACKS[name], target, tls, seconds)))
+        name, target, ways, seconds = pipe.recv()
+        pipe.send(uvloop.run(_fight(ATTACKS[name], target, ways, seconds)))
 
 
 async def _fight(
-    attack: Attack, target: Target, tls: bool | None, seconds: float
+    attack: Attack, target: Target, ways: tuple[Over, ...], seconds: float
 ) -> tuple[Counter[str], str]:
-    fight = Fight(target, tls, seconds)
+    fight = Fight(target, ways, seconds)
     failure = ""
     try:
         # What the broker does not answer, or does not take, is not waited for.

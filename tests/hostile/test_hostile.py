@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from arena import Arena
 from attacks import ATTACKS
-from combat import Attack
+from combat import BOTH, Attack
 
 pytestmark = pytest.mark.timed
 
@@ -24,6 +24,7 @@ def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Arena]:
 
 @pytest.mark.parametrize("attack", SHORT, ids=lambda attack: attack.name)
 def test_the_broker_withstands(arena: Arena, attack: Attack) -> None:
-    outcome = arena.run(attack, None, SECONDS)
+    ways = BOTH if attack.over is None else (attack.over,)
+    outcome = arena.run(attack, ways, SECONDS)
     if outcome.problems:
         pytest.fail("\n".join([attack.what, *outcome.problems]), pytrace=False)

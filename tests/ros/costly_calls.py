@@ -32,7 +32,7 @@ sys.path.insert(0, str(HERE.parent / "hostile"))
 import cbor2  # noqa: E402
 import zstandard  # noqa: E402
 from appliance_process import ApplianceProcess  # noqa: E402
-from witness import Report, Target, Witness  # noqa: E402
+from witness import Over, Report, Target, Witness  # noqa: E402
 
 from appliance.mqtt.codec import Property  # noqa: E402
 from appliance.mqtt.packets import (  # noqa: E402
@@ -372,7 +372,7 @@ def arena(directory: Path) -> Iterator[Callable[[str, float], Outcome]]:
 
     def attack(name: str, seconds: float) -> Outcome:
         before = _routes(appliance)
-        witness.begin(target, tls=False)
+        witness.begin(target, Over.PLAIN)
         pipe.send((name, target, seconds))
         assert pipe.poll(seconds + 60), f"{name} does not come to its end"
         counts = pipe.recv()
