@@ -636,6 +636,11 @@ class Broker:
         self.faults.caught("broker.delivery", error, session)
         return False
 
+    def announce(self, message: Message, session: Session) -> None:
+        """A QoS 2 message has come, and is kept until its PUBREL."""
+        for guard in self.guards.get(message.topic, ()):
+            guard.announced(message, session)
+
     def inspect(self, message: Message, session: Session) -> Objection | None:
         """What a part of the appliance has against a QoS 2 message, before it is taken."""
         for guard in self.guards.get(message.topic, ()):

@@ -633,8 +633,10 @@ class Client:
                 f"more than {self.broker.limits.inflight} unfinished QoS 2 messages",
             )
         else:
-            objection = self.broker.inspect(message, session)
-            if objection is not None and self._version == 5:
+            self.broker.announce(message, session)
+            # 3.1.1 cannot refuse: who objects does so when the message is published.
+            objection = self.broker.inspect(message, session) if self._version == 5 else None
+            if objection is not None:
                 self._counters.publish_refused += 1
                 self._note_refused(packet_id)
                 self.output.object(0x50, packet_id, objection)

@@ -308,8 +308,12 @@ class Guard(Protocol):
     def decide(self, session: Session) -> Decision:
         """Whether the session may; it holds until `Broker.guards_changed`."""
 
+    def announced(self, message: Message, session: Session) -> None:
+        """A QoS 2 message has come, which will be published with its PUBREL."""
+
     def inspect(self, message: Message, session: Session) -> Objection | None:
-        """What is wrong with a QoS 2 message, which can be refused before its PUBREL only."""
+        """What is wrong with a QoS 2 message, which can be refused before its PUBREL only, and in
+        MQTT 5 only."""
 
     def refused(self, session: Session) -> None:
         """A message of the session was refused, by this guard, another or the access rules."""

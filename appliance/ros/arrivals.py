@@ -262,10 +262,12 @@ class Arrivals:
         coming = self._coming.get(origin)
         if coming is not None and coming.number == number >= 0:
             return
-        if coming is None or now - coming.last > oldest:
+        if coming is None or max(now - coming.last, coming.longest) > oldest:
+            # For a route with a longer `oldest` it may have gone on.
             self._coming[origin] = _Pace(now)
         else:
             gap, coming.last = now - coming.last, now
+            coming.longest = max(coming.longest, gap)
             if coming.steady < STEADY or gap < BURST:
                 self._time(coming, origin, 2, gap, now)
         self._coming[origin].number = number

@@ -214,7 +214,7 @@ class Commands(ToRos):
             return
         super().leave()
         for origin in list(self._waiting):
-            self._forget(origin, "the route ends")
+            self._give_up(origin, "the route ends")
         if self._is_driven:
             self._stop_now("the route ends")
         if self._timer is not None:
@@ -239,6 +239,7 @@ class Commands(ToRos):
         is_kept = retain or (message.retain and self.rules.take_retained)
         if is_kept and (self._out is None or self._looks < LOOKS_TO_MATCH):
             self._awaited = number
+            self._settle(origin)
             return None
         size = size_of(message.payload)
         if size <= LITTLE and origin not in self._queued:
@@ -284,6 +285,17 @@ class Commands(ToRos):
             return self._convert_and_carry_out(command)
         except Exception as error:
             return self.fault(command.message, error)
+        finally:
+            self._settle(command.origin)
+
+    def _settle(self, origin: Session | None) -> None:
+        """Something has become of a command: if it was a first one, the next one of its client is
+        no queue with it, unless it waits here."""
+        if origin is None or origin in self._waiting:
+            return
+        queue = self._queued.get(origin, ())
+        if not any(one.verdict is Verdict.WAIT and not one.why for one in queue):
+            self._arrivals.waited(origin, self)
 
     def _convert_and_carry_out(self, command: _Command) -> Objection | None:
         message, origin = command.message, command.origin
@@ -291,13 +303,11 @@ class Commands(ToRos):
             return self._refuse(command, command.why)
         cdr = command.cdr or self._convert(message, origin)
         verdict = command.verdict
-        if isinstance(cdr, Objection) or (verdict is not Verdict.CARRY_OUT and self.stops(cdr)):
-            # Who says stop is heard at once, whatever comes with it.
-            if origin is not None:
-                self._arrivals.waited(origin, self)
-            verdict = Verdict.CARRY_OUT
         if isinstance(cdr, Objection):
             return cdr
+        if verdict is not Verdict.CARRY_OUT and self.stops(cdr):
+            # Who says stop is heard at once, whatever comes with it.
+            verdict = Verdict.CARRY_OUT
         if origin is not None and verdict is Verdict.REFUSE:
             return self._expire(message, command.refusal, origin)
         if origin is not None and verdict is Verdict.WAIT:
@@ -318,8 +328,7 @@ class Commands(ToRos):
                 if cdr is not None and self.stops(cdr):
                     command.cdr = cdr
                     return self._finish(command)
-            if origin is not None:
-                self._arrivals.waited(origin, self)
+            self._settle(origin)
             why = "was refused: too much of its user waits to be converted"
             return self._object(message, why, ReasonCode.QUOTA_EXCEEDED)
         self._queued.setdefault(origin, deque()).append(command)
@@ -354,10 +363,12 @@ class Commands(ToRos):
             self.counters.refused += 1
         else:
             self._finish(command)
-            if command.has_left and origin is self._source:
+            is_away = origin is not None and origin.link is None
+            if command.has_left and is_away and origin is self._source:
                 self._source = None
                 if self._is_driven:
                     self._stop_now(f"{origin} has left")
+        self._settle(origin)
 
     def _why_late(self, command: _Command) -> str:
         """Why a command that was new has become too old in the queue; empty when it has not."""
@@ -387,6 +398,20 @@ class Commands(ToRos):
         stop = self._stop
         return 0 if stop is None else max(STOP_SIZE, STOP_BYTES * len(stop.example))
 
+    def announced(self, message: Message, session: Session) -> None:
+        """How commands of QoS 2 come can be told now only, where they do not say how old they are
+        themselves."""
+        if self.rules.oldest == math.inf:
+            return
+        try:
+            is_known = self._old_by_itself(message) or sent_at(message.properties) is not None
+        except ValueError:
+            return
+        if not is_known:
+            broker = self._around.broker
+            number = broker.counters.messages_received
+            self._arrivals.look(session, self.rules.oldest, broker.now, number)
+
     def inspect(self, message: Message, session: Session) -> Objection | None:
         try:
             why = self._old_by_itself(message)
@@ -395,10 +420,6 @@ class Commands(ToRos):
                 return None
             return self._object(message, f"was refused: {error}")
         if not why:
-            if self.rules.oldest < math.inf and sent_at(message.properties) is None:
-                broker = self._around.broker
-                number = broker.counters.messages_received
-                self._arrivals.look(session, self.rules.oldest, broker.now, number)
             return super().inspect(message, session)
         if self._is_heard_late(message, session):
             return None
@@ -484,7 +505,6 @@ class Commands(ToRos):
         ledger = self._around.broker.ledger
         size = message.size + len(cdr)
         if not ledger.fits(origin.account, size):
-            self._arrivals.waited(origin, self)
             return self._object(message, "was refused: there is no memory for it to wait in")
         ledger.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
@@ -500,7 +520,7 @@ class Commands(ToRos):
             self._has_waited,
             origin,
             served=origin,
-            failed=lambda: self._forget(origin, "it could not be carried out"),
+            failed=lambda: self._give_up(origin, "it could not be carried out"),
         )
 
     def _wait_no_longer(self, origin: Session) -> _Waiting | None:
@@ -522,6 +542,11 @@ class Commands(ToRos):
             if command.verdict is Verdict.WAIT:
                 command.why = command.why or why
 
+    def _give_up(self, origin: Session, why: str) -> None:
+        """What waits is dropped, and not for what came behind it: the next may be a first one."""
+        self._forget(origin, why)
+        self._settle(origin)
+
     def _has_waited(self, origin: Session) -> None:
         """Nothing has followed the first command, unless it has come and was not read yet."""
         now = self._around.entries.time()
@@ -533,7 +558,7 @@ class Commands(ToRos):
             if now < waiting.due + self.rules.oldest:
                 waiting.timer = self._wait_until(now + READ_SOON, origin)
             else:
-                self._forget(origin, "what came with it was read late")
+                self._give_up(origin, "what came with it was read late")
             return
         self._arrivals.waited(origin, self)
         self._carry_out_waiting(origin)

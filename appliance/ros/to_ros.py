@@ -214,6 +214,9 @@ class ToRos(Flow):
         """Whether the session may publish a command now."""
         return self._lease.decide(session)
 
+    def announced(self, message: Message, session: Session) -> None:
+        """A message of QoS 2 has come: where there are rules, its time may say something."""
+
     def inspect(self, message: Message, session: Session) -> Objection | None:
         """Whether a message of QoS 2 can be converted; of a large one that is found out when it is
         its turn, unless that is now."""

@@ -36,6 +36,7 @@ from appliance.ros.backlog import Backlog
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
+from appliance.ros.commands import Commands
 from appliance.ros.convert import Converter
 from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProfile
 from appliance.ros.payloads import ZSTD_MAGIC
@@ -2332,3 +2333,127 @@ def test_a_qos_2_command_of_two_routes_is_looked_at_once():
             sender.arrivals.look(sender, sender.OLDEST, sender.now, number)
         verdicts.append(sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, number))
     assert verdicts[2:] == [Verdict.CARRY_OUT] * 4
+
+
+@pytest.mark.parametrize("pace", [0, 0.05])
+async def test_each_message_of_a_plugin_is_a_command_of_its_own(house, pace):
+    """It comes from inside: no packet from the network tells one from another."""
+    house.start(CommandRules(expire=0.5))
+    begun = asyncio.get_running_loop().time()
+    for number in range(6):
+        house.broker.ledger.now = begun + number * pace
+        house.client.send(TOPIC, GO)
+    assert len(house.robot.received) == (4 if pace else 0)
+    await asyncio.sleep(0.2)  # longer than a first command waits
+    assert len(house.robot.received) == (4 if pace else 0)
+
+
+FRESH = CommandRules(expire=60.0)
+
+
+@pytest.mark.parametrize(
+    "way", ["reload", "late", "overtaken", "turn, reload", "turn, overtaken", "fault", "kept"]
+)
+async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, escaped, way):
+    """What waits no longer is nothing that the next one would be a queue with."""
+    rules = CommandRules(
+        expire=60.0, on_silence=OnSilence(60.0), take_retained=way == "kept", exclusive=False
+    )
+    bridge = start_beside(house, own=rules)
+    for _ in range(3 * (way != "kept")):
+        house.node.spin()
+    await house.settle()
+    house.robot.received.clear()
+    if way.startswith("turn"):
+        make_busy(house)
+    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+    if way == "late":  # by the rule of a route with a short expire
+        bridge.replace(
+            [
+                RouteSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=CommandRules(expire=0.15)),
+                RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
+            ]
+        )
+        lamp = house.node.add_subscriber("/lamp", TWIST)
+        await house.settle()
+        driver.wire.connection = Contact(has_unread=True)
+        driver.say(Publish("r2d2/lamp", GO))
+        await until(lambda: total(house, "expired") == 1)
+        assert lamp.received == []
+        driver.wire.connection = Contact()
+    elif way == "fault":
+        with monkeypatch.context() as patch:
+            patch.setattr(Commands, "_read", lambda *_: 1 / 0)
+            driver.drive()
+    else:
+        driver.drive(large(0.1) if way.startswith("turn") else GO, retain=way == "kept")
+    if way.endswith("reload"):
+        bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=FRESH)])
+        house.node.spin()
+        await until(lambda: not bridge._turns.is_busy)
+    elif way.endswith("overtaken"):
+        stop_beside(other, properties=made(0))
+        await until(lambda: total(house, "expired") == 1)
+    await asyncio.sleep(0.3)  # no burst
+    house.robot.received.clear()
+    driver.drive(b'{"linear":{"x":0.9}}')
+    await until(lambda: house.robot.received == [twist(0.9)], timeout=3)
+    escaped.clear()
+
+
+async def test_who_left_before_its_turn_and_is_back_is_not_stopped(house):
+    house.start(RULES)
+    make_busy(house)
+    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    driver.steer(large(0.1))
+    driver.leave()
+    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    driver.steer(large(0.2))
+    await until(lambda: len(house.robot.received) == 2)
+    assert house.robot.received == [twist(0.1), twist(0.2)]
+    driver.leave()
+    assert house.robot.received == [twist(0.1), twist(0.2), STOP]
+
+
+@pytest.mark.parametrize("version", [4, 5])
+@pytest.mark.parametrize("size", [0, 5000])
+@pytest.mark.parametrize(
+    ("what", "counter"), [("against", "refused"), ("bad", "errors"), ("old", "expired")]
+)
+async def test_a_qos_2_command_that_is_refused_is_counted_once(house, version, size, what, counter):
+    """3.1.1 cannot refuse at its PUBREC: the exchange goes on, and it is refused in the end."""
+    house.start(CommandRules(expire=0.5, allow=(("linear.z", (0.0,)),)))
+    driver = Driver(house.broker, "a", version=version)
+    if what == "old":
+        driver.drive(b'{"linear":{"x":1}}' + b" " * size, qos=2, dup=True)
+    else:
+        payload = b'{"linear":{"z":1}}' if what == "against" else b"{]"
+        driver.drive(payload + b" " * size, qos=2)
+    driver.say(Pubrel(7))
+    await until(lambda: getattr(house.counters(), counter))
+    await until(lambda: not house.bridge._turns.is_busy)
+    counters = house.counters()
+    assert (counters.refused, counters.errors, counters.expired) == tuple(
+        int(name == counter) for name in ("refused", "errors", "expired")
+    )
+    assert house.robot.received == []
+
+
+@pytest.mark.parametrize("lights", [0, 1])
+def test_the_pace_of_qos_2_of_a_long_expire_is_not_that_of_a_short_one(lights):
+    """Old commands that come one by one behind a stall, each when the one before is answered."""
+    sender = Sender(2)
+    for _ in range(6):
+        sender.say(0.05)
+    assert sender.moved
+    sender.moved.clear()
+    sender.now += 3
+    for _ in range(lights):
+        sender.arrivals.look(sender, 10.0, sender.now)
+        sender.arrivals.judge(sender, 2, 10.0, sender.now)
+    for _ in range(40):
+        withheld = sum(sender.link.withheld)
+        sender.link.withheld.clear()
+        sender.say(0.05 + withheld, "old")
+    sender.rest(1)
+    assert sender.moved == []
