@@ -1,4 +1,4 @@
-"""cd tests && python -m memory [SHAPE …]: by how much memory grows, and what the limits allow."""
+"""python tests/memory [SHAPE …]: by how much memory grows, and what the limits allow."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 from memory.shapes import MIB, MOST, SHAPES, run
 
 
 def measure(name: str) -> tuple[int, int, int]:
     """`run`, in a process of its own."""
     said = subprocess.run(
-        [sys.executable, "-m", "memory", "--one", name],
-        cwd=Path(__file__).parents[1],
+        [sys.executable, Path(__file__).parent, "--one", name],
         check=True,
         capture_output=True,
         text=True,
