@@ -91,7 +91,7 @@ async def test_chunks_that_cost_little_do_not_wait_for_a_turn(house: House):
     there = await crowd(house)
     await asyncio.sleep(0)
     house.network.is_round_over()
-    house.network.count(2 * EFFORT_A_ROUND)
+    house.broker.counters.effort += 2 * EFFORT_A_ROUND
     served = 0
     for _, protocol in there[:8]:
         protocol.data_received(Pingreq().encode(5))
@@ -141,7 +141,7 @@ async def test_what_was_received_and_waits_is_counted_for_its_user(house: House,
     before = ledger.queued_bytes
     chunk = Publish("a", bytes(1000)).encode(5) * 100
     house.network.is_round_over()
-    house.network.count(2 * EFFORT_A_ROUND)
+    house.broker.counters.effort += 2 * EFFORT_A_ROUND
     protocol.data_received(chunk)
     assert protocol._held and ledger.queued_bytes - before >= len(chunk)
     assert protocol.account.bytes >= len(chunk)
