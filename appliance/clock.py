@@ -20,7 +20,7 @@ RELEASED: Final = datetime(2026, 1, 1, tzinfo=timezone.utc)
 #: Seconds that the wall clock may be off from one look to the next, as it is nudged by NTP.
 NUDGE: Final = 2.0
 
-#: Seconds after which half of what a `WorkClock` saw of the computer's load is forgotten, those
+#: Seconds after which half of what a `SpareClock` saw of the computer's load is forgotten, those
 #: that a thread may wait for its turn on a computer that has time, and the least share of the
 #: processor that is assumed for others.
 OF_LATE: Final = 0.1
@@ -48,13 +48,13 @@ class StepWatch:
         return step if abs(step) >= NUDGE else 0.0
 
 
-class WorkClock:
-    """Seconds that a thread left no other program of the computer, as far as it can tell.
+class SpareClock:
+    """Seconds that a thread has left to the other programs of its computer, as far as it can tell.
 
-    These are the ones in which it worked, or was ready to while others had the processor. When it
-    had to wait for the processor so did they: of the time in which it rested that part counts, too.
+    It left none while it worked, or was ready to and others had the processor. When it had to wait
+    for the processor so did they: of the time in which it rested only the part they got counts.
 
-    It is the thread of the first call. Where the system does not tell, only its work counts.
+    It is the thread of the first call. Where the system does not tell, only its work is taken off.
     """
 
     def __init__(self) -> None:
@@ -62,22 +62,25 @@ class WorkClock:
         self._last = (0.0, 0.0, 0.0, 0.0)
         # How much it worked and waited of late.
         self._worked = self._waited = 0.0
+        self._ahead = 0.0  # what it worked and waited before the time came that it did so in
         self._sum = 0.0
 
     def __call__(self) -> float:
         """What it is now; by how much it grows is what it is for."""
+        now = time.monotonic()
         if self._file < 0:
             try:
                 self._file = os.open("/proc/thread-self/schedstat", os.O_RDONLY | os.O_CLOEXEC)
             except OSError:
-                return time.thread_time()
+                return now - time.thread_time()
         worked, waited, turns = os.pread(self._file, 100, 0).split()  # in nanoseconds
-        return self.grow(time.monotonic(), int(worked) * 1e-9, int(waited) * 1e-9, float(turns))
+        return self.grow(now, int(worked) * 1e-9, int(waited) * 1e-9, float(turns))
 
     def grow(self, now: float, worked: float, waited: float, turns: float) -> float:
         """What it is at a time, in seconds as is what the thread worked and waited up to then.
 
-        `turns` are the times that it was given the processor, each of which takes a moment.
+        `turns` are the times that it was given the processor, each of which takes a moment. It
+        never goes back.
         """
         before, self._last = self._last, (now, worked, waited, turns)
         if not before[0]:
@@ -91,8 +94,10 @@ class WorkClock:
         # all of it is assumed beside what was seen, which over a rest fades to less than that.
         free = self._worked + TURN_TAKES
         share = max(free / (free + self._waited), LEAST_SHARE)
-        rested = max(seconds - worked - waited, 0.0)
-        self._sum += worked + waited + rested * (1 - share)
+        # The processor may be lost between the looks at the one clock and the other.
+        rested = seconds - worked - waited - self._ahead
+        self._ahead = max(-rested, 0.0)
+        self._sum += max(rested, 0.0) * share
         return self._sum
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from typing import Protocol, TypeAlias
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange, Identity, Refusal
-from appliance.clock import WorkClock
+from appliance.clock import SpareClock
 from appliance.entries import Entries
 from appliance.farewell import Farewell
 from appliance.mqtt.packets import Connect
@@ -110,7 +110,7 @@ class Network:
         certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
-        self._work = broker.ledger.busy = WorkClock()
+        self._spare = broker.ledger.spare = SpareClock()
         self.certificates = certificates
         self.authenticate = authenticate
         self.exchange = exchange
@@ -330,4 +330,4 @@ class Network:
             member.abort()
         for farewell in list(self._farewells):
             farewell.end()
-        self._work.close()
+        self._spare.close()

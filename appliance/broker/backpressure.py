@@ -6,11 +6,13 @@ is lost between two clients that both read. Rules say for how long; then `queue_
 
 * A reader is waited for as long as its queue drains within PATIENCE at the pace of its
   acknowledgements; the time in which the broker was busy does not count, nor the part of the rest
-  that a loaded computer gives to other programs than the reader. Who reads nothing holds its
-  publishers for PATIENCE, once, until its queue was empty; who reads too slowly, for little longer.
+  that a loaded computer gives to other programs than the reader, nor that in which the reader has
+  acknowledged all it was given, as what it is sent next waits for a commit of the store. Who reads
+  nothing holds its publishers for PATIENCE, once, until its queue was empty; who reads too slowly,
+  for little longer.
 * A publisher is held by all its readers together for no more than PUBLISHER_PATIENCE at once, and
   in the long run MESSAGE_PATIENCE a message: readers that conspire slow it to 100 messages a
-  second, and no further.
+  second, and no further. Of the time in which none of them was waited for LEAST_COUNTED counts.
 * Nobody else waits: other publishers, a publisher's messages of QoS 0 that came before, and what a
   publisher acknowledges meanwhile, so that two that publish to each other drain each other's queue.
 
@@ -32,6 +34,10 @@ PATIENCE = 0.25
 #: of its messages gives back.
 PUBLISHER_PATIENCE = 1.0
 MESSAGE_PATIENCE = 0.01
+
+#: The part that counts of a publisher's time while it was the computer that was waited for: so
+#: nobody waits without end for readers that are found to be never at fault.
+LEAST_COUNTED = 0.25
 
 
 class Waiting(Protocol):
@@ -69,11 +75,14 @@ class Congestion:
         "_a_byte",
         "_a_message",
         "_allowance",
-        "_busy",
+        "_dawdled",
         "_earned",
+        "_held_back",
+        "_is_owed",
         "_ledger",
         "_looked_at",
         "_session",
+        "_unwritten",
         "_waiting",
         "awaited",
     )
@@ -84,17 +93,23 @@ class Congestion:
         self._a_message = PATIENCE / ledger.limits.queue_messages
         self._a_byte = PATIENCE / ledger.limits.queue_bytes
         self._allowance = Allowance(PATIENCE)
-        self._looked_at = ledger.now
-        self._busy = ledger.busy()
+        self._looked_at = ledger.spare()
         self._earned = 0.0  # since it was looked at
+        self._dawdled = 0.0
+        #: Packet ids that wait for the flush, and for a batch of the store.
+        self._unwritten: dict[int, None] = {}
+        self._held_back: dict[int, int] = {}
+        #: Whether there is something that the reader has been given and not acknowledged.
+        self._is_owed = True
         #: Those who wait, in the order in which they came.
         self._waiting: dict[Waiting, None] = {}
         #: Whether somebody waits for room and was not told yet that there is some.
         self.awaited = False
         ledger.congested[session] = None
 
-    def acknowledged(self, size: int) -> None:
+    def acknowledged(self, packet_id: int, size: int) -> None:
         """The reader has a message of so many bytes."""
+        self.settled(packet_id)
         by_size = size * self._a_byte
         self._earned += by_size if by_size > self._a_message else self._a_message
         if self._allowance.used_up and self._earned > PATIENCE / 2 and self.patience():
@@ -105,15 +120,57 @@ class Congestion:
         """Seconds that publishers might wait for it when it was looked at last."""
         return self._allowance.left
 
+    def sent(self, packet_id: int) -> None:
+        """A message, or the PUBREL of one, goes to the reader with the next flush."""
+        self._unwritten[packet_id] = None
+
+    def settled(self, packet_id: int) -> None:
+        """The reader owes nothing for what was sent under that id."""
+        self._unwritten.pop(packet_id, None)
+        self._held_back.pop(packet_id, None)
+
+    def held_back(self, batch: int) -> None:
+        """What was sent since the last flush waits until this batch is committed."""
+        self._held_back.update(dict.fromkeys(self._unwritten, batch))
+        self._unwritten.clear()
+        self._look_what_is_owed()
+
+    def written(self, committed: int) -> None:
+        """What was sent has gone out, and what waited for batches up to this one."""
+        self._unwritten.clear()
+        held_back = self._held_back
+        while held_back and held_back[oldest := next(iter(held_back))] <= committed:
+            del held_back[oldest]
+        self._look_what_is_owed()
+
+    def _look_what_is_owed(self) -> None:
+        inflight = self._session.inflight
+        is_owed = len(self._held_back) < len(inflight) or not inflight
+        if is_owed is not self._is_owed:
+            self._settle()
+            self._is_owed = is_owed
+
+    def _settle(self) -> None:
+        """Take account of the time up to now."""
+        # The reader is not to blame for the time in which the broker had others to serve.
+        now, idle = self._ledger.spare(), 0.0
+        if self._is_owed or self._ledger.failing:
+            idle = now - self._looked_at
+            self._dawdled += idle
+        self._allowance.change(self._earned - idle)
+        self._looked_at = now
+        self._earned = 0.0
+
+    def dawdled(self) -> float:
+        """Seconds since the beginning in which it was the reader that was waited for."""
+        if self._session in self._ledger.congested:
+            self._settle()
+        return self._dawdled
+
     def patience(self) -> float:
         """Seconds that publishers may wait for this reader from now on."""
-        now, busy = self._ledger.now, self._ledger.busy()
+        self._settle()
         allowance = self._allowance
-        # The reader is not to blame for the time in which the broker had others to serve.
-        idle = max(now - self._looked_at - (busy - self._busy), 0.0)
-        allowance.change(self._earned - idle)
-        self._looked_at, self._busy = now, busy
-        self._earned = 0.0
         if not allowance.used_up:
             return allowance.left
         self._ledger.congested.pop(self._session, None)
@@ -139,8 +196,11 @@ class Congestion:
 
     def resume(self) -> None:
         """The reader has come back, to what is left of the patience with it."""
-        self._looked_at, self._busy = self._ledger.now, self._ledger.busy()
+        self._looked_at = self._ledger.spare()
         self._earned = 0.0
+        self._unwritten.clear()
+        self._held_back.clear()
+        self._is_owed = True
         if not self._allowance.used_up:
             self._ledger.congested[self._session] = None
 

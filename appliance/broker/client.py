@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
 from appliance.broker.backpressure import (
+    LEAST_COUNTED,
     MESSAGE_PATIENCE,
     PUBLISHER_PATIENCE,
     Allowance,
@@ -153,6 +154,7 @@ class Client:
         self._behind_size = 0  # bytes
         self._awaited: Sequence[Congestion] = ()
         self._waits_since = 0.0
+        self._dawdled = 0.0  # by those that it waits for, together, at that time
         #: When what had to wait and is done now came, at the latest; 0 for what comes just now.
         self._came_at = 0.0
         #: Since when what came waits for an answer of somebody else; 0 when nothing does.
@@ -477,6 +479,7 @@ class Client:
             if congestion not in congestions:
                 congestion.forget(self)
         self._awaited = congestions
+        self._dawdled = sum(congestion.dawdled() for congestion in congestions)
         seconds = allowance.left
         for congestion in congestions:
             congestion.wait(self)
@@ -549,9 +552,12 @@ class Client:
             return
         limit = self._counters.effort + EFFORT_A_TURN
         if self._awaited:
-            now = self._ledger.now
-            self._allowance.change(self._waits_since - now)
-            self._waits_since = now
+            dawdled = sum(congestion.dawdled() for congestion in self._awaited)
+            waited = self._ledger.now - self._waits_since
+            # All together cannot have kept it waiting for longer than it has waited.
+            counted = min(max(dawdled - self._dawdled, waited * LEAST_COUNTED), waited)
+            self._allowance.change(-counted)
+            self._waits_since, self._dawdled = self._ledger.now, dawdled
         try:
             while behind and self._work is None:
                 if self._counters.effort > limit:

@@ -94,10 +94,12 @@ class Ledger:
     refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
-    #: Seconds that the broker, or the computer under load, has left none of its clients.
-    busy: Callable[[], float] = field(default=lambda: 0.0)
+    #: Seconds that the broker, and the computer under load, have left to the clients: a clock that
+    #: does not go on while these could do nothing.
+    spare: Callable[[], float] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.spare = lambda: self.now
         self.use(self.limits)
 
     def use(self, limits: Limits) -> None:

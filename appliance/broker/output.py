@@ -339,6 +339,9 @@ class Output:
             if self._full:
                 self.writable = not self._closed
             self.wire.write(out)
+            session = self.session
+            if session is not None and session.congestion is not None:
+                session.congestion.written(self._broker.store.committed)
         if self._closed:
             self.wire.close()
         elif self._full:
@@ -362,6 +365,8 @@ class Output:
             waiting[-1][1].extend(out)
         else:
             waiting.append((batch, out))
+        if session is not None and session.congestion is not None:
+            session.congestion.held_back(batch)
         return True
 
     def release(self, committed: int) -> bool:
@@ -373,6 +378,9 @@ class Output:
             chunks = waiting.popleft()[1]
             if chunks:
                 self.wire.write(chunks)
+        session = self.session
+        if session is not None and session.congestion is not None:
+            session.congestion.written(committed)
         if waiting:
             return True
         if not self._out:

@@ -507,6 +507,8 @@ class Session:
         self.account.bytes += size
         self.ledger.queued_bytes += size
         inflight[packet_id] = delivery
+        if self.congestion is not None:
+            self.congestion.sent(packet_id)
         if self.expiry:
             self._staged()
             self.ledger.store.sent(self, delivery, packet_id)
@@ -625,7 +627,7 @@ class Session:
             self.ledger.store.settled(self, delivery)
         congestion = self.congestion
         if congestion is not None:
-            congestion.acknowledged(size)
+            congestion.acknowledged(packet_id, size)
         if self.queue or self.replays or self.resends or congestion is not None:
             self.pump()
         return True
@@ -652,7 +654,8 @@ class Session:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
             if self.congestion is not None:
-                self.congestion.acknowledged(delivery[0].size)
+                self.congestion.acknowledged(packet_id, delivery[0].size)
+                self.congestion.sent(packet_id)  # the PUBREL
                 self._relieve(self.congestion)
             if self.expiry:
                 self._staged()
@@ -670,6 +673,8 @@ class Session:
         if self.inflight[packet_id] is not None:
             raise _wrong("PUBCOMP", packet_id)
         del self.inflight[packet_id]
+        if self.congestion is not None:
+            self.congestion.settled(packet_id)
         if self.expiry:
             self.ledger.store.completed(self, packet_id)
         if self.queue or self.replays or self.resends:
@@ -679,6 +684,8 @@ class Session:
     def give_up(self, packet_id: int) -> None:
         """Take a message out of flight that the client cannot be sent [MQTT-3.1.2-25]."""
         delivery = self.inflight.pop(packet_id, None)
+        if self.congestion is not None:
+            self.congestion.settled(packet_id)
         if delivery is not None:
             self._uncount(delivery[0])
             self._settled(delivery)
