@@ -176,8 +176,9 @@ class ClientProtocol:
             self._forget()
         except Exception as error:
             self._broker.faults.caught("connection.begin", error, self)
-            connection.close()
-            self._forget()
+            self.abort()  # it may have been made: nobody would know of it
+            if self._transport is None:
+                connection.close()
         finally:
             self._accepted = None
 

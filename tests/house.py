@@ -9,6 +9,7 @@ import ssl
 from collections.abc import Callable
 from pathlib import Path
 
+from broker.conftest import check_accounts
 from waiting import PATIENCE
 
 from appliance import certs
@@ -130,6 +131,7 @@ class House:
         assert not self.broker.clients
         assert self.broker.ledger.queued_bytes == 0
         assert self.network.output == 0
+        check_network(self.network)
 
     def protocol(self, client_id: str) -> ClientProtocol:
         """The server's end of a client's connection."""
@@ -138,6 +140,23 @@ class House:
             if session is not None and session.client_id == client_id:
                 return protocol
         raise AssertionError(f"{client_id} is not connected")
+
+
+def check_network(network: Network) -> None:
+    """`check_accounts`, with what the connections hold of what came in and of what goes out."""
+    strangers = network.broker.ledger.accounts.strangers
+    accounts = {strangers} | {protocol.account for protocol in network.open}
+    accounts |= {session.account for session in network.broker.sessions.values()}
+    wires = {account: account.output for account in accounts}
+    total = network.output
+    for protocol in network.open:
+        held = protocol._held_size + protocol._frame + protocol._below
+        total += held
+        wires[protocol.account] += held
+        if protocol.account is strangers:
+            wires[strangers] += protocol._client._held
+    assert strangers.bytes == wires[strangers]
+    check_accounts(network.broker, wires=total, wires_of=wires)
 
 
 class Caller:

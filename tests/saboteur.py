@@ -1,5 +1,6 @@
 """Lets an entry of the appliance fail, once, when it is next passed: for `test_containment.py`.
 
+It fails before anything was done there, or when all was done: the state is another one then.
 What goes through `appliance.entries` and `Faults.run` is reached by the entry's name alone. Where
 an entry has a `try` of its own, INLINE says what is called in there, and by whom.
 """
@@ -8,10 +9,11 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Generator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,7 +77,7 @@ INLINE = {
     "connection.last_turn": ("broker.client", "Client", "send_on", "_leave"),
     "connection.login": ("wire", "ClientProtocol", "_read_on", "_log_in"),
     "connection.turn": ("wire", "ClientProtocol", "take_turn", "_run_turns"),
-    "control.command": ("app", "App", "_answer_skipped", ""),
+    "control.command": ("app", "App", "_answer_status", ""),
     "control.connection": ("control", "Control", "_answer", "_serve"),
     "flush": ("broker.output", "Output", "flush", "broker/broker.py:flush"),
     "flush.wait": ("broker.output", "Output", "wait", "_hold_back"),
@@ -116,7 +118,9 @@ class Saboteur:
     """`arm` lets entries fail when they are next passed, each once."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        #: Those that are to fail before their work, and those behind it.
         self._armed: set[str] = set()
+        self._armed_behind: set[str] = set()
         #: What was caught that nobody let fail, with where.
         self.others: list[str] = []
         self._patch_entries(monkeypatch)
@@ -126,17 +130,46 @@ class Saboteur:
         for place, callers in places.items():
             self._patch_inline(monkeypatch, place, callers)
 
-    def arm(self, *names: str) -> None:
+    def arm(self, *names: str, behind: str = "") -> None:
+        """Let these fail before their work, and this one when its work is done."""
         self._armed = set(names)
+        self._armed_behind = {behind} if behind else set()
 
-    def strike(self, entry: str) -> None:
+    def _strike(self, entry: str) -> None:
         if entry in self._armed:
             self._armed.discard(entry)
-            raise SabotageError(entry)
+            raise SabotageError(f"before {entry}")
 
-    def _first(self, entry: str, callback: Callable[..., object], *args: Any, **more: Any) -> Any:
-        self.strike(entry)
-        return callback(*args, **more)
+    def _strike_behind(self, entry: str) -> None:
+        if entry in self._armed_behind:
+            self._armed_behind.discard(entry)
+            raise SabotageError(f"behind {entry}")
+
+    def _struck(self, entry: str, callback: Callable[..., object], *args: Any, **more: Any) -> Any:
+        self._strike(entry)
+        result = callback(*args, **more)
+        if entry in self._armed_behind:
+            if inspect.iscoroutine(result):
+                return self._struck_task(entry, result)
+            if inspect.isgenerator(result):
+                return self._struck_steps(entry, result)
+            self._strike_behind(entry)
+        return result
+
+    async def _struck_task(self, entry: str, work: Coroutine[Any, Any, Any]) -> Any:
+        try:
+            self._strike(entry)
+        except SabotageError:
+            work.close()
+            raise
+        result = await work
+        self._strike_behind(entry)
+        return result
+
+    def _struck_steps(self, entry: str, steps: Generator[Any, Any, Any]) -> Any:
+        result = yield from steps
+        self._strike_behind(entry)
+        return result
 
     def _patch_entries(self, monkeypatch: pytest.MonkeyPatch) -> None:
         caught = Faults.caught
@@ -151,34 +184,26 @@ class Saboteur:
         monkeypatch.setattr(Faults, "caught", noted)
         run, task, repeat = entries.Entries.run, entries.Entries.task, entries.Repeated.__init__
         once, shield = Faults.run, entries._Shield.__init__
-        first = self._first
+        struck = self._struck
 
         def entered(own, entry, served, failed, callback, args):
-            run(own, entry, served, failed, partial(first, entry, callback), args)
+            run(own, entry, served, failed, partial(struck, entry, callback), args)
 
         def begun(own, entry, work, **more):
-            async def begin() -> Any:
-                try:
-                    self.strike(entry)
-                except SabotageError:
-                    work.close()
-                    raise
-                return await work
-
-            return task(own, entry, begin(), **more)
+            return task(own, entry, self._struck_task(entry, work), **more)
 
         def repeated(own, all_entries, entry, interval, callback, delay):
-            repeat(own, all_entries, entry, interval, partial(first, entry, callback), delay)
+            repeat(own, all_entries, entry, interval, partial(struck, entry, callback), delay)
 
         def ran(own, entry, work, *args, otherwise):
-            return once(own, entry, partial(first, entry, work), *args, otherwise=otherwise)
+            return once(own, entry, partial(struck, entry, work), *args, otherwise=otherwise)
 
         class Struck:
             def __init__(self, entry: str, told: object) -> None:
                 self._entry, self._told = entry, told
 
             def __getattr__(self, name: str) -> object:
-                return partial(first, self._entry, getattr(self._told, name))
+                return partial(struck, self._entry, getattr(self._told, name))
 
         def shielded(own, entry, faults, told):
             shield(own, entry, faults, Struck(entry, told))
@@ -186,7 +211,7 @@ class Saboteur:
         contained = ContainedThread._contained
 
         def of_the_node(own, entry, callback):
-            return contained(own, entry, partial(first, entry, callback))
+            return contained(own, entry, partial(struck, entry, callback))
 
         monkeypatch.setattr(ContainedThread, "_contained", of_the_node)
         monkeypatch.setattr(entries.Entries, "run", entered)
@@ -208,7 +233,7 @@ class Saboteur:
             return
         cells = dict(zip(code.co_freevars, closure, strict=True))
         entry, own = cells["entry"].cell_contents, cells["method"].cell_contents
-        monkeypatch.setattr(cells["method"], "cell_contents", partial(self._first, entry, own))
+        monkeypatch.setattr(cells["method"], "cell_contents", partial(self._struck, entry, own))
 
     def _patch_inline(
         self, monkeypatch: pytest.MonkeyPatch, place: tuple[str, str, str], callers: dict[str, str]
@@ -218,12 +243,12 @@ class Saboteur:
         owner = getattr(owner, kind) if kind else owner
         own = getattr(owner, name)
 
-        def struck(*args: Any, **more: Any) -> Any:
-            for entry in self._armed & callers.keys():
+        def entered(*args: Any, **more: Any) -> Any:
+            for entry in (self._armed | self._armed_behind) & callers.keys():
                 file, _, caller = callers[entry].rpartition(":")
                 code = sys._getframe(1).f_code
                 if not caller or (code.co_name == caller and code.co_filename.endswith(file)):
-                    self.strike(entry)
+                    return self._struck(entry, own, *args, **more)
             return own(*args, **more)
 
-        monkeypatch.setattr(owner, name, struck)
+        monkeypatch.setattr(owner, name, entered)

@@ -9,7 +9,7 @@ import time
 
 import pytest
 from house import House, Watches
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.broker.ports import HERE, Contact
 from appliance.mqtt.packets import Pingreq, Pingresp, Publish, Subscribe, Subscription
@@ -154,3 +154,23 @@ async def test_what_was_not_read_for_a_time_is_told(house):
     assert held[0] < 0.2  # the login
     assert held[1] > 0.29
     assert held[2] == 0
+
+
+async def test_what_has_come_and_was_not_read_is_told(house):
+    caller = await house.join("a")
+    wire = house.protocol("a")
+    assert not wire.contact().has_unread
+    wire._rest(PATIENCE)
+    await caller.say(Publish("x", b"1"))
+    await until(lambda: wire.contact().has_unread, "bytes that the system holds")
+    heard = []
+    Watches(house, lambda message: heard.append(wire.contact().has_unread))
+    wire._rest(0)
+    await until(lambda: heard, "the message")
+    assert heard == [False] and not wire.contact().has_unread
+    # And what was read, and waits in here for its turn.
+    wire._hold(Publish("x", b"2").encode(5), 0)
+    assert wire.contact().has_unread
+    wire._read_on()
+    await until(lambda: len(heard) == 2, "the message that waited")
+    assert not wire.contact().has_unread

@@ -3,7 +3,8 @@
 The entries are those that stand in the sources (`saboteur.all_entries`), so none is missing. While
 one after the other fails, clients of every kind do what they always do. Each of them must go on
 after each fault: a round trip, a message of 300 KB, a SUBSCRIBE with hundreds of filters, a will, a
-keep alive, `$SYS`; and at most a few connections may end by it.
+keep alive, `$SYS`; and at most a few connections may end by it. An entry fails twice, before its
+work and when it is done; then the sums are right, and nothing is left of who is gone.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import pytest
 import uvloop
 import yaml
 from amqtt.plugins.base import BasePlugin
-from house import Caller, House, make_contexts
+from house import Caller, House, check_network, make_contexts
 from saboteur import INLINE, SabotageError, Saboteur, all_entries
 from waiting import PATIENCE, until
 
@@ -69,6 +70,7 @@ LARGE = bytes(300_000)
 TWIST = "geometry_msgs/msg/Twist"
 STRING = "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
+DONE = b"\0\1\0\0\1\0\0\0\1\0\0\0\0"
 
 
 class Listening(BasePlugin):
@@ -294,6 +296,7 @@ class Site:
         self.node.add_subscriber("/cmd_vel", TWIST)
         self.node.add_subscriber("/down", STRING)
         self.node.add_service("/srv/slow", TRIGGER, lambda request, respond: None)
+        self.node.add_service("/srv/quick", TRIGGER, lambda request, respond: respond(DONE))
 
     async def join(self, name: str, kind: str = "plain", **options: Any) -> Caller:
         """A client that has logged in."""
@@ -485,6 +488,10 @@ FIRST: dict[str, tuple[str, ...]] = {
     "connection.flush": ("connection.chunk",),
     "listener.reopen": ("listener.accept",),
 }
+
+
+#: Work that does not end while the appliance runs.
+ENDLESS = frozenset(("app.task",))
 
 
 def reach(*names: str) -> Callable[[Reach], Reach]:
@@ -717,7 +724,7 @@ async def _reloads(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("control.command", "control.connection")
 async def _command(site: Site, patch: pytest.MonkeyPatch) -> None:
     with contextlib.suppress(ControlError):
-        await asyncio.to_thread(ask, site.app.settings.control, "skipped", 5.0)
+        await asyncio.to_thread(ask, site.app.settings.control, "status", 5.0)
 
 
 @reach("loop")
@@ -796,7 +803,8 @@ async def _asks_plugins(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("calls.take", "calls.call", "calls.end", "calls.timeout", "calls.answer", "calls.handle")
 async def _call(site: Site, patch: pytest.MonkeyPatch) -> None:
     caller, _ = await site.victim()
-    await caller.say(Publish("r2d2/srv/slow/_call/1", b"{}", 1, packet_id=3))
+    for packet_id, name in enumerate(("slow", "quick"), 3):
+        await caller.say(Publish(f"r2d2/srv/{name}/_call/1", b"{}", 1, packet_id=packet_id))
 
 
 @reach("calls.follow", "parameters.read", "parameters.end")
@@ -855,6 +863,7 @@ async def _in_turn(directory: Path, saboteur: Saboteur) -> None:
     async with site.stack:
         await site.start()
         await _all_go_on(site, "at the beginning")
+        await _all_right(site, "at the beginning")
         for name in only.split(",") if only else names:
             began = time.monotonic()
             try:
@@ -869,17 +878,43 @@ async def _in_turn(directory: Path, saboteur: Saboteur) -> None:
 
 
 async def _one(site: Site, saboteur: Saboteur, name: str) -> None:
-    before = site.faults.by_entry.get(name, 0)
     losses = sum(actor.losses for actor in site.actors)
+    for behind in (False, True):
+        if behind and name in ENDLESS:
+            continue
+        where = f"{'behind' if behind else 'before'} the work of {name}"
+        await _strike(site, saboteur, name, behind=behind, where=where)
+        others, saboteur.others = saboteur.others, []
+        assert not others, f"faults that nobody injected, {where}:\n" + "\n".join(others)
+    for caller in site.hands:
+        caller.hang_up()
+    site.hands.clear()
+    await _all_go_on(site, f"after the faults in {name}")
+    await _all_right(site, f"after the faults in {name}")
+    others, saboteur.others = saboteur.others, []
+    assert not others, f"faults that nobody injected, after {name}:\n" + "\n".join(others)
+    lost = sum(actor.losses for actor in site.actors) - losses
+    # One, as a rule; all that waited for the store when it failed; all of a host whose accepting
+    # paused.
+    assert lost <= 2 * (len(site.actors) if name.startswith(("commit.", "store.")) else 6), lost
+
+
+async def _strike(site: Site, saboteur: Saboteur, name: str, *, behind: bool, where: str) -> None:
+    """Let the entry fail once."""
+    before = site.faults.by_entry.get(name, 0)
+    first = FIRST.get(name, ())
     with pytest.MonkeyPatch.context() as patch:
         for left in reversed(range(ATTEMPTS)):
-            saboteur.arm(name, *FIRST.get(name, ()))
+            if behind:
+                saboteur.arm(*first, behind=name)
+            else:
+                saboteur.arm(name, *first)
             try:
                 if name in REACH:
                     await REACH[name](site, patch)
                 await until(
                     lambda: site.faults.by_entry.get(name, 0) > before,
-                    f"{name} to be passed: say in REACH how",
+                    f"a fault {where}: say in REACH how it is passed",
                     float(os.environ.get("REACH_TIME", PATIENCE)) / ATTEMPTS,
                 )
             except (AssertionError, asyncio.TimeoutError, OSError, EOFError):
@@ -889,16 +924,39 @@ async def _one(site: Site, saboteur: Saboteur, name: str) -> None:
             if site.faults.by_entry.get(name, 0) > before:
                 break
     saboteur.arm()
-    for caller in site.hands:
-        caller.hang_up()
-    site.hands.clear()
-    await _all_go_on(site, f"after a fault in {name}")
-    others, saboteur.others = saboteur.others, []
-    assert not others, "faults that nobody injected:\n" + "\n".join(others)
-    lost = sum(actor.losses for actor in site.actors) - losses
-    # One, as a rule; all that waited for the store when it failed; all of a host whose accepting
-    # paused.
-    assert lost <= (len(site.actors) if name.startswith(("commit.", "store.")) else 6), lost
+
+
+async def _all_right(site: Site, when: str) -> None:
+    end = time.monotonic() + float(os.environ.get("REACH_TIME", PATIENCE))
+    while wrong := _wrong(site):
+        assert time.monotonic() < end, f"{when}: {wrong}"
+        await asyncio.sleep(0.01)
+
+
+def _wrong(site: Site) -> str:
+    """What is left of who is gone, or is counted for nobody; empty when all is right."""
+    broker, network = site.broker, site.network
+    try:
+        check_network(network)
+    except AssertionError as error:
+        return f"accounts: {error}"
+    there = {protocol._client for protocol in network.open}
+    if not broker.clients <= there:
+        return f"no connections any more: {[*map(str, broker.clients - there)]}"
+    outputs = {client.output for client in there}
+    linked = [each for each in broker.sessions.values() if each.identity and each.link is not None]
+    if left := [str(each) for each in linked if each.link not in outputs]:
+        return f"not connected any more: {left}"
+    neighbours = site.app._listeners._addresses._known.values()
+    guests = {guest for each in neighbours for guest in each.guests}
+    if not guests <= network.open:
+        return f"guests that are gone: {[*map(str, guests - network.open)]}"
+    strangers = broker.ledger.accounts.strangers
+    admitted = sum(sum(each.clients.values()) for each in neighbours)
+    logged_in = sum(protocol.account is not strangers for protocol in network.open)
+    if admitted != logged_in:
+        return f"{admitted} connections are counted that have logged in, and there are {logged_in}"
+    return ""
 
 
 async def _all_go_on(site: Site, when: str) -> None:
@@ -964,6 +1022,26 @@ def test_who_could_not_be_let_in_is_cut_off(
 
     saboteur = Saboteur(monkeypatch)
     run(dial())
+    escaped.clear()
+
+
+async def test_who_a_fault_arose_with_is_told_at_once(
+    tmp_path: Path, escaped: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When nobody else says anything either, and so nothing else is written out."""
+    house = House(*make_contexts(tmp_path))
+    await house.start()
+    saboteur = Saboteur(monkeypatch)
+    for behind in ("", "connection.chunk"):
+        caller = await house.join("a")
+        saboteur.arm(*([] if behind else ["connection.chunk"]), behind=behind)
+        await caller.say(Publish("x", b"x", 1, packet_id=1))
+        while not isinstance(told := await caller.hear(), Disconnect):
+            pass
+        assert told.reason_code == ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
+        assert not await caller.hear_the_end()
+    monkeypatch.undo()
+    await house.close()
     escaped.clear()
 
 

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
-from house import Caller, House, make_contexts
+from house import Caller, House, check_network, make_contexts
 
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.mqtt.packets import (
@@ -15,6 +15,7 @@ from appliance.mqtt.packets import (
     Connect,
     Pingreq,
     Pingresp,
+    Puback,
     Publish,
     Subscribe,
     Subscription,
@@ -152,3 +153,53 @@ async def test_what_was_received_and_waits_is_counted_for_its_user(house: House,
         lambda: not protocol._held and ledger.queued_bytes == before,
         lambda: f"{ledger.queued_bytes - before} bytes that are counted",
     )
+
+
+@pytest.mark.parametrize("portion", [LITTLE, 1000], ids=["taken in", "waits"])
+async def test_what_came_behind_connect_is_the_users_once_it_is_known(house: House, portion: int):
+    await house.start()
+    house.network.portion = portion
+    house.gate.clear()
+    caller = await house.dial()
+    begun = Publish("a", bytes(3000), 1, packet_id=1).encode(5)
+    await caller.say(Connect("b", username="mallory"), begun[:2000])
+    strangers = house.broker.ledger.accounts.strangers
+    await until(lambda: strangers.bytes >= 2000, lambda: f"{strangers.bytes} bytes of strangers")
+    check_network(house.network)
+    house.gate.set()
+    assert isinstance(await caller.hear(), Connack)
+    user = house.protocol("b").account
+    assert user is not strangers and not strangers.bytes and user.bytes >= 2000
+    check_network(house.network)
+    await caller.say(begun[2000:])
+    assert isinstance(await caller.hear(), Puback)
+    assert not user.bytes
+    check_network(house.network)
+
+
+async def test_the_last_byte_of_a_large_packet_is_not_little(house: House):
+    await house.start()
+    (caller, protocol), (other, others), *_ = await crowd(house)
+    large = Publish("a", bytes(LITTLE + 1000), 1, packet_id=1).encode(5)
+    small = Publish("a", bytes(LITTLE - 1000), 1, packet_id=1).encode(5)
+    for who, packet in ((caller, large), (other, small)):
+        await who.say(packet[:-1])
+    await until(
+        lambda: protocol._client._held > LITTLE and others._client._held > LITTLE - 1000,
+        lambda: (protocol._client._held, others._client._held),
+    )
+    await asyncio.sleep(0)
+    received = house.broker.counters.publish_received
+    house.network.is_round_over()
+    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    for client, last in ((protocol, large), (others, small)):
+        client.data_received(last[-1:])
+    assert protocol._turn_over and protocol._held, "it waits for its turn"
+    assert not others._held and house.broker.counters.publish_received == received + 1
+    for who in (caller, other):
+        assert isinstance(await who.hear(), Puback)
+    house.network.is_round_over()
+    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    protocol.data_received(Pingreq().encode(5))
+    assert not protocol._held, "what comes then is little again"
+    assert isinstance(await caller.hear(), Pingresp)

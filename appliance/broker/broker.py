@@ -443,15 +443,25 @@ class Broker:
         faults = self.faults
         effort = ENDING_EFFORT
         for topic_filter in session.subscriptions:
-            faults.run("end.leave", self.router.leave, session, topic_filter, otherwise=None)
-            share = self.router.shares.get(topic_filter)
-            if share is not None and share.members.pop(session, None) is not None:
-                self.router.changed()  # or the group would go on to give it what comes
+            self._leave(session, topic_filter)
             effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
         self.counters.effort += effort
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
         faults.run("end.clear", session.clear, otherwise=None)
         faults.run("end.store", self.store.session_removed, session, otherwise=None)
+
+    def _leave(self, session: Session, topic_filter: str) -> None:
+        """Take a subscription out of the tree; when that fails, once more.
+
+        Nobody does it later, and what is left there would be given all that comes, for good.
+        """
+        for _ in range(2):
+            if self.faults.run("leave", self._left, session, topic_filter, otherwise=False):
+                return
+
+    def _left(self, session: Session, topic_filter: str) -> bool:
+        self.router.leave(session, topic_filter)
+        return True
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
@@ -810,9 +820,16 @@ class Broker:
             self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
             self.complain(session, "may not subscribe to %s: %s", name, reason)
             return code, reason
-        if session.subscriptions.get(subscription.filter) != subscription:
-            session.subscribe(subscription)
-            self.router.join(session, subscription)
+        topic_filter = subscription.filter
+        if session.subscriptions.get(topic_filter) != subscription:
+            try:
+                session.subscribe(subscription)
+                self.router.join(session, subscription)
+            except Exception:
+                # Half of it would be taken for the whole when the client subscribes again.
+                session.unsubscribe(topic_filter)
+                self._leave(session, topic_filter)
+                raise
         if session.persistent:
             self.store.subscribed(session, subscription)
         if self.observer is not None:
@@ -855,6 +872,10 @@ class Broker:
         handling = subscription.retain_handling
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
+        self.begin_replay(session, subscription)
+
+    def begin_replay(self, session: Session, subscription: Subscription) -> None:
+        """The same, of a subscription that has asked for them."""
         session.replay(subscription.filter, self._find_retained(session, subscription.filter))
         if session.persistent and subscription.qos:
             self.store.subscribed(session, subscription)
@@ -884,7 +905,7 @@ class Broker:
         if not session.unsubscribe(topic_filter):
             return ReasonCode.NO_SUBSCRIPTION_EXISTED
         share = self.router.shares.get(topic_filter)
-        self.router.leave(session, topic_filter)
+        self._leave(session, topic_filter)
         if share is not None:
             session.hand_over((share,), self._giver(absent_too=True), sent=False)
         if session.persistent:

@@ -1065,6 +1065,7 @@ class Client:
         """Something went wrong in here: tell the client so (0x83), and end its connection."""
         if self._closed:
             self._make_sure()
+            self.output.end()  # it may be that which has failed
             return
         code = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
         if self.session is not None:
@@ -1149,12 +1150,14 @@ class Client:
         """Take in nothing more, and give back what is held; may be called twice."""
         self._closed = True
         self._work = None
-        self._ledger.take(self.account, -self._held)
-        self._ledger.input_bytes -= self._held
-        self._held = 0
-        self.broker.clients.discard(self)
-        self._stop_waiting()
-        self._behind.clear()
-        self._behind_size = 0
-        self.connection.close()
-        self.output.end()
+        try:
+            self._ledger.take(self.account, -self._held)
+            self._ledger.input_bytes -= self._held
+            self._held = 0
+            self.broker.clients.discard(self)
+            self._stop_waiting()
+            self._behind.clear()
+            self._behind_size = 0
+            self.connection.close()
+        finally:  # or the other end would learn of it only when the wire's patience is over
+            self.output.end()

@@ -80,7 +80,7 @@ def restore(broker: Broker, kept: list[Kept], retained: list[tuple[Message, Acco
     for entry in kept:
         assert entry.session is not None
         for subscription in entry.replaying:  # from the beginning: what was sent is not known
-            broker.replay_retained(entry.session, subscription, is_new=True)
+            broker.begin_replay(entry.session, subscription)
 
 
 def _left_at(entry: Kept) -> float:

@@ -108,7 +108,7 @@ class Router:
         share.members[session] = subscription
 
     def leave(self, session: Session, topic_filter: str) -> None:
-        """Take a subscription out of the tree, or a member out of its group."""
+        """Take a subscription out of the tree, or a member out of its group; may be done twice."""
         self.epoch += 1
         share = self.shares.get(topic_filter)
         if share is None:
@@ -116,9 +116,9 @@ class Router:
             return
         share.members.pop(session, None)
         if not share.members:
-            del self.shares[topic_filter]
             _, inner = parse_shared(topic_filter) or ("", "")
             self._subscriptions.remove(inner, topic_filter)
+            del self.shares[topic_filter]
 
     def route(self, session: Session, topic_wire: bytes) -> Route:
         """Where messages of the session to the topic go, looked up once an epoch.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
@@ -485,23 +485,28 @@ def held_bytes(session: Session) -> int:
     return sum(message.size for message in waiting) + rest
 
 
-def check_accounts(broker: Broker) -> None:
-    """The sums that the broker keeps are those of what it holds."""
+def check_accounts(
+    broker: Broker, *, wires: int = 0, wires_of: Mapping[Account, int] | None = None
+) -> None:
+    """The sums that the broker keeps are those of what it holds.
+
+    `wires` are the bytes that connections hold: of all, and as they are counted for each user.
+    """
     total = 0
     for session in broker.sessions.values():
         assert session.bytes == held_bytes(session), session
         total += session.bytes
-    assert broker.ledger.queued_bytes == total + broker.ledger.input_bytes
+    assert broker.ledger.queued_bytes == total + broker.ledger.input_bytes + wires
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
     assert broker.retained.bytes == sum(retained_size(message) for message in retained)
-    check_users(broker, retained)
+    check_users(broker, retained, wires_of or {})
 
 
-def check_users(broker: Broker, retained: list[Message]) -> None:
+def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Account, int]) -> None:
     """And each user's part of them is what that user holds."""
     accounts = broker.ledger.accounts
-    sessions, queued, kept = Counter[Account](), Counter[Account](), Counter[Account]()
+    sessions, queued, kept = Counter[Account](), Counter(wires_of), Counter[Account]()
     for session in broker.sessions.values():
         account = accounts.of(session.identity)
         assert session.account is account

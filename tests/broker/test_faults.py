@@ -24,6 +24,8 @@ from appliance.mqtt.packets import (
     Pubrel,
     Subscribe,
     Subscription,
+    Unsuback,
+    Unsubscribe,
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
@@ -434,7 +436,7 @@ def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, 
     session = member.session
     member.lose()
     Peer(broker, 4).connect("member", clean=True)  # ends the one before
-    assert calls == ["$share/g/t"]
+    assert calls == ["$share/g/t"] * 2
     assert all(session not in share.members for share in broker.router.shares.values())
     assert not session.queue and not session.inflight
     other.publish("t", b"after", 1)
@@ -457,7 +459,7 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
     other.subscribe("will", 1)
     peer = join(broker, "a", properties=keeps, will=Will("will", b"w", 1))
     peer.subscribe("x", 1)
-    account = peer.session.account
+    account, subscriptions = peer.session.account, len(broker.router)
     once(monkeypatch, whose(broker, peer), name)
     if leaves:
         try:
@@ -470,6 +472,8 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
         except BrokenError as error:
             broker.fault("connection.lost", error, peer.client)
     broker.flush()
+    assert peer.wire.closed, "at once, not when the wire's patience is over"
+    assert len(broker.router) == subscriptions - (0 if expiry else 1)
     assert peer.client not in broker.clients
     assert account.connections == (1 if account is other.session.account else 0)
     assert departed == ["a"]
@@ -486,6 +490,51 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
     again = join(broker, "a", properties=keeps)
     assert again.session.link is again.client.output
     goes_on(broker, other)
+    check_accounts(broker)
+    escaped.clear()
+
+
+@pytest.mark.parametrize("done", [False, True], ids=["before", "behind"])
+@pytest.mark.parametrize("topic_filter", ["t", "$share/g/t"])
+@pytest.mark.parametrize("what", ["join", "leave"])
+def test_a_subscription_is_there_or_it_is_not(
+    broker, other, monkeypatch, escaped, what, topic_filter, done
+):
+    """Not for the client alone, nor in the tree alone: from there nobody would take it."""
+    keeps = {Property.SESSION_EXPIRY_INTERVAL: 60}
+    peer, before = join(broker, "a", properties=keeps), len(broker.router)
+    if what == "leave":
+        peer.subscribe(topic_filter, 1)
+    own, calls = getattr(broker.router, what), []
+
+    def fails_once(*args: Any) -> None:
+        calls.append(args)
+        if done or len(calls) > 1:
+            own(*args)
+        if len(calls) == 1:
+            fail()
+
+    monkeypatch.setattr(broker.router, what, fails_once)
+    try:
+        if what == "join":
+            peer.client.receive(Subscribe(1, [Subscription(topic_filter, 1)]).encode(5))
+        else:
+            peer.client.receive(Unsubscribe(1, [topic_filter]).encode(5))
+    except BrokenError as error:
+        broker.fault("connection.chunk", error, peer.client)
+    broker.flush()
+    monkeypatch.undo()
+    session = broker.sessions["a"]
+    assert not session.subscriptions and not broker.router.shares
+    assert len(broker.router) == before
+    other.publish("t", b"not for it", 1)
+    assert not session.queue and not session.inflight
+    if what == "leave":
+        assert peer.only(Unsuback).reason_codes == [ReasonCode.SUCCESS]
+    again = join(broker, "a", properties=keeps)
+    again.subscribe(topic_filter, 1)
+    other.publish("t", b"for it", 1)
+    assert again.payloads() == [b"for it"]
     check_accounts(broker)
     escaped.clear()
 

@@ -122,6 +122,25 @@ async def test_retained_messages_that_were_not_sent_yet_are_sent_behind_the_rest
     await twin.stop()
 
 
+async def test_what_was_asked_for_first_is_sent_behind_the_restart_whatever_was_asked_then(
+    house: House, tmp_path: Path
+) -> None:
+    """It would be sent without a restart: who asks for nothing more takes nothing back."""
+    topics = [f"a/{number}" for number in range(10)]
+    publisher = await house.join("publisher")
+    for number, topic in enumerate(topics, 1):
+        publisher.send(Publish(topic, b"x", 1, retain=True, packet_id=number))
+    client = await house.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a/#", 1)]))
+    client.send(Subscribe(2, [Subscription("a/#", 1, retain_handling=2)]))
+    await house.written()
+    twin = await restarted(house, tmp_path / "twin")
+    again = await twin.join("client", **lasting(5))
+    assert await _acknowledge_all(twin, again) == {*topics}
+    assert await _acknowledge_all(house, client) == {*topics}
+    await twin.stop()
+
+
 async def _acknowledge_all(house: House, client: Peer) -> set[str]:
     """Topics of all that the client is sent."""
     topics: set[str] = set()
