@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import socket
 import time
 
 import pytest
 from house import House, Watches
+from test_websocket import frame, hear_frame, shake_hands
 from waiting import PATIENCE, until
 
+from appliance import wire as wire_module
 from appliance.broker.ports import HERE, Contact
-from appliance.mqtt.packets import Pingreq, Pingresp, Publish, Subscribe, Subscription
-from appliance.sockets import Probe, contact
+from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
+from appliance.sockets import Probe, contact, inbox
+
+HOST = "127.0.0.1"
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_INFO"), reason="only Linux tells")
 
@@ -174,3 +179,72 @@ async def test_what_has_come_and_was_not_read_is_told(house):
     wire._read_on()
     await until(lambda: len(heard) == 2, "the message that waited")
     assert not wire.contact().has_unread
+
+
+ROUND_TRIP = 0.1
+
+
+class FarAway:
+    """A network with a round trip, and room for one flight of bytes on their way to the broker."""
+
+    FLIGHT = 32 * 1024
+
+    async def start(self, target):
+        self._target = target
+        self._server = await asyncio.start_server(self._serve, HOST, 0, limit=self.FLIGHT)
+        return self._server.sockets[0].getsockname()
+
+    async def _serve(self, reader, writer):
+        sock = socket.create_connection(self._target)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        up, down = await asyncio.open_connection(sock=sock)
+        down.transport.set_write_buffer_limits(0)
+        back = asyncio.create_task(self._copy(up, writer, 0))
+        await self._copy(reader, down, ROUND_TRIP)
+        await back
+        self._server.close()
+
+    async def _copy(self, reader, writer, delay):
+        with contextlib.suppress(ConnectionError):
+            while chunk := await reader.read(self.FLIGHT):
+                await asyncio.sleep(delay)
+                writer.write(chunk)
+                await writer.drain()
+        writer.close()
+
+
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize("websocket", [False, True])
+async def test_what_a_far_client_kept_back_is_not_new(house, monkeypatch, websocket, tls):
+    """It says all at once, and is not read for a time; the last of it comes long behind that."""
+    monkeypatch.setattr(
+        wire_module, "inbox", lambda sock: inbox(sock)._replace(round_trip=ROUND_TRIP)
+    )
+    at = 2 * websocket + tls
+    house.ports[at] = await FarAway().start(house.ports[at])
+    if websocket:
+        caller = await shake_hands(house, tls)
+        await caller.say(frame(Connect("a").encode(5)))
+        await hear_frame(caller)
+    else:
+        caller = await house.join("a", tls=tls)
+    wire, held = house.protocol("a"), []
+
+    def published(_):
+        held.append(wire.contact().held)
+        if len(held) == 1:
+            wire._rest(0.5)
+
+    def say(packet: bytes, times: int = 1) -> None:
+        for _ in range(times):
+            caller.writer.write(frame(packet) if websocket else packet)
+
+    Watches(house, published)
+    say(Publish("x", bytes(1000)).encode(5), 700)
+    await until(lambda: len(held) == 700)
+    late = [seconds for seconds in held if seconds >= 0.5]
+    assert len(late) > 350 and held[-len(late) :] == late
+    await until(lambda: not wire._client.inflow.is_behind)
+    say(Publish("x", b"new").encode(5))
+    await until(lambda: len(held) == 701)
+    assert held[-1] == 0
