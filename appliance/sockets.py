@@ -161,7 +161,7 @@ def contact(connection: socket.socket) -> Contact:
         )
     except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
         return Contact(silence=math.inf)
-    return Contact(round_trip / 1e6, min(data, ack) / 1e3, unread > 0, unheard=data / 1e3)
+    return Contact(round_trip / 1e6, min(data, ack) / 1e3, unread > 0)
 
 
 class Inbox(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -97,8 +96,7 @@ class Contact:
     `silence` is how long nothing has come from it, not even an acknowledgement of the network's;
     infinity where that cannot be known. `has_unread`: bytes have come that were not looked at yet.
     `flowing` is for how long it has sent without a pause, `held` for how long what it sends now may
-    have waited in here, as it was not read. `unheard`: it has sent nothing new for so long;
-    infinity where that cannot be known.
+    have waited in here, as it was not read.
     """
 
     round_trip: float = 0.0
@@ -106,7 +104,6 @@ class Contact:
     has_unread: bool = False
     flowing: float = 0.0
     held: float = 0.0
-    unheard: float = math.inf
 
 
 #: What is on this computer is there as long as its connection is.

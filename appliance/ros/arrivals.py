@@ -186,13 +186,12 @@ class Arrivals:
     def _judge(
         self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
     ) -> Verdict:
-        contact = _contact(origin)
         was_held = pace is not None and pace.was_held
-        is_held = contact.held > oldest
+        is_held = _contact(origin).held > oldest
         if pace is None or now - pace.last > oldest or (is_held and not was_held):
             verdict = self._begin(origin, oldest, now)
             pace = self._paces[origin]
-            if is_held and contact.unheard > oldest:
+            if is_held:  # whatever it has said since, this may be older
                 pace.is_queue, pace.is_waiting, verdict = True, False, Verdict.REFUSE
             pace.was_held = is_held
             return verdict
