@@ -17,6 +17,12 @@ Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
 ASKED = 128
 
 
+def as_target(session: Session, subscription: Subscription) -> Target:
+    """A member of a group as a receiver of a message."""
+    ids = [subscription.identifier] if subscription.identifier else None
+    return session, subscription.qos, subscription.retain_as_published, ids
+
+
 class Share:
     """One `$share/{group}/{filter}` and its members, in the order in which they came."""
 
@@ -29,15 +35,7 @@ class Share:
 
     def targets(self) -> list[Target]:
         """All members, as receivers of a message."""
-        return [
-            (
-                session,
-                subscription.qos,
-                subscription.retain_as_published,
-                [subscription.identifier] if subscription.identifier else None,
-            )
-            for session, subscription in self.members.items()
-        ]
+        return [as_target(*member) for member in self.members.items()]
 
     def choose(
         self,

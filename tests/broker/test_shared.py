@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from typing import Any
+
 import pytest
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action, Limits
+from appliance.broker.ports import Action, Decision, Identity, Limits
+from appliance.broker.routing import MEMBERS_ASKED, REFUSALS_OF_A_USER
 from appliance.mqtt.codec import Property
 
 from .conftest import FakeAccess, Join, lasting
@@ -152,3 +156,62 @@ def test_a_group_without_room_is_told_to_the_publisher(join: Join, qos):
     codes = [publisher.publish("a", b"%d" % number, qos) for number in range(10)]
     assert codes == [0] * 8 + [0x97] * 2
     assert sum(len(member.drain()) for member in members) == 8
+
+
+def _crowd(join: Join, count: int, user: str) -> list[Any]:
+    crowd = [join(f"{user}-{n}", user=user) for n in range(count)]
+    for member in crowd:
+        member.subscribe("$share/g/a/#", 1)
+    return crowd
+
+
+def test_of_a_large_group_some_are_asked_about_at_a_time(
+    join: Join, broker: Broker, access: FakeAccess
+):
+    crowd = _crowd(join, 3 * MEMBERS_ASKED, "mallory")
+    publisher = join("publisher")
+    asked = _count_questions(access)
+    effort = broker.counters.effort
+    publisher.publish("a/b", b"first", 1)
+    assert sum(len(member.drain()) for member in crowd) == 1
+    assert asked.pop("a/b") <= MEMBERS_ASKED
+    assert broker.counters.effort - effort < 3 * MEMBERS_ASKED
+    for number in range(6):  # the same topic: all are known after a while
+        publisher.go_on()
+        publisher.publish("a/b", b"%d" % number, 1)
+        assert asked.pop("a/b", 0) <= MEMBERS_ASKED
+    publisher.go_on()
+    publisher.publish("a/b", b"last", 1)
+    assert not asked
+    assert sum(len(member.drain()) for member in crowd) == 7
+
+
+def test_members_who_may_not_read_keep_none_out_who_may(
+    join: Join, broker: Broker, access: FakeAccess
+):
+    crowd = _crowd(join, 2 * MEMBERS_ASKED, "mallory")
+    (alice,) = _crowd(join, 1, "alice")
+    access.deny("mallory", Action.RECEIVE, "a/secret/#")
+    publisher = join("publisher")
+    asked = _count_questions(access)
+    for number in range(5):
+        topic = f"a/secret/{number}"
+        publisher.publish(topic, b"%d" % number, 1)
+        publisher.go_on()
+        assert asked.pop(topic) <= REFUSALS_OF_A_USER + 1
+    assert len(alice.drain()) == 5
+    assert not any(member.drain() for member in crowd)
+
+
+def _count_questions(access: FakeAccess) -> Counter[str]:
+    """How often the rules are asked who may receive a topic, from now on."""
+    asked: Counter[str] = Counter()
+    decide = access.decide
+
+    def counted(identity: Identity, action: Action, topic: str) -> Decision:
+        if action is Action.RECEIVE:
+            asked[topic] += 1
+        return decide(identity, action, topic)
+
+    access.decide = counted  # type: ignore[method-assign]
+    return asked
