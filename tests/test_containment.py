@@ -597,6 +597,12 @@ async def _rests(site: Site, patch: pytest.MonkeyPatch) -> None:
     protocol._rest(0.01)
 
 
+@reach("connection.look")
+async def _looks_whether_all_is_read(site: Site, patch: pytest.MonkeyPatch) -> None:
+    _, protocol = await site.victim()
+    protocol._look_after(0.01)
+
+
 @reach("connection.abort")
 async def _cannot_be_aborted(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
