@@ -35,11 +35,6 @@ UNDECIDED = 16
 ROUTE_EFFORT = 20
 PASSED_AN_EFFORT = 4
 
-#: Members of a group that the rules are asked about for one message, and how many refusals of one
-#: user are enough for it: the others of that user are asked about for the next one.
-MEMBERS_ASKED = 256
-REFUSALS_OF_A_USER = 64
-
 _ALLOWED = Decision(True, "the appliance itself")
 _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
 
@@ -59,8 +54,6 @@ class Route:
     subscribed: bool
     #: What could not be decided yet, as somebody is asked: such a route is not kept.
     undecided: list[Question]
-    #: Whether not all members of its groups were asked about: nor is such a route.
-    partial: bool = False
 
 
 class Router:
@@ -76,8 +69,6 @@ class Router:
         self.asked: Asked | None = None
         #: What could not be decided of the route that is being found.
         self._undecided: list[Question] | None = None
-        #: And whether members of its groups were left out, as many others were asked about.
-        self._partial = False
         #: By topic, what parts of the appliance have to say about who publishes to it.
         self.guards: dict[str, list[Guard]] = {}
         #: Grows whenever a cached route may be wrong.
@@ -141,7 +132,7 @@ class Router:
         route = session.routes.get(topic_wire)
         if route is None:
             route = self._find_route(session, topic_wire)
-            if len(topic_wire) <= CACHED_TOPIC and not (route.undecided or route.partial):
+            if len(topic_wire) <= CACHED_TOPIC and not route.undecided:
                 session.routes[topic_wire] = route
                 self._count_cached(_route_size(route, topic_wire))
         return route
@@ -180,11 +171,9 @@ class Router:
             decision = next((verdict for verdict in verdicts if not verdict), decision)
         self._counters.effort += ROUTE_EFFORT
         matches = self._match(topic) if decision else []
-        self._partial = False
         targets, shares = self._targets(session, topic, matches)
-        reason, subscribed = decision.reason, bool(matches)
         return Route(
-            topic, decision.allowed, reason, targets, shares, subscribed, undecided, self._partial
+            topic, decision.allowed, decision.reason, targets, shares, bool(matches), undecided
         )
 
     def _match(self, topic: str) -> list[tuple[Session, Subscription] | Share]:
@@ -254,41 +243,17 @@ class Router:
         return targets, shares
 
     def _members(self, share: Share, topic: str) -> list[Target]:
-        """The members of the group that may receive the topic, as far as that is known.
+        """The members of the group that may receive the topic.
 
-        The rules are asked about so many for one message, and on until one is found who may; about
-        the others for the next ones. Who is refused often keeps no member of another user out.
+        All are asked about, so that no message misses a group of which anybody may have it: what
+        that takes is effort, for which who published waits.
         """
-        asked = walked = 0
-        refused: dict[str | None, int] = {}
-        allowed: list[Target] = []
-        for session, subscription in share.members.items():
-            walked += 1
-            if not self._knows(session, topic):
-                user = None if session.identity is None else session.identity.username
-                if asked >= MEMBERS_ASKED and allowed:
-                    self._partial = True
-                    break
-                if refused.get(user, 0) >= REFUSALS_OF_A_USER:
-                    self._partial = True
-                    continue
-                asked += 1
-                if not self.may_receive(session, topic):
-                    refused[user] = refused.get(user, 0) + 1
-                    continue
-            elif not self.may_receive(session, topic):
-                continue
-            allowed.append(as_target(session, subscription))
-        self._counters.effort += walked + asked
-        return allowed
-
-    def _knows(self, session: Session, topic: str) -> bool:
-        """Whether the rules need not be asked about the session and the topic."""
-        if session.identity is None:
-            return True
-        readable = session.readable
-        is_current = session.readable_epoch == self.access.epoch and len(readable) < CACHED_ROUTES
-        return is_current and topic in readable
+        self._counters.effort += len(share.members)
+        return [
+            as_target(session, subscription)
+            for session, subscription in share.members.items()
+            if self.may_receive(session, topic)
+        ]
 
     def may_receive(self, session: Session, topic: str) -> bool:
         """Whether the rules in force let the session receive the topic's messages."""
@@ -302,6 +267,7 @@ class Router:
             session.readable_epoch = self.access.epoch
         allowed = readable.get(topic)
         if allowed is None:
+            self._counters.effort += 1
             decision = self.decide(session.identity, Action.RECEIVE, topic)
             allowed = decision.allowed
             if len(topic) <= CACHED_TOPIC and not decision.pending:

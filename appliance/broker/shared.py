@@ -13,7 +13,7 @@ from appliance.mqtt.packets import Subscription
 Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
 
 
-#: Members that are looked at for one message.
+#: Members that are looked at for one message, where that is enough to find one for it.
 ASKED = 128
 
 
@@ -46,15 +46,19 @@ class Share:
         """Who of these members gets the message; None when nobody can be given it.
 
         They take turns. A member that would have to queue the message is passed over as long as
-        another can be sent it at once, and an absent one as long as any is there. `may_receive` is
-        asked where the members are not only those that may receive the topic.
+        another can be sent it at once, and an absent one as long as any is there: so many are
+        looked at, and on until one is found. `may_receive` is asked where the members are not only
+        those that may receive the topic; then no more than so many are looked at.
         """
         best: Target | None = None
         best_rank = 0
         best_index = 0
         count = len(members)
-        self.looked = min(count, ASKED)
-        for offset in range(self.looked):
+        self.looked = count
+        for offset in range(count):
+            if offset >= ASKED and (best is not None or may_receive is not None):
+                self.looked = offset
+                break
             index = (self._turn + offset) % count
             session = members[index][0]
             qos = min(message.qos, members[index][1])

@@ -65,12 +65,20 @@ class FakeAccess:
     def __init__(self) -> None:
         self.epoch = 0
         self._denied: set[tuple[str | None, Action, str]] = set()
+        self._reader: str | None = None
 
     def deny(self, user: str | None, action: Action, topic_filter: str) -> None:
         self._denied.add((user, action, topic_filter))
         self.epoch += 1
 
+    def allow_only(self, client_id: str) -> None:
+        """A rule by client id: nobody else may receive anything."""
+        self._reader = client_id
+        self.epoch += 1
+
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        if action is Action.RECEIVE and self._reader not in (None, identity.client_id):
+            return Decision(False, f"only {self._reader} may read")
         for user, denied, topic_filter in self._denied:
             if (user, denied) == (identity.username, action) and matches(topic_filter, topic):
                 return Decision(False, f"{user} {action.value} {topic_filter} is denied")
