@@ -161,6 +161,23 @@ class Explanation:
         return "\n".join(lines)
 
 
+class _Received:
+    """What was decided about clients that are to receive one topic.
+
+    A message may be for thousands, and rules name a client only by a whole level of a topic. So
+    what is decided about one client of a user goes for all others of the user whose ids are no
+    level of the topic, and about one whose id cannot be put in for all of these.
+    """
+
+    __slots__ = ("decisions", "levels", "topic")
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self.levels = frozenset(topic.split("/"))
+        #: By the user, and by whether the id cannot be put in.
+        self.decisions: dict[tuple[str | None, bool], Decision] = {}
+
+
 class Acl:
     """The rules of an ACL file and of those that it includes. It never changes once loaded.
 
@@ -184,6 +201,7 @@ class Acl:
                 own.setdefault(rule.user, []).append(rule)
         self._own = {user: _Group(group) for user, group in own.items()}
         self._patterns = _Group(patterns)
+        self._received = _Received("")
 
     @classmethod
     def load(cls, path: Path, robot: str) -> Acl:
@@ -205,6 +223,26 @@ class Acl:
         A subscription is refused when no message could ever be delivered because of it. Of
         `$share/group/filter` the filter counts.
         """
+        if action is Action.RECEIVE:
+            return self._decide_receive(identity, topic)
+        return self._decide(identity, action, topic)
+
+    def _decide_receive(self, identity: Identity, topic: str) -> Decision:
+        received = self._received
+        if received.topic != topic:
+            received = self._received = _Received(topic)
+        client_id = identity.client_id
+        is_unfit = _is_unfit(client_id)
+        if not is_unfit and client_id in received.levels:  # a rule may name it
+            return self._decide(identity, Action.RECEIVE, topic)
+        who = (identity.username, is_unfit)
+        decision = received.decisions.get(who)
+        if decision is None:
+            decision = self._decide(identity, Action.RECEIVE, topic)
+            received.decisions[who] = decision
+        return decision
+
+    def _decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         shared = parse_shared(topic) if action is Action.SUBSCRIBE else None
         rules = self._applied(identity, shared[1] if shared is not None else topic)
         verdict = self._verdict(identity, action, topic, rules)
@@ -315,10 +353,15 @@ def _substitute(filter: str, identity: Identity) -> str | None:
     for index, level in enumerate(levels):
         if level in names:
             name = names[level]
-            if not name or any(c in name for c in "+#/"):
+            if name is None or _is_unfit(name):
                 return None
             levels[index] = name
     return "/".join(levels)
+
+
+def _is_unfit(name: str) -> bool:
+    """Whether it would change the levels of a filter that it is put into."""
+    return not name or "/" in name or "+" in name or "#" in name
 
 
 def _samples(a: str, b: str, depth: int) -> Iterator[str]:

@@ -497,25 +497,20 @@ NAMES = ["a", "b", "c", "$SYS", ""]
 PERMISSIONS = [Permission.DENY, Permission.READ, Permission.WRITE, Permission.READWRITE]
 
 
-@settings(deadline=None, max_examples=150)
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from(PERMISSIONS),
-            st.lists(st.sampled_from([*NAMES, "+", "%c", "%u"]), min_size=1, max_size=4),
-            st.booleans(),
-            st.sampled_from(["own", "pattern"]),
-        ),
-        min_size=12,
-        max_size=24,
+LINES = st.lists(
+    st.tuples(
+        st.sampled_from(PERMISSIONS),
+        st.lists(st.sampled_from([*NAMES, "+", "%c", "%u"]), min_size=1, max_size=4),
+        st.booleans(),
+        st.sampled_from(["own", "pattern"]),
     ),
-    st.sampled_from([NOBODY, Identity(None, "a"), Identity(None, "a/b"), Identity(None, "$SYS")]),
-    filters(),
+    min_size=12,
+    max_size=24,
 )
-def test_what_is_decided_quickly_is_what_all_rules_say(
-    lines: list[tuple[Permission, list[str], bool, str]], identity: Identity, filter: str
-) -> None:
-    acl = Acl(
+
+
+def acl_with(lines: list[tuple[Permission, list[str], bool, str]]) -> Acl:
+    return Acl(
         "acl.conf",
         [
             Rule("f", number, "", permission, name, None, kind == "pattern")
@@ -523,10 +518,65 @@ def test_what_is_decided_quickly_is_what_all_rules_say(
             if (name := "/".join([*levels, "#"] if open_ended else levels))
         ],
     )
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    LINES,
+    st.sampled_from([NOBODY, Identity(None, "a"), Identity(None, "a/b"), Identity(None, "$SYS")]),
+    filters(),
+)
+def test_what_is_decided_quickly_is_what_all_rules_say(
+    lines: list[tuple[Permission, list[str], bool, str]], identity: Identity, filter: str
+) -> None:
+    acl = acl_with(lines)
     for topic in (filter, filter.replace("+", "a").replace("#", "b"), "$SYS/a", "a/c/d/e/f"):
         for verdict in acl.explain(identity, topic).verdicts:
             decision = acl.decide(identity, verdict.action, topic)
             assert (decision.allowed, decision.reason) == (verdict.allowed, verdict.reason)
+
+
+CLIENTS = [
+    Identity(user, client_id)
+    for user in (None, "a", "b", "a/b", "$SYS")
+    for client_id in ("a", "b", "c", "n", "m", "a/b", "+", "#", "", "$SYS", "$n", "%u", "%c")
+]
+
+
+@settings(deadline=None, max_examples=150)
+@given(LINES, st.permutations(CLIENTS), filters())
+def test_what_is_decided_about_many_clients_is_what_the_rules_say_about_each(
+    lines: list[tuple[Permission, list[str], bool, str]], clients: list[Identity], filter: str
+) -> None:
+    """Whoever was asked about before, and whatever the topic then."""
+    acl = acl_with(lines)
+    for topic in (filter.replace("+", "a").replace("#", "b"), "$SYS/a", "$n", "a/b", "%u/%c"):
+        for identity in clients:
+            decision = acl.decide(identity, Action.RECEIVE, topic)
+            verdict = acl.explain(identity, topic).verdicts[0]
+            assert verdict.action is Action.RECEIVE
+            assert (decision.allowed, decision.reason) == (verdict.allowed, verdict.reason)
+
+
+@pytest.mark.parametrize("name", ["w{}", "w/{}"], ids=["fit", "unfit"])
+def test_the_rules_are_looked_at_once_for_all_clients_of_a_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A message may be for thousands of them, see `Router`: only w7 is named by the topic."""
+    acl = acl_of(tmp_path, "pattern read a/%c/#\npattern read a/%u/#\npattern read b")
+    looks: list[Identity] = []
+    applied = Acl._applied
+    monkeypatch.setattr(
+        Acl, "_applied", lambda acl, *about: (looks.append(about[0]), applied(acl, *about))[1]
+    )
+    may = [
+        identity.client_id
+        for identity in (Identity(user, name.format(n)) for n in range(50) for user in ("x", "y"))
+        if acl.decide(identity, Action.RECEIVE, "a/w7/b")
+    ]
+    is_fit = name == "w{}"
+    assert may == (["w7", "w7"] if is_fit else [])
+    assert len(looks) == (4 if is_fit else 2)
 
 
 def test_an_acl_is_quick_where_it_is_long(tmp_path: Path) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from statistics import median
 from time import thread_time
 
 import pytest
 
+from appliance.access import Acl
 from appliance.broker.broker import Broker
 from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.ports import Action, Decision, Identity, Limits
@@ -255,11 +257,18 @@ def test_who_has_the_rules_asked_about_many_members_waits_for_the_others(
 
 @pytest.mark.timed
 @pytest.mark.parametrize("limits", [Limits(connections=20_000, sessions=20_000)])
-def test_a_message_for_10_000_who_may_not_read_it_holds_nobody_up(join: Join, access: FakeAccess):
+@pytest.mark.parametrize("rules", ["", "pattern read a/%c/#"], ids=["no file", "file"])
+def test_a_message_for_10_000_who_may_not_read_it_holds_nobody_up(
+    join: Join, access: FakeAccess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rules: str
+):
     """In seconds of this thread's CPU for one PUBLISH, of a topic that is kept and of one not."""
     _crowd(join, 10_000)
     access.allow_only("nobody")
+    if rules:
+        (tmp_path / "acl").write_text(f"pattern write #\n{rules}\n")
+        monkeypatch.setattr(access, "decide", Acl.load(tmp_path / "acl", "robot").decide)
     publisher = join("publisher")
+    asked = _count_questions(access)
     for topic in ("a/short", "a/" + 600 * "x"):
         took = []
         for number in range(5):
@@ -267,6 +276,8 @@ def test_a_message_for_10_000_who_may_not_read_it_holds_nobody_up(join: Join, ac
             publisher.send(Publish(f"{topic}/{number}", b"", 0))
             took.append(thread_time() - begun)
             publisher.go_on()
+        assert asked.total() == 50_000
+        asked.clear()
         print(f"{len(topic)} bytes: {[round(each * 1000) for each in took]} ms")
         assert median(took) < 0.25, took
 
