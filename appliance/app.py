@@ -256,8 +256,9 @@ class App:
         task = self._entries.task("app.task", go_on())
 
         async def end() -> None:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            while not task.done():  # up to Python 3.11 `wait_for` may lose a cancellation
+                task.cancel()
+                await asyncio.wait({task}, timeout=1)
 
         self._stack.push_async_callback(end)
 

@@ -17,15 +17,6 @@ ROOT = Path(__file__).parents[1]
 #: The tests of what is compiled, as far as they run in their own process.
 TESTS = ["tests/broker", "tests/mqtt", "tests/test_tls.py", "tests/test_websocket.py"]
 
-#: They put something of their own into a class or in its place, which a compiled one refuses.
-PATCHING = [
-    "tests/broker/test_client.py::test_a_packet_cut_in_two_is_as_old_as_its_first_byte",
-    "tests/broker/test_effort.py::test_to_leave_many_groups_takes_one_look_at_what_waits",
-    "tests/broker/test_faults.py::test_an_end_comes_to_its_end",
-    "tests/broker/test_faults.py::test_an_ended_session_is_no_member_of_its_group",
-    "tests/broker/test_faults.py::test_a_fault_at_the_end_of_a_login_leaves_nobody_connected",
-]
-
 #: Prints where two of the compiled modules come from.
 WHERE = "from appliance import wire; from appliance.broker import client; print(wire, client)"
 
@@ -65,8 +56,8 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     pytest_command = Path(sys.executable).with_name("pytest")  # `-m pytest` would import from here
     run = subprocess.run(
         [
-            *(str(pytest_command), "-q", "-x", "-p", "no:cacheprovider", *TESTS),
-            *(f"--deselect={test}" for test in PATCHING),
+            *(str(pytest_command), "-q", "-x", "-p", "no:cacheprovider"),
+            *("-m", "not patches", *TESTS),
         ],
         env=environment,
         cwd=ROOT,

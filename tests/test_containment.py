@@ -94,12 +94,14 @@ class Actor:
         self.losses = 0
 
     async def run(self) -> None:
-        while True:
+        # Not until it is cancelled alone: up to Python 3.11 `wait_for` loses a cancellation that
+        # comes with the result or the error of what it waits for.
+        while not self.site.is_over:
             try:
                 caller = await self.site.join(self.name, self.kind, keep_alive=self.keep_alive)
                 try:
                     await asyncio.wait_for(self.begin(caller), STEP)
-                    while True:
+                    while not self.site.is_over:
                         await asyncio.wait_for(self.step(caller), STEP)
                         self.done += 1
                 finally:
@@ -126,6 +128,7 @@ class Pinger(Actor):
     """A message to itself, and back."""
 
     payload = b"x"
+    pause = 0.01
 
     async def begin(self, caller: Caller) -> None:
         await caller.say(Subscribe(1, [Subscription(f"load/{self.name}", 1)]))
@@ -135,13 +138,14 @@ class Pinger(Actor):
         await caller.say(Publish(f"load/{self.name}", self.payload, 1, packet_id=7))
         back = await self.wait_for(caller, Publish)
         await caller.say(Puback(back.packet_id, 0))
-        await asyncio.sleep(0.01)
+        await asyncio.sleep(self.pause)
 
 
 class Large(Pinger):
     """The same, with a message that takes several turns."""
 
     payload = LARGE
+    pause = 0.1
 
 
 class Subscriber(Actor):
@@ -153,7 +157,7 @@ class Subscriber(Actor):
         assert len((await self.wait_for(caller, Suback)).reason_codes) == 300
         await caller.say(Unsubscribe(2, names))
         await self.wait_for(caller, Unsuback)
-        await asyncio.sleep(0.02)
+        await asyncio.sleep(0.1)
 
 
 class Willing(Actor):
@@ -221,6 +225,7 @@ class Site:
         self.hands: list[Caller] = []
         self.victims = 0
         self.readers: list[asyncio.Task[None]] = []
+        self.is_over = False
         self.stack = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
@@ -271,6 +276,10 @@ class Site:
                 task = loop.create_task(actor.run())
                 self.stack.callback(task.cancel)
                 await asyncio.sleep(0.1)  # not all at once
+        self.stack.callback(self._end)
+
+    def _end(self) -> None:
+        self.is_over = True
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         from ros.call_house import AllTypes

@@ -447,7 +447,9 @@ class Broker:
             effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
         self.counters.effort += effort
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
-        faults.run("end.clear", session.clear, otherwise=None)
+        for _ in range(2):  # as `_leave`: nobody gives back later what it holds
+            if faults.run("end.clear", self._cleared, session, otherwise=False):
+                break
         faults.run("end.store", self.store.session_removed, session, otherwise=None)
 
     def _leave(self, session: Session, topic_filter: str) -> None:
@@ -458,6 +460,10 @@ class Broker:
         for _ in range(2):
             if self.faults.run("leave", self._left, session, topic_filter, otherwise=False):
                 return
+
+    def _cleared(self, session: Session) -> bool:
+        session.clear()
+        return True
 
     def _left(self, session: Session, topic_filter: str) -> bool:
         self.router.leave(session, topic_filter)

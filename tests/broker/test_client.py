@@ -829,6 +829,7 @@ def test_an_absent_client_without_room_is_no_reason_to_refuse_what_others_take(
     assert publisher.publish("a", b"4", 2) == 0x97
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("waits", [False, True])
 def test_a_packet_cut_in_two_is_as_old_as_its_first_byte(
     broker: Broker, monkeypatch: pytest.MonkeyPatch, waits: bool

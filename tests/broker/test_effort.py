@@ -93,6 +93,7 @@ def test_what_a_member_leaves_is_offered_to_few_of_many(
     assert len(heard) == count
 
 
+@pytest.mark.patches
 def test_to_leave_many_groups_takes_one_look_at_what_waits(
     join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ):

@@ -411,6 +411,7 @@ PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
 ]
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("others", [0, 1])
 def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, escaped, others):
     """Whatever fails: what the group has goes to who is there, and not to it again."""
@@ -448,6 +449,7 @@ def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, 
     escaped.clear()
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("expiry", [0, 60])
 @pytest.mark.parametrize("leaves", [False, True], ids=["lost", "disconnects"])
 @pytest.mark.parametrize(("whose", "name"), PARTS, ids=[name for _, name in PARTS])
@@ -494,6 +496,7 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
     escaped.clear()
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("done", [False, True], ids=["before", "behind"])
 @pytest.mark.parametrize("topic_filter", ["t", "$share/g/t"])
 @pytest.mark.parametrize("what", ["join", "leave"])
@@ -539,6 +542,33 @@ def test_a_subscription_is_there_or_it_is_not(
     escaped.clear()
 
 
+@pytest.mark.patches
+@pytest.mark.parametrize("done", [False, True], ids=["before", "behind"])
+def test_what_an_ended_session_held_is_given_back(broker, other, monkeypatch, escaped, done):
+    keeps = {Property.SESSION_EXPIRY_INTERVAL: 60}
+    peer = join(broker, "a", properties=keeps)
+    peer.subscribe("t", 1)
+    session = peer.client.session
+    peer.lose()
+    other.publish("t", bytes(1000), 1)
+    assert session.bytes > 1000
+    own, calls = Session.clear, []
+
+    def fails_once(self: Session) -> None:
+        calls.append(self)
+        if done or len(calls) > 1:
+            own(self)
+        if len(calls) == 1:
+            fail()
+
+    monkeypatch.setattr(Session, "clear", fails_once)
+    join(broker, "a", clean=True)
+    assert calls == [session, session] and not session.bytes
+    check_accounts(broker)
+    escaped.clear()
+
+
+@pytest.mark.patches
 @pytest.mark.parametrize("present", [False, True])
 @pytest.mark.parametrize("name", ["session_saved", "reconnected", "set_will", "open", "accept"])
 def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
