@@ -164,11 +164,12 @@ class Arrivals:
             # Known by a route with a longer `oldest` only: for this one it begins.
             gap = pace.gap if is_same else now - pace.last
             verdict = self._begin(origin, oldest, now)
-            if gap < self.waiting_time(origin, oldest):
-                began = self._paces[origin]
+            began = self._paces[origin]
+            began.was_held = _is_held(origin, oldest)
+            if began.was_held or gap < self.waiting_time(origin, oldest):
                 began.is_queue, began.is_waiting = True, False
                 verdict = Verdict.REFUSE
-        elif pace is not None and is_same:
+        elif pace is not None and is_same and self._is_for_all(pace, origin, oldest):
             return pace.verdict
         else:
             verdict = self._judge(pace, origin, qos, oldest, now)
@@ -177,6 +178,10 @@ class Arrivals:
         if verdict is Verdict.REFUSE:
             self._drop(pace, origin, self.why(origin))
         return verdict
+
+    def _is_for_all(self, pace: _Pace, origin: Session, oldest: float) -> bool:
+        """Whether the verdict holds for a route with that `oldest`, too."""
+        return pace.verdict is Verdict.REFUSE or not _is_held(origin, oldest)
 
     def why(self, origin: Session) -> str:
         """Why its command was refused that was judged last."""
@@ -187,7 +192,7 @@ class Arrivals:
         self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
     ) -> Verdict:
         was_held = pace is not None and pace.was_held
-        is_held = _contact(origin).held > oldest
+        is_held = _is_held(origin, oldest)
         if pace is None or now - pace.last > oldest or (is_held and not was_held):
             verdict = self._begin(origin, oldest, now)
             pace = self._paces[origin]
@@ -259,8 +264,15 @@ class Arrivals:
         """A command of QoS 2 has come that is not released yet: only now its pace can be told, and
         whether it was held in here. The number is its own, once for all its routes."""
         coming = self._coming.get(origin)
-        if coming is not None and coming.number == number >= 0:
-            return
+        if coming is None or not coming.number == number >= 0:
+            self._come(coming, origin, oldest, now)
+            self._coming[origin].number = number
+        if _is_held(origin, oldest):  # also where it is the first of its connection
+            pace = self._paces.get(origin)
+            is_known = pace is not None and pace.longest <= oldest
+            self._judge(pace if is_known else None, origin, 2, oldest, now)
+
+    def _come(self, coming: _Pace | None, origin: Session, oldest: float, now: float) -> None:
         if coming is None or max(now - coming.last, coming.longest) > oldest:
             # For a route with a longer `oldest` it may have gone on.
             self._coming[origin] = _Pace(now)
@@ -269,16 +281,12 @@ class Arrivals:
             coming.longest = max(coming.longest, gap)
             if coming.steady < STEADY or gap < BURST:
                 self._time(coming, origin, 2, gap, now)
-        self._coming[origin].number = number
         pace = self._paces.get(origin)
-        if pace is None:
-            return
-        if pace.is_waiting:  # its release may be withheld for longer than the first one waits
+        if pace is not None and pace.is_waiting:
+            # Its release may be withheld for longer than the first one waits.
             pace.is_queue, pace.is_waiting = True, False
             begins = self._coming[origin].steady > 0 and now - pace.last < WITHHELD
             self._drop(pace, origin, BEGINS if begins else QUEUED)
-        if _contact(origin).held > oldest:
-            self._judge(pace, origin, 2, oldest, now)
 
     def is_old(self, origin: Session, now: float) -> None:
         """A command has come that is known to be old: the next ones were queued behind it."""
@@ -318,6 +326,11 @@ class Arrivals:
 
 def _contact(origin: Session) -> Contact:
     return HERE if origin.link is None else origin.link.contact()
+
+
+def _is_held(origin: Session, oldest: float) -> bool:
+    """Whether what it sends now may have been in here for too long, before it was read."""
+    return _contact(origin).held > oldest
 
 
 def said_age(properties: Properties | None, now: float) -> float | None:

@@ -89,6 +89,11 @@ class _Command:
     #: Whether what it says of its age is wrong, and `why` says so.
     is_wrong: bool = False
 
+    @property
+    def is_to_come(self) -> bool:
+        """Whether it is to be carried out, though its client has left."""
+        return self.has_left and not self.why and self.verdict is Verdict.CARRY_OUT
+
 
 class _Stop:
     """The stop message of a route, for one type."""
@@ -363,16 +368,22 @@ class Commands(ToRos):
             self.counters.refused += 1
         else:
             self._finish(command)
-            is_away = origin is not None and origin.link is None
-            if command.has_left and is_away and origin is self._source:
-                self._source = None
-                if self._is_driven:
-                    self._stop_now(f"{origin} has left")
+        if command.has_left and origin is not None and origin.link is None:
+            self._stop_behind(origin)
         self._settle(origin)
+
+    def _stop_behind(self, origin: Session) -> None:
+        """Its connection has ended: the robot is stopped behind the last of its commands."""
+        queue = self._queued.get(origin, ())
+        if origin is not self._source or any(one.is_to_come for one in queue):
+            return
+        self._source = None
+        if self._is_driven:
+            self._stop_now(f"{origin} has left")
 
     def _why_late(self, command: _Command) -> str:
         """Why a command that was new has become too old in the queue; empty when it has not."""
-        if self._lease.is_overtaken(command.number):
+        if self._lease.is_overtaken(command.number, command.origin):
             return OVERTAKEN
         oldest = self.rules.oldest
         waited = self._around.entries.time() - command.at
@@ -434,7 +445,7 @@ class Commands(ToRos):
     def _carry_out(
         self, message: Message, cdr: bytes, origin: Session | None, number: int
     ) -> Objection | None:
-        objection = self._publish(cdr, message, number)
+        objection = self._publish(cdr, message, origin, number)
         if objection is None:
             self._commanded(cdr, origin)
         return objection
@@ -567,7 +578,7 @@ class Commands(ToRos):
         waiting = self._wait_no_longer(origin)
         if waiting is None:
             return
-        if self._lease.is_overtaken(waiting.number):
+        if self._lease.is_overtaken(waiting.number, origin):
             self._count_expired(OVERTAKEN, origin)
         elif self.decide(origin):
             self._carry_out(waiting.message, waiting.cdr, origin, waiting.number)
@@ -670,10 +681,7 @@ class Commands(ToRos):
         self._asked.pop(session, None)
         if self.rules.exclusive and session is self._lease.holder:
             self._release("has left")
-        if session is self._source:
-            self._source = None
-            if self._is_driven:
-                self._stop_now(f"{session} has left")
+        self._stop_behind(session)
         driven = self._drivers.pop(session, None)
         if driven is not None and not self._is_stop(driven[0]):
             # Its library may have queued what it commanded since, and marks none of it as old.
@@ -790,7 +798,7 @@ class Commands(ToRos):
         awaited, self._awaited = self._awaited, None
         if awaited is None:
             return
-        if self._lease.is_overtaken(awaited):
+        if self._lease.is_overtaken(awaited, None):
             self._count_expired(OVERTAKEN, None)
             return
         # What is retained now: it may have been replaced, or taken back.

@@ -145,12 +145,12 @@ class ToRos(Flow):
         """
         if retain:
             return None
-        if self._lease.is_overtaken(number):  # while it waited for its turn
+        if self._lease.is_overtaken(number, origin):  # while it waited for its turn
             self.counters.expired += 1
             self._tell_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
             return None
         cdr = self._convert(message, origin)
-        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message, number)
+        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message, origin, number)
 
     def _convert(self, message: Message, origin: Session | None) -> bytes | Objection:
         """The message's CDR, or what is wrong with it, which is told."""
@@ -167,7 +167,9 @@ class ToRos(Flow):
             problem = f"cannot be converted: {error}"
             return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
 
-    def _publish(self, cdr: bytes, message: Message, number: int) -> Objection | None:
+    def _publish(
+        self, cdr: bytes, message: Message, origin: Session | None, number: int
+    ) -> Objection | None:
         """Publish on ROS what the message was converted to; returns why that failed."""
         out = self._out
         if out is None:
@@ -179,7 +181,7 @@ class ToRos(Flow):
         except BusError as error:
             return self._object(message, f"could not be published: {error}")
         finally:  # who says stop is not driven on, also when ROS does not take it
-            self._lease.said(cdr, number)
+            self._lease.said(cdr, number, origin, self._around.entries.time())
         self.counters.messages += 1
         self.counters.bytes += len(message.payload)
         return None

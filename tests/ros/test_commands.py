@@ -30,7 +30,7 @@ from appliance.mqtt.packets import (
     Will,
     decode_packet,
 )
-from appliance.ros import commands
+from appliance.ros import commands, lease
 from appliance.ros.arrivals import EXPECTED, STEADY, WAIT, WITHHELD, Arrivals, Verdict, sent_at
 from appliance.ros.backlog import Backlog
 from appliance.ros.bridge import RouteSettings
@@ -38,6 +38,7 @@ from appliance.ros.calls import Answer, CallCounters, Offer
 from appliance.ros.careful import ConversionError
 from appliance.ros.commands import Commands
 from appliance.ros.convert import Converter
+from appliance.ros.lease import REPEATED
 from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProfile
 from appliance.ros.payloads import ZSTD_MAGIC
 from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
@@ -2462,3 +2463,231 @@ def test_the_pace_of_qos_2_of_a_long_expire_is_not_that_of_a_short_one(lights):
         sender.say(0.05 + withheld, "old")
     sender.rest(1)
     assert sender.moved == []
+
+
+class Stick:
+    """A client that repeats its stop, as a joystick does that nobody touches."""
+
+    def __init__(self, house, name):
+        self.driver = Driver(house.broker, name)
+
+    def say(self, times=1):
+        for _ in range(times):
+            self.driver.drive(b"{}")
+
+
+@pytest.mark.parametrize("sticks", [1, 2])
+@pytest.mark.parametrize("size", [0, 20_000])
+async def test_an_idle_stick_overtakes_no_command_of_others(house, size, sticks):
+    house.start(RULES)
+    idle = [Stick(house, f"stick {number}") for number in range(sticks)]
+    for one in idle:
+        one.say(REPEATED)
+    for number in range(3):
+        driver = Driver(house.broker, f"driver {number}")
+        await until(lambda: not house.bridge._turns.is_busy)
+        if size:
+            make_busy(house)
+            for one in idle:  # what moved the robot came before
+                one.say()
+        house.robot.received.clear()
+        driver.drive(large(0.5, size), qos=1)
+        assert (driver.code, twist(0.5) in house.robot.received) == (0, False)
+        for one in idle:
+            one.say(2)
+        await until(lambda: twist(0.5) in house.robot.received)
+        for one in idle:  # it does not lock either way: the robot is stopped again
+            one.say()
+        assert house.robot.received[-1] == STOP
+    assert house.counters().expired == 0
+
+
+async def test_an_idle_stick_overtakes_its_own_commands(house):
+    house.start(RULES)
+    stick = Stick(house, "stick")
+    stick.say(REPEATED)
+    make_busy(house)
+    stick.say()
+    stick.driver.steer(large(0.5))
+    stick.driver.steer(large(0.6))
+    house.robot.received.clear()
+    stick.say()
+    await until(lambda: house.counters().expired == 2)
+    assert house.robot.received == [STOP]
+
+
+@pytest.mark.parametrize("before", ["nothing", "a pause", "a few", "a command", "movement"])
+async def test_a_stop_that_is_not_only_repeated_overtakes(house, monkeypatch, before):
+    """Also where the robot stands, and a stick says so all the time."""
+    house.start(RULES)
+    idle, stopper = Stick(house, "stick"), Stick(house, "emergency stop")
+    other, driver = Driver(house.broker, "other"), Driver(house.broker, "driver")
+    idle.say(REPEATED)
+    if before == "a pause":
+        stopper.say(REPEATED)
+        with monkeypatch.context() as patch:
+            patch.setattr(lease, "WITHIN", -1.0)
+            stopper.say()
+    elif before == "a few":
+        stopper.say(REPEATED - 2)
+    elif before == "a command":
+        stopper.say(REPEATED)
+        stopper.driver.steer()
+        idle.say()
+    elif before == "movement":
+        stopper.say(REPEATED)
+    driver.drive()
+    if before == "movement":
+        other.steer(b'{"linear":{"x":0.7}}')
+    else:
+        idle.say()
+    house.robot.received.clear()
+    stopper.say()
+    await until(lambda: house.counters().expired == 1)
+    assert house.robot.received == [STOP]
+
+
+def test_what_is_known_of_stops_is_bounded(monkeypatch):
+    monkeypatch.setattr(lease, "CLIENTS", 2)
+    shared = lease.Lease("/cmd_vel")
+    shared.join(AnyStops())
+    clients = [Sender(client_id=name) for name in "abc"]
+    number = 0
+    for client in clients:
+        for _ in range(REPEATED + 1):
+            number += 1
+            shared.said(STOP, number, client, 0.0)
+    assert len(shared._stops) == 2
+    # What is forgotten has overtaken what came before it all the same.
+    assert shared.is_overtaken(REPEATED, clients[0])
+    assert not shared.is_overtaken(number, clients[2])
+    assert shared.is_overtaken(number - 1, clients[2])
+
+
+class AnyStops:
+    """A route that takes all for a stop."""
+
+    is_exclusive = False
+
+    def watch(self):
+        """It has nothing to look at."""
+
+    def stops(self, cdr):
+        return True
+
+
+async def test_who_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(house):
+    house.start(RULES)
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    for x in (0.1, 0.2, 0.3):
+        driver.steer(large(x))
+    driver.leave()
+    await until(lambda: STOP in house.robot.received)
+    assert house.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
+    assert house.counters().expired == 0
+
+
+async def test_who_drove_and_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(house):
+    house.start(RULES)
+    driver = Driver(house.broker, "a")
+    driver.steer(large(0.1))
+    for x in (0.2, 0.3):
+        driver.steer(large(x))
+    driver.leave()
+    await until(lambda: STOP in house.robot.received)
+    assert house.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
+
+
+@pytest.mark.parametrize("way", ["leave", "cut"])
+async def test_who_drove_and_is_gone_is_followed_by_the_stop_at_once(house, way):
+    """Where nothing of its queue is carried out, nothing is waited for."""
+    house.start(RULES)
+    driver = Driver(house.broker, "a")
+    driver.steer(large(0.1))
+    driver.drive(large(0.2, 5000), properties=made(0 if way == "cut" else 60))
+    getattr(driver, way)()
+    assert house.robot.received == [twist(0.1), STOP]
+
+
+@pytest.mark.parametrize("last", ["old", "wrong"])
+async def test_who_leaves_is_followed_by_a_stop_though_its_last_is_not_carried_out(house, last):
+    house.start(RULES)
+    make_busy(house)
+    driver = Driver(house.broker, "a")
+    driver.steer(large(0.1))
+    if last == "old":
+        driver.steer(large(0.2), properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
+        (queue,) = house.commands._queued.values()
+        queue[-1].message.expires_at = -math.inf
+    else:
+        driver.steer(b"[]" + b" " * 20_000)
+    driver.leave()
+    await until(lambda: STOP in house.robot.received)
+    assert house.robot.received == [twist(0.1), STOP]
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_the_first_command_of_a_connection_that_was_not_read_for_a_time(house, qos):
+    house.start(CommandRules(expire=0.5))
+    driver = Driver(house.broker, "a")
+    driver.wire.connection = Contact(held=1.2)
+    driver.say(Publish(TOPIC, GO, qos=qos, packet_id=7 if qos else None))
+    driver.wire.connection = Contact()
+    if qos == 2:
+        driver.say(Pubrel(7))
+    await until(lambda: house.counters().expired == 1)
+    await asyncio.sleep(0.3)  # longer than a first command waits
+    assert house.robot.received == []
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_what_was_held_is_old_also_for_the_route_with_the_shorter_expire(qos):
+    """A client that switches lights each 1.2 s, then nothing it sends is read for a time."""
+    sender = Sender(qos)
+    lights = 10.0
+    for _ in range(4):
+        sender.now += 1.2
+        sender.arrivals.judge(sender, qos, lights, sender.now)
+    sender.link.held = 3.0
+    sender.now += 0.4
+    if qos == 2:
+        sender.arrivals.look(sender, sender.OLDEST, sender.now, 1)
+        sender.link.held = 0.0
+        sender.now += 0.2  # until its PUBREL
+    verdict = sender.arrivals.judge(sender, qos, sender.OLDEST, sender.now, 1)
+    assert verdict is Verdict.REFUSE
+
+
+@pytest.mark.parametrize("first", ["the lights", "the robot"])
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_what_was_held_is_old_for_one_of_two_routes(qos, first):
+    """One message that two routes take, of which one has a long `expire`."""
+    sender = Sender(qos)
+    order = [10.0, sender.OLDEST][:: 1 if first == "the lights" else -1]
+    sender.link.held = 3.0
+    if qos == 2:
+        for oldest in order:
+            sender.arrivals.look(sender, oldest, sender.now, 1)
+        sender.link.held = 0.0
+        sender.now += 0.05
+    verdicts = {
+        oldest: sender.arrivals.judge(sender, qos, oldest, sender.now, 1) for oldest in order
+    }
+    assert verdicts[sender.OLDEST] is Verdict.REFUSE
+
+
+def test_a_qos_2_command_that_was_held_behind_others_that_were():
+    """It is old for a route with a short `expire` also when its PUBREL was not held any more."""
+    sender = Sender(2)
+    lights = 2.0
+    sender.link.held = 3.0
+    for _ in range(3):
+        sender.now += 1.2
+        sender.arrivals.judge(sender, 0, lights, sender.now)
+    sender.now += 0.4
+    sender.arrivals.look(sender, sender.OLDEST, sender.now, 1)
+    sender.link.held = 0.0
+    sender.now += 0.2
+    verdict = sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, 1)
+    assert verdict is Verdict.REFUSE
