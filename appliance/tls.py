@@ -127,6 +127,7 @@ class TlsTransport:
         self._ended = False  # nothing more is to be read
         self._hung_up = False  # nothing more arrives
         self._cut = True  # OpenSSL may have the beginning of a record
+        self._has_told_cut = False
         self._error: Exception | None = None
         self._deadline: asyncio.TimerHandle | None = None
 
@@ -197,6 +198,9 @@ class TlsTransport:
             self._turns.count(RECORD_EFFORT * len(parts), cast(Charged, self._protocol))
         if parts:
             self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
+        if self._cut or self._has_told_cut:  # each time: what was told is over with what came
+            self._has_told_cut = self._cut
+            cast(Charged, self._protocol).has_part(self._cut)
         if self._waits and not self._ended:
             self._wait()
         elif self._ended or self._outgoing.pending:
@@ -236,6 +240,7 @@ class TlsTransport:
         if not self._open:
             return
         self._tcp.pause_reading()
+        cast(Charged, self._protocol).is_not_read()
         if self._reading and not self._queued:
             self._queued = True
             self._turns.queue_turn(self)
@@ -254,6 +259,7 @@ class TlsTransport:
             self._ended = True
             self._react()
         elif self._reading:
+            cast(Charged, self._protocol).is_read()
             self._tcp.resume_reading()
 
     def _react(self) -> None:

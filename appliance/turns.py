@@ -28,6 +28,15 @@ class Charged(Protocol):
     def set_apart(self, size: int) -> None:
         """The layers below keep so many bytes that were received and not taken apart yet."""
 
+    def is_not_read(self) -> None:
+        """What has come waits below for a turn, and nothing more is read."""
+
+    def is_read(self) -> None:
+        """It waits no longer."""
+
+    def has_part(self, part: bool) -> None:
+        """Whether a layer below keeps the beginning of a record that has not come whole."""
+
 
 class Turns(Protocol):
     """What all connections share: who has much to do waits until others have had their turn."""

@@ -158,6 +158,18 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._below = size
         self._protocol.set_apart(size + self._set_apart)
 
+    def is_not_read(self) -> None:
+        """What has come waits in TLS."""
+        self._protocol.is_not_read()
+
+    def is_read(self) -> None:
+        """It waits there no longer."""
+        self._protocol.is_read()
+
+    def has_part(self, part: bool) -> None:
+        """Whether TLS keeps the beginning of a record."""
+        self._protocol.has_part(part)
+
     def _take(self) -> None:
         """Take apart what is there, until others have their turn; reading is paused then."""
         self._frames_left = FRAMES_A_TURN
@@ -175,6 +187,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def _take_later(self) -> None:
         """Let the others have their turn first."""
         self._transport.pause_reading()
+        self._protocol.is_not_read()
         if not self._queued:
             self._queued = True
             self._turns.queue_turn(self)
@@ -189,6 +202,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if self._frames.close_rcvd is not None:
             self._transport.close()
         elif not (self._held or self._queued):
+            self._protocol.is_read()
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:

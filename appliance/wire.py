@@ -102,6 +102,7 @@ class ClientProtocol:
         self._held = _NOTHING
         self._held_size = 0  # bytes of the chunk that it is the rest of, in the ledger
         self._frame = 0  # bytes of a WebSocket frame that is not complete
+        self._is_record_cut = False  # the same of TLS
         self._below = 0  # bytes that TLS and WebSocket have not taken apart
         self._sends_on = False  # the client has more to do, and wants its turn
         self._turn_over = False
@@ -110,6 +111,7 @@ class ClientProtocol:
         self._turned_at = 0.0
         self._resting: asyncio.TimerHandle | None = None
         self._looks: asyncio.TimerHandle | None = None  # whether it has caught up
+        self._looks_at = 0.0
         self._choked = False
         self._logging_in = False
         self._who: Identity | Refusal | None = None  # what came of it, not told yet
@@ -451,7 +453,7 @@ class ClientProtocol:
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
-            self._client.inflow.not_read(self._loop.time())
+            self.is_not_read()
             self._transport.pause_reading()
 
     def _read_on(self) -> None:
@@ -476,11 +478,19 @@ class ClientProtocol:
             self._take_portion(portion)
             self._read_later()
         else:
-            inflow = self._client.inflow
-            inflow.read(self._loop.time())
-            if inflow.is_behind:
-                self._see_whether_caught_up()
+            self.is_read()
             self._transport.resume_reading()
+
+    def is_not_read(self) -> None:
+        """What has come waits: here, or in a layer below that has told so."""
+        self._client.inflow.not_read(self._loop.time())
+
+    def is_read(self) -> None:
+        """It waits no longer."""
+        inflow = self._client.inflow
+        inflow.read(self._loop.time())
+        if inflow.is_behind:
+            self._see_whether_caught_up()
 
     def _see_whether_caught_up(self) -> None:
         """Look whether all is read of what the client has said while it was not, now and later."""
@@ -491,14 +501,18 @@ class ClientProtocol:
             known = known._replace(unread=True)
         inflow = self._client.inflow
         seconds = inflow.look(self._loop.time(), **known._asdict())
-        if seconds and inflow.is_watched:  # else nobody has asked
+        if seconds:
             self._look_after(seconds)
 
     def _look_after(self, seconds: float) -> None:
-        if self._looks is None:
-            self._looks = self._entries.later(
-                "connection.look", seconds, self._look_again, served=self
-            )
+        """Look again, then or before."""
+        looks_at = self._loop.time() + seconds
+        if self._looks is not None:
+            if self._looks_at <= looks_at:
+                return
+            self._looks.cancel()
+        self._looks_at = looks_at
+        self._looks = self._entries.later("connection.look", seconds, self._look_again, served=self)
 
     def _look_again(self) -> None:
         self._looks = None
@@ -548,11 +562,8 @@ class ClientProtocol:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""
         ledger = self._ledger
         grown = size - self._frame
-        inflow, connection = self._client.inflow, self._client.connection
-        if size and not inflow.unfinished:
-            inflow.unfinished = self._loop.time()
-        elif not size and self._frame and not (connection.unfinished or connection.paused):
-            inflow.unfinished = 0.0  # what the frame held is done, or it was a ping
+        if size or self._frame:
+            self._note_part(size > 0 or self._is_record_cut)
         self._frame = size
         ledger.take(self.account, grown)
         if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
@@ -562,6 +573,19 @@ class ClientProtocol:
             )
             self._client.fail(ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason))
             self._broker.flush()
+
+    def has_part(self, part: bool) -> None:
+        """Whether TLS keeps the beginning of a record."""
+        self._is_record_cut = part
+        self._note_part(part or self._frame > 0)
+
+    def _note_part(self, is_kept: bool) -> None:
+        """Know since when the beginning of something is kept below: what it holds is as old."""
+        inflow, connection = self._client.inflow, self._client.connection
+        if is_kept:
+            inflow.unfinished = inflow.unfinished or self._loop.time()
+        elif not (connection.unfinished or connection.paused or self._held):
+            inflow.unfinished = 0.0  # what it held is done, or it was a ping
 
     # --- bytes out -----------------------------------------------------------------------------
 

@@ -247,3 +247,46 @@ async def test_what_a_far_client_kept_back_is_not_new(house, monkeypatch, websoc
     say(Publish("x", b"new").encode(5))
     await until(lambda: len(held) == 701)
     assert held[-1] == 0
+
+
+async def test_who_streams_on_is_new_again_after_a_pause(house):
+    """What it had kept back comes faster than what it says from then on."""
+    caller = await house.join("a")
+    wire, held = house.protocol("a"), []
+    Watches(house, lambda _: held.append(wire.contact().held))
+    chunk = Publish("x", bytes(3000)).encode(5)
+
+    async def stream():
+        while True:
+            caller.writer.write(chunk)
+            await asyncio.sleep(0.004)
+
+    streaming = asyncio.create_task(stream())
+    try:
+        await until(lambda: len(held) > 50)
+        wire._rest(0.6)
+        await until(lambda: held[-1] >= 0.6)
+        await until(lambda: held[-1] == 0, "that it has caught up, while it streams")
+    finally:
+        streaming.cancel()
+
+
+async def test_what_comes_long_behind_a_slow_login_is_new(house):
+    """Nobody asks before."""
+    house.gate.clear()
+    caller = await house.dial()
+    await caller.say(Connect("a"))
+    await until(lambda: any(wire._logging_in for wire in house.network.open))
+    (wire,) = house.network.open
+    await caller.say(Subscribe(1, [Subscription("y")]))
+    await until(lambda: inbox(wire._transport.get_extra_info("socket")).unread)
+    await asyncio.sleep(0.1)
+    house.gate.set()
+    await caller.hear()
+    await caller.hear()
+    held = []
+    await until(lambda: not wire._client.inflow.is_behind, "a look by itself")
+    Watches(house, lambda _: held.append(wire.contact().held))
+    await caller.say(Publish("x", b""))
+    await until(lambda: held)
+    assert held == [0]

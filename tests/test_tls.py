@@ -120,6 +120,15 @@ class Served(asyncio.Protocol):
     def set_apart(self, size):
         self.set_aside = size
 
+    def is_not_read(self):
+        pass
+
+    def is_read(self):
+        pass
+
+    def has_part(self, part):
+        pass
+
     def connection_made(self, transport):
         self.transport = transport
         self.heard.append("made")

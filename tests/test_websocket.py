@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import itertools
 import random
+import ssl
 import threading
+import time
 import tracemalloc
 from collections.abc import AsyncIterator, Iterable
 from typing import Any, cast
@@ -762,20 +764,120 @@ async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls,
     assert late and held[-len(late) :] == late  # and none behind them is taken for new
 
 
-async def test_a_frame_in_two_segments_is_as_old_as_the_first(house: House):
-    """Not as the last look at the clock, which may be a second ago."""
+class Busy:
+    """Somebody who has much to do, for so many turns: each takes a round's effort."""
+
+    def __init__(self, house: House, turns: int) -> None:
+        self.house = house
+        self.left = turns
+        house.network.queue_turn(self)
+
+    def take_turn(self) -> None:
+        time.sleep(0.006)
+        self.house.broker.counters.effort += EFFORT_A_ROUND + 1
+        self.left -= 1
+        if self.left > 0:
+            self.house.network.queue_turn(self)
+
+    def fault(self, entry: str, error: Exception) -> None:
+        raise error
+
+
+@pytest.mark.parametrize("size", [2, 17_000])
+@pytest.mark.parametrize("busy", [False, True])
+async def test_a_frame_in_two_segments_is_as_old_as_the_first(house: House, busy, size):
+    """Not as the last look at the clock, which may be a second ago; also when it has to wait."""
     caller = await open_by_hand(house)
     wire, loop = house.protocol("a"), asyncio.get_running_loop()
     ages: list[float] = []
     Watches(house, lambda message: ages.append(message.age))
-    command = frame(Publish("x", b"go").encode(5))
+    command = frame(Publish("x", bytes(size)).encode(5))
     begun = loop.time()
     house.broker.ledger.now = begun - 60
-    await caller.say(command[:5])
+    await caller.say(command[: len(command) // 2])
     await until(lambda: wire._frame)
-    await caller.say(command[5:])
+    noticed = loop.time()
+    await asyncio.sleep(0.3)
+    least = loop.time() - noticed
+    if busy:
+        Busy(house, 20)
+    await caller.say(command[len(command) // 2 :])
     await until(lambda: ages)
-    assert ages[0] <= loop.time() - begun
+    assert least <= ages[0] <= loop.time() - begun
+
+
+@pytest.mark.parametrize("in_frames", [False, True])
+async def test_a_record_in_two_segments_is_as_old_as_the_first(house: House, in_frames):
+    await house.start()
+    loop = asyncio.get_running_loop()
+    reader, writer = await asyncio.open_connection(*house.ports[3 if in_frames else 1][:2])
+    coming, going = ssl.MemoryBIO(), ssl.MemoryBIO()
+    sealed = house.client_context.wrap_bio(coming, going, server_hostname="localhost")
+    while True:
+        try:
+            sealed.do_handshake()
+            break
+        except ssl.SSLWantReadError:
+            writer.write(going.read())
+            coming.write(await asyncio.wait_for(reader.read(65536), PATIENCE))
+    if in_frames:
+        sealed.write(REQUEST)
+    connect = Connect("a").encode(5)
+    sealed.write(frame(connect) if in_frames else connect)
+    writer.write(going.read())
+    await until(lambda: any(wire._client.session for wire in house.network.open))
+    wire = house.protocol("a")
+    ages: list[float] = []
+    Watches(house, lambda message: ages.append(message.age))
+    command = Publish("x", bytes(200)).encode(5)
+    command = frame(command) if in_frames else command
+    begun = loop.time()
+    sealed.write(command)
+    record = going.read()
+    writer.write(record[:100])
+    await until(lambda: wire._is_record_cut)
+    noticed = loop.time()
+    await asyncio.sleep(0.3)
+    least = loop.time() - noticed
+    writer.write(record[100:])
+    await until(lambda: ages)
+    assert least <= ages[0] <= loop.time() - begun
+    assert not wire._client.inflow.unfinished
+    sealed.write(command)
+    writer.write(going.read())
+    await until(lambda: len(ages) == 2)
+    assert ages[1] == 0
+    writer.close()
+
+
+@pytest.mark.parametrize(("tls", "in_frames"), [(False, True), (True, True), (True, False)])
+async def test_what_waits_for_a_turn_below_is_held(house: House, tls, in_frames):
+    packet = Publish("x", bytes(5000)).encode(5)
+    if in_frames:
+        caller, packet = await open_by_hand(house, tls), frame(packet)
+    else:
+        await house.start()
+        caller = await house.join("a", tls=tls)
+    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+    held: list[float] = []
+    waited: list[float] = []
+
+    def published(_: Message) -> None:
+        held.append(wire.contact().held)
+        waited.append(loop.time() - begun)
+
+    Watches(house, published)
+    for _ in range(60):
+        Busy(house, 1)
+    begun = loop.time()
+    caller.writer.write(packet)
+    await until(lambda: held)
+    assert waited[0] / 2 < held[0] <= waited[0] + 0.1
+    await until(lambda: not wire._client.inflow.is_behind)
+    begun = loop.time()
+    caller.writer.write(packet)
+    await until(lambda: len(held) == 2)
+    assert held[1] < 0.1
 
 
 @pytest.mark.parametrize("behind", [0, 5])

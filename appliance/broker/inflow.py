@@ -7,7 +7,9 @@ since was said at the earliest; unless it had come before and was not read.
 While a client is not read, what it says fills what the system keeps for it, and then it keeps the
 rest back itself. That comes a round trip after it is read again, as fast as the network takes it.
 So who had to keep something back has caught up when little has come for longer than that, and
-nothing that came is left unread.
+nothing that came is left unread. Little is also what is far less than came in such a time before:
+who streams has a pace of its own, and catches up at that of the network. Where the two are nearly
+the same nothing shows the end; then it has had the time that catching up takes.
 """
 
 from __future__ import annotations
@@ -27,6 +29,19 @@ PAUSE_BEHIND = 0.02
 #: sends several full packets of the network in one.
 LITTLE = 4096
 
+#: The same as a part of the most that came in such a time since it was read again.
+FAR_LESS = 1 / 4
+
+#: Seconds in which a client makes up for one in which it was not read, at the most: its network
+#: takes at least 1.2 times what it has to say.
+CATCHING_UP = 5.0
+
+#: Beside this, so many times the two round trips and that pause: TCP begins slowly.
+FLIGHTS = 10
+
+#: Seconds from one look to the next, at the most.
+RARELY = 1.0
+
 #: The smallest PUBLISH has so many bytes.
 SHORTEST = 5
 
@@ -39,12 +54,17 @@ class Inflow:
 
     __slots__ = (
         "_caught_up",
+        "_caught_up_by",
         "_held",
         "_held_since",
+        "_interval",
         "_is_kept_back",
-        "_quiet_since",
+        "_measured_since",
+        "_most",
         "_received",
         "_resumed",
+        "_seen",
+        "_was_full",
         "began",
         "is_watched",
         "last",
@@ -65,11 +85,18 @@ class Inflow:
         self._held_since = 0.0
         self._resumed = -math.inf
         self._caught_up = 0.0
-        #: Whether it may have kept back what it had to say; since when little has come, 0 while
-        #: that is not known, and the bytes that had come until then.
+        #: Whether it may have kept something back, and when it has caught up at the latest.
         self._is_kept_back = False
-        self._quiet_since = 0.0
+        self._caught_up_by = 0.0
+        #: Since when it is measured how much comes, 0 for not; the bytes that had come until then;
+        #: whether it may have kept something back since; and the most that came, in bytes a second.
+        self._measured_since = 0.0
         self._received = 0
+        self._was_full = False
+        self._most = 0.0
+        #: Of the last look, the bytes that had come; and the seconds to the next one, at least.
+        self._seen = 0
+        self._interval = PAUSE_BEHIND
 
     def came(self, data: bytes, now: float) -> None:
         """A chunk has come."""
@@ -95,9 +122,14 @@ class Inflow:
     def read(self, now: float) -> None:
         """It is read again."""
         if self._held_since:
-            self._held += now - self._held_since
+            pause = now - self._held_since
+            self._held += pause
             self._held_since = 0.0
             self._resumed = now
+            self._caught_up_by = max(self._caught_up_by, now) + CATCHING_UP * pause
+            if pause > PAUSE_BEHIND:  # what comes now is not the pace of either
+                self._measured_since = 0.0
+                self._interval = PAUSE_BEHIND
 
     def look(
         self, now: float, *, unread: bool, full: bool, received: int, round_trip: float
@@ -112,22 +144,42 @@ class Inflow:
         if not (unread or full or self._is_kept_back):
             self._has_caught_up()
             return 0.0
-        self._is_kept_back |= full
-        if unread or full:
-            self._quiet_since = 0.0
-            return PAUSE_BEHIND
-        if not self._quiet_since or received - self._received > LITTLE:
-            self._quiet_since, self._received = now, received
-        left = self._quiet_since + 2 * round_trip + PAUSE_BEHIND - now
-        if left > 0:
-            return left
-        self._has_caught_up()
-        return 0.0
+        span = 2 * round_trip + PAUSE_BEHIND
+        if full:
+            self._is_kept_back = self._was_full = True
+            by = now + CATCHING_UP * self._held + FLIGHTS * span
+            self._caught_up_by = max(self._caught_up_by, by)
+        if not self._measured_since:
+            self._measured_since, self._received = now, received
+        left = self._measured_since + span - now
+        is_little = left <= 0 and self._measure(now, received)
+        if not (unread or full) and (is_little or now >= self._caught_up_by):
+            self._has_caught_up()
+            return 0.0
+        seconds = left if left > 0 and not (unread or full) else PAUSE_BEHIND
+        if self.is_watched and received != self._seen:
+            self._interval = PAUSE_BEHIND
+            self._seen = received
+            return seconds
+        # Nobody has asked; or nothing comes: it has said a part of something, and not the rest.
+        seconds = max(seconds, self._interval)
+        self._interval = min(2 * self._interval, RARELY)
+        return seconds
+
+    def _measure(self, now: float, received: int) -> bool:
+        """Whether little has come since the last time, and it could send all that it had to say."""
+        came = received - self._received
+        pace = came / (now - self._measured_since)
+        is_little = not self._was_full and (came <= LITTLE or pace <= FAR_LESS * self._most)
+        self._most = max(self._most, pace)
+        self._measured_since, self._received, self._was_full = now, received, False
+        return is_little
 
     def _has_caught_up(self) -> None:
         """Nothing that it had to say before is left to be read."""
-        self._held = self._caught_up = self._quiet_since = 0.0
-        self._is_kept_back = False
+        self._held = self._caught_up = self._caught_up_by = self._measured_since = self._most = 0.0
+        self._is_kept_back = self._was_full = False
+        self._interval = PAUSE_BEHIND
 
     @property
     def is_behind(self) -> bool:

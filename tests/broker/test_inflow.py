@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from appliance.broker.inflow import A_BYTE, LITTLE, PAUSE, PAUSE_BEHIND, Inflow
+from appliance.broker.inflow import A_BYTE, CATCHING_UP, LITTLE, PAUSE, PAUSE_BEHIND, Inflow
 
 COMMAND = b"0" * 60
 
@@ -143,8 +143,8 @@ def test_no_work_of_ours_is_a_pause_of_its_own():
     inflow.not_read(inflow.now)
     inflow.now += 1
     inflow.read(inflow.now)
-    for _ in range(9):
-        assert inflow.see(unread=True) == PAUSE_BEHIND
+    for n in range(9):
+        assert inflow.see(unread=True, received=n + 1) == PAUSE_BEHIND
         inflow.hear(3 * PAUSE_BEHIND)
         assert inflow.age(has_unread=True) == 1
     assert inflow.age() == 1
@@ -158,24 +158,25 @@ def test_what_it_kept_back_comes_a_round_trip_after_it_is_read_again(round_trip)
     inflow.not_read(inflow.now)
     inflow.now += 1
     inflow.read(inflow.now)
-    assert inflow.see(unread=True, full=True, round_trip=round_trip) == PAUSE_BEHIND
-    inflow.hear(0, bytes(60_000))
+    received = 60_000  # what the system had kept
+    pause = inflow.see(unread=True, full=True, received=received, round_trip=round_trip)
+    assert pause == PAUSE_BEHIND
+    inflow.hear(0, bytes(received))
     assert inflow.age() == 1
-    received = 60_000
     for _ in range(5):  # it is more than fits into one flight
         inflow.now += PAUSE_BEHIND
         inflow.see(received=received, round_trip=round_trip)
         inflow.hear(round_trip, bytes(14_000))
         received += 14_000
         assert inflow.age() == 1
+    last, while_nothing = inflow.now, 2 * round_trip + PAUSE_BEHIND
     inflow.now += PAUSE_BEHIND
-    pause = inflow.see(received=received, round_trip=round_trip)
-    assert pause == pytest.approx(2 * round_trip + PAUSE_BEHIND)
-    inflow.hear(pause / 2)
-    assert inflow.age() == 1
-    inflow.now += pause / 2 + 0.001
-    # Who goes on with little has nothing else to say.
-    assert inflow.see(received=received + LITTLE, round_trip=round_trip) == 0
+    received += LITTLE  # who goes on with little has nothing else to say
+    while pause := inflow.see(received=received, round_trip=round_trip):
+        inflow.hear(pause / 2)
+        assert inflow.age() == 1
+        inflow.now += pause / 2 + 0.001
+    assert while_nothing < inflow.now - last < 3 * while_nothing
     inflow.hear(0)
     assert inflow.age() == 0
 
@@ -192,3 +193,87 @@ def test_who_has_not_caught_up_before_it_is_not_read_again_has_it_all_before_it(
         inflow.now += 0.1
         assert inflow.see(received=60_000, round_trip=0.1)
     assert inflow.age() == pytest.approx(0.9)
+
+
+class Streaming(Sending):
+    """It says so many bytes each `every` seconds; those are looked at when that is due, and nothing
+    is ever left unread."""
+
+    def __init__(self, size, every, round_trip):
+        super().__init__()
+        self.__dict__.update(size=size, every=every, round_trip=round_trip)
+        self.__dict__.update(received=0, looks_at=0.0)
+
+    def pause(self, seconds, *, full=True):
+        self.not_read(self.now)
+        self.now += seconds
+        self.read(self.now)
+        self.look_now(unread=True, full=full)
+
+    def look_now(self, **seen):
+        seconds = self.see(received=self.received, round_trip=self.round_trip, **seen)
+        self.looks_at = self.now + seconds if seconds else 0.0
+
+    def stream(self, seconds):
+        """Returns for how long it was behind."""
+        begun, behind = self.now, 0.0
+        while self.now < begun + seconds:
+            self.received += self.size
+            self.hear(self.every, bytes(self.size))
+            if self.looks_at and self.looks_at <= self.now:
+                self.look_now()
+            if self.age():
+                behind = self.now - begun
+        return behind
+
+
+@pytest.mark.parametrize(
+    ("size", "every", "round_trip", "paused"),
+    [
+        (3000, 0.005, 0.005, 0.6),
+        (8192, 1 / 30, 0.005, 0.6),
+        (3000, 0.05, 0.05, 0.6),
+        (60_000, 0.03, 0.1, 1.0),
+    ],
+)
+def test_who_streams_on_catches_up(size, every, round_trip, paused):
+    inflow = Streaming(size, every, round_trip)
+    inflow.pause(paused)
+    assert inflow.stream(20) < CATCHING_UP * paused + 20 * round_trip + 0.3
+    inflow.pause(paused)
+    inflow.received += int(size / every * paused)  # what it had kept back comes at once
+    assert inflow.stream(20) < 6 * round_trip + 0.3
+
+
+def test_pauses_of_ours_in_a_stream_do_not_add_up():
+    """Each of its large chunks ends the reading for this round."""
+    inflow = Streaming(100_000, 0.03, 0.005)
+    inflow.pause(0.6)
+    for _ in range(300):
+        inflow.pause(0.002, full=False)
+        inflow.stream(0.03)
+    assert not inflow.is_behind
+
+
+def test_what_takes_long_to_catch_up_does_so_until_the_end():
+    """Its network is hardly faster than it is itself."""
+    inflow = Streaming(10_000, 0.01, 0.02)
+    inflow.pause(1.0)
+    assert CATCHING_UP < inflow.stream(20) < CATCHING_UP + 1
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_half_a_frame_is_looked_for_ever_more_rarely(watched):
+    inflow = Sending()
+    inflow.is_watched = watched
+    inflow.not_read(inflow.now)
+    inflow.now += 0.1
+    inflow.read(inflow.now)
+    looks, begun = 0, inflow.now
+    while inflow.now < begun + 60:
+        inflow.now += inflow.see(unread=True, received=50)
+        looks += 1
+    assert looks < 70
+    # The rest of it comes, and something asks.
+    assert inflow.see(unread=True, received=100) <= 1
+    assert inflow.see() == 0
