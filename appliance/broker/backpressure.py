@@ -12,7 +12,8 @@ is lost between two clients that both read. Rules say for how long; then `queue_
   for little longer.
 * A publisher is held by all its readers together for no more than PUBLISHER_PATIENCE at once, and
   in the long run MESSAGE_PATIENCE a message: readers that conspire slow it to 100 messages a
-  second, and no further. Of the time in which none of them was waited for LEAST_COUNTED counts.
+  second, and no further. Of the time in which none of them was waited for, but the disk or the
+  computer, LEAST_COUNTED counts: so four times as long, and to 25 messages a second, at the most.
 * Nobody else waits: other publishers, a publisher's messages of QoS 0 that came before, and what a
   publisher acknowledges meanwhile, so that two that publish to each other drain each other's queue.
 

@@ -448,7 +448,7 @@ class Broker:
         self.counters.effort += effort
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
         for _ in range(2):  # as `_leave`: nobody gives back later what it holds
-            if faults.run("end.clear", self._cleared, session, otherwise=False):
+            if faults.run("end.clear", _done, session.clear, otherwise=False):
                 break
         faults.run("end.store", self.store.session_removed, session, otherwise=None)
 
@@ -458,16 +458,9 @@ class Broker:
         Nobody does it later, and what is left there would be given all that comes, for good.
         """
         for _ in range(2):
-            if self.faults.run("leave", self._left, session, topic_filter, otherwise=False):
+            leave = self.router.leave
+            if self.faults.run("leave", _done, leave, session, topic_filter, otherwise=False):
                 return
-
-    def _cleared(self, session: Session) -> bool:
-        session.clear()
-        return True
-
-    def _left(self, session: Session, topic_filter: str) -> bool:
-        self.router.leave(session, topic_filter)
-        return True
 
     def _hand_over(self, session: Session) -> None:
         """A client is gone: what its groups gave it goes to the members who are there."""
@@ -1100,3 +1093,9 @@ class Broker:
                 if session.identity is not None:
                     self.faults.run("stop.session", close, session, otherwise=None)
         self.flush()
+
+
+def _done(work: Callable[..., object], *args: object) -> bool:
+    """Do it: true, as it has not failed then, whatever it returns."""
+    work(*args)
+    return True

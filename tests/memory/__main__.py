@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import subprocess
@@ -25,14 +26,22 @@ def measure(name: str) -> tuple[int, int, int]:
     return grown, counted, allowed
 
 
-def main(arguments: list[str]) -> int:
-    if arguments[:1] == ["--one"]:
+def main() -> int:
+    parser = argparse.ArgumentParser("python tests/memory", description=__doc__)
+    parser.add_argument("shapes", nargs="*", metavar="SHAPE", help=f"of: {', '.join(SHAPES)}")
+    parser.add_argument("--one", action="store_true", help="in this process, and for machines")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.shapes) - set(SHAPES):
+        parser.error(f"no such shape: {', '.join(sorted(unknown))}; there are {', '.join(SHAPES)}")
+    if arguments.one and len(arguments.shapes) != 1:
+        parser.error("--one takes one shape")
+    if arguments.one:
         logging.disable(logging.CRITICAL)
-        print(json.dumps(run(arguments[1])))
+        print(json.dumps(run(arguments.shapes[0])))
         return 0
     failed = False
     print(f"{'shape':<46} {'grown':>7} {'counted':>8} {'allowed':>8}  (MiB)")
-    for name in arguments or SHAPES:
+    for name in arguments.shapes or SHAPES:
         grown, counted, allowed = measure(name)
         bad = grown > MOST * allowed
         failed |= bad
@@ -45,4 +54,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
