@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -338,24 +337,6 @@ def test_ros_arguments_stand_behind_ros_args() -> None:
     assert ours == ["run", "-c", "x.yaml"]
     assert ros == ["-r", "/a:=/b", "-p", "p:=1"]
     assert cli._split_ros_arguments(["pub", "--", "-x"]) == (["pub", "--", "-x"], [])
-
-
-def test_the_readme_names_programs_that_run(tmp_path: Path) -> None:
-    project = Path(__file__).parent.parent
-    names = sorted(set(re.findall(r"`python (tests/[\w/.]+)", (project / "README.md").read_text())))
-    assert "tests/soak" in names
-    processes = {
-        name: subprocess.Popen(
-            [sys.executable, str(project / name), "--help"],
-            cwd=tmp_path,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for name in names
-    }
-    told = {name: process.communicate()[0] for name, process in processes.items()}
-    assert {name: told[name] for name, each in processes.items() if each.returncode != 0} == {}
 
 
 def test_the_file_for_fast_dds(capsys: pytest.CaptureFixture[str]) -> None:

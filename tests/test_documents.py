@@ -1,0 +1,225 @@
+"""README, CONTRIBUTING and docs/: their commands, options, configurations and links are true."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from pages import PROJECT, Page, anchor, pages
+from waiting import PATIENCE
+
+from appliance import cli, config
+
+PAGES = pages()
+README = PAGES[0]
+NAMES = [page.name for page in PAGES]
+
+#: Lines that README may have: more belongs into docs/.
+LONGEST_README = 200
+
+#: Commands that need no running appliance, and are run as they stand.
+OFFLINE = ("init", "check", "user", "acl", "cert", "fastdds", "store")
+
+
+def invocations(page: Page) -> Iterator[list[str]]:
+    """The words behind `appliance` of each line that calls it."""
+    for line in page.commands():
+        for part in re.split(r"&&|\||>|;", line):
+            words = shlex.split(part, comments=True)
+            while words and (words[0] == "sudo" or re.match(r"[A-Z_]+=", words[0])):
+                del words[0]
+            if words and Path(words[0]).name == "appliance":
+                yield words[1:]
+
+
+def command_of(words: list[str]) -> tuple[Any, list[str]]:
+    """The command that these words name, and what is behind its name."""
+    command: Any = typer.main.get_command(cli.app)
+    rest, _ = cli._split_ros_arguments(words)
+    while rest and rest[0] in getattr(command, "commands", {}):
+        command, rest = command.commands[rest[0]], rest[1:]
+    return command, rest
+
+
+def options_of(command: Any) -> set[str]:
+    names = {name for param in command.params for name in (*param.opts, *param.secondary_opts)}
+    return {name for name in names if name.startswith("-")} | {"-h", "--help"}
+
+
+def wrong_with(words: list[str]) -> str:
+    """What is wrong with a complete command line; nothing if it would be taken."""
+    command, rest = command_of(words)
+    known = {
+        name: param
+        for param in command.params
+        for name in (*param.opts, *param.secondary_opts)
+        if name.startswith("-")
+    }
+    given = 0
+    while rest:
+        word, *rest = rest
+        if word.startswith("-") and word != "-":
+            if word not in known:
+                return f"{word} is none of {sorted(known)}"
+            if not known[word].is_flag:
+                if not rest:
+                    return f"{word} has no value"
+                del rest[0]
+        else:
+            given += 1
+    arguments = [param for param in command.params if param.param_type_name == "argument"]
+    least = sum(param.required for param in arguments)
+    most = 1000 if any(param.nargs == -1 for param in arguments) else len(arguments)
+    if not least <= given <= most:
+        return f"{given} arguments, where it takes {least} to {most}"
+    return ""
+
+
+def test_readme_is_a_first_visit() -> None:
+    assert len(README.text.splitlines()) <= LONGEST_README
+
+
+def test_readme_names_every_command() -> None:
+    command: Any = typer.main.get_command(cli.app)
+    names = {*command.commands}
+    assert len(names) > 15
+    assert [name for name in sorted(names) if f"`{name}" not in README.text] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_somewhere(page: Page) -> None:
+    by_path = {each.path: each for each in PAGES}
+    broken = []
+    for link in page.links():
+        file, _, heading = link.partition("#")
+        path = (page.path.parent / file).resolve() if file else page.path
+        known = by_path[path].anchors() if path in by_path else set()
+        if not path.exists() or (heading and heading not in known):
+            broken.append(link)
+    assert broken == []
+
+
+@pytest.mark.parametrize("page", PAGES[1:], ids=NAMES[1:])
+def test_a_page_begins_with_its_contents(page: Page) -> None:
+    start = page.text.partition("\n## ")[0]
+    listed = re.findall(r"^- \[(.+?)\]\(#(.+?)\)$", start, re.M)
+    assert listed == [(text, anchor(text)) for text in page.headings(2)]
+
+
+def test_every_page_is_found_from_readme() -> None:
+    missing = {*NAMES[1:]} - {link.partition("#")[0] for link in README.links()}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_commands_are_ones_that_there_are(page: Page) -> None:
+    wrong = {" ".join(words): wrong_with(words) for words in invocations(page)}
+    assert {line: what for line, what in wrong.items() if what} == {}
+
+
+def test_it_is_seen_when_a_command_is_wrong() -> None:
+    assert wrong_with(["run", "-c", "a.yaml"]) == ""
+    assert "--colour" in wrong_with(["run", "--colour"])
+    assert "arguments" in wrong_with(["cert", "revoke"])
+    assert "no value" in wrong_with(["run", "-c"])
+    assert "arguments" in wrong_with(["fly"])
+    assert sum(1 for page in PAGES for _ in invocations(page)) > 30
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_commands_in_the_text_are_ones_that_there_are(page: Page) -> None:
+    unknown = []
+    for text in page.quoted():
+        if not text.startswith("appliance "):
+            continue
+        command, rest = command_of(shlex.split(text)[1:])
+        options = [word for word in rest if word.startswith("-")]
+        is_group = bool(getattr(command, "commands", None))
+        is_unknown = is_group and rest and not options
+        if is_unknown or {*options} - options_of(command):
+            unknown.append(text)
+    assert unknown == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_what_needs_no_running_appliance_does_what_it_says(page: Page, tmp_path: Path) -> None:
+    lines = [words for words in invocations(page) if words and words[0] in OFFLINE]
+    if not lines:
+        return
+    directory = tmp_path / "appliance"
+    environment = {**os.environ, "HOME": str(tmp_path), "NO_COLOR": "1"}
+
+    def run(words: list[str]) -> None:
+        done = subprocess.run(
+            [sys.executable, "-m", "appliance", *words],
+            cwd=directory,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=PATIENCE,
+        )
+        assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}"
+
+    directory.mkdir()
+    run(["init", "--robot", "r2d2"])
+    (directory / "device.csr").write_bytes(signing_request())
+    for words in lines:
+        words = [word.replace("~", str(tmp_path), 1) if word[0] == "~" else word for word in words]
+        asks = words[:2] in (["user", "add"], ["user", "passwd"])
+        run([*words, "--generate"] if asks and "--generate" not in words else words)
+
+
+def signing_request() -> bytes:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "device")])
+    request = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    return request.public_bytes(Encoding.PEM)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_yaml_blocks_are_configurations(page: Page, tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    for block in page.blocks("yaml"):
+        variables = dict.fromkeys(re.findall(r"\$\{(\w+)", block), "x")
+        config.loads(block, file, variables)  # raises ConfigError, which names what is wrong
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_targets_of_make_are_there(page: Page) -> None:
+    makefile = (PROJECT / "Makefile").read_text()
+    lines = [*page.commands(), *page.quoted()]
+    named = {line.split()[1] for line in lines if re.match(r"make [a-z]", line)}
+    assert {name for name in named if f"\n{name}:" not in makefile} == set()
+
+
+def test_programs_of_the_tests_run(tmp_path: Path) -> None:
+    found = {name for page in PAGES for name in re.findall(r"`python (tests/[\w/.]+)", page.text)}
+    assert {"tests/soak", "tests/hostile", "tests/service"} <= found
+    processes = {
+        name: subprocess.Popen(
+            [sys.executable, str(PROJECT / name), "--help"],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for name in sorted(found)
+    }
+    told = {name: process.communicate()[0] for name, process in processes.items()}
+    assert {name: told[name] for name, each in processes.items() if each.returncode != 0} == {}
