@@ -7,15 +7,17 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
+from appliance_process import ApplianceProcess
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 from pages import PROJECT, Page, anchor, pages
 from waiting import PATIENCE
@@ -29,8 +31,9 @@ NAMES = [page.name for page in PAGES]
 #: Lines that README may have: more belongs into docs/.
 LONGEST_README = 200
 
-#: Commands that need no running appliance, and are run as they stand.
+#: Commands that need no running appliance, and those that need only one: they are run as they stand.
 OFFLINE = ("init", "check", "user", "acl", "cert", "fastdds", "store")
+ONLINE = ("routes", "status", "reload")
 
 
 def invocations(page: Page) -> Iterator[list[str]]:
@@ -153,19 +156,17 @@ def test_commands_in_the_text_are_ones_that_there_are(page: Page) -> None:
     assert unknown == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_what_needs_no_running_appliance_does_what_it_says(page: Page, tmp_path: Path) -> None:
-    lines = [words for words in invocations(page) if words and words[0] in OFFLINE]
-    if not lines:
-        return
-    directory = tmp_path / "appliance"
-    environment = {**os.environ, "HOME": str(tmp_path), "NO_COLOR": "1"}
+@pytest.fixture
+def typed(tmp_path: Path) -> Callable[[list[str]], None]:
+    """Runs a command line, beside an appliance.yaml, and fails when it does."""
 
     def run(words: list[str]) -> None:
+        home = tmp_path / "home"
+        words = [word.replace("~", str(home), 1) if word[0] == "~" else word for word in words]
         done = subprocess.run(
             [sys.executable, "-m", "appliance", *words],
-            cwd=directory,
-            env=environment,
+            cwd=home / "appliance",
+            env={**os.environ, "HOME": str(home), "NO_COLOR": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -174,21 +175,43 @@ def test_what_needs_no_running_appliance_does_what_it_says(page: Page, tmp_path:
         )
         assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}"
 
-    directory.mkdir()
-    run(["init", "--robot", "r2d2"])
-    (directory / "device.csr").write_bytes(signing_request())
+    (tmp_path / "home/appliance").mkdir(parents=True)
+    return run
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_what_needs_no_running_appliance_does_what_it_says(
+    page: Page, typed: Callable[[list[str]], None], tmp_path: Path
+) -> None:
+    lines = [words for words in invocations(page) if words and words[0] in OFFLINE]
+    if not lines:
+        return
+    typed(["init", "--robot", "r2d2"])
+    (tmp_path / "home/appliance/device.csr").write_bytes(signing_request())
     for words in lines:
-        words = [word.replace("~", str(tmp_path), 1) if word[0] == "~" else word for word in words]
         asks = words[:2] in (["user", "add"], ["user", "passwd"])
-        run([*words, "--generate"] if asks and "--generate" not in words else words)
+        typed([*words, "--generate"] if asks and "--generate" not in words else words)
+
+
+def test_what_asks_a_running_appliance_is_answered(
+    typed: Callable[[list[str]], None], tmp_path: Path
+) -> None:
+    lines = [words for page in PAGES for words in invocations(page) if words[:1]]
+    lines = [words for words in lines if words[0] in ONLINE]
+    assert {words[0] for words in lines} == {*ONLINE}
+    appliance = ApplianceProcess(tmp_path / "home/appliance")
+    appliance.start()
+    try:
+        for words in lines:
+            typed(words)
+    finally:
+        appliance.stop()
 
 
 def signing_request() -> bytes:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "device")])
     request = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
-    from cryptography.hazmat.primitives.serialization import Encoding
-
     return request.public_bytes(Encoding.PEM)
 
 

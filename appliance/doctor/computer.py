@@ -60,7 +60,7 @@ def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
             "warning",
             "clock",
             "it has no battery: after a start it is wrong until the network tells the time",
-            "the appliance works all the same, see README, «A clock that is wrong»",
+            "the appliance works all the same, see docs/operations.md, «A clock that is wrong»",
         )
 
 

@@ -26,7 +26,7 @@ OPEN = (
 )
 OPEN_ADVICE = (
     "where all nodes are on this computer: bridge.discovery: localhost; else a network of the "
-    "robot's own, or SROS 2 (README, Security)"
+    "robot's own, or SROS 2 (docs/security.md)"
 )
 
 #: What two nodes of one name mean, and what to do, for the log and `doctor`.
