@@ -31,7 +31,7 @@ NAMES = [page.name for page in PAGES]
 #: Lines that README may have: more belongs into docs/.
 LONGEST_README = 200
 
-#: Commands that need no running appliance, and those that need only one: they are run as they stand.
+#: Commands that need no running appliance, and those that need one: all are run as they stand.
 OFFLINE = ("init", "check", "user", "acl", "cert", "fastdds", "store")
 ONLINE = ("routes", "status", "reload")
 
