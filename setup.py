@@ -29,7 +29,7 @@ def compiled() -> None:
         setup(setup_requires=["mypy[mypyc]>=2.4"])
         return
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
-    modules |= {Path(f"appliance/{name}.py") for name in ("network", "tls", "wire")}
+    modules |= {Path(f"appliance/net/{name}.py") for name in ("connection", "scheduler", "tls")}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
     # "0" takes a minute less: for who looks whether it works, not how fast it is.
     level = os.environ.get("APPLIANCE_OPTIMIZE", "3")

@@ -24,7 +24,7 @@ from waiting import PATIENCE
 
 from appliance import certs
 from appliance.access import Passwords
-from appliance.init import Credentials, initialise
+from appliance.ops.init import Credentials, initialise
 
 ROBOT = "r2d2"
 HOST = "localhost"

@@ -17,13 +17,13 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Decision, Identity, Limits, Refusal
 from appliance.broker.session import Session
-from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode
-from appliance.network import Network
+from appliance.net.connection import ClientProtocol
+from appliance.net.listeners import Admission, Listeners, ListenerSettings
+from appliance.net.scheduler import Network
 from appliance.store import MemoryStore
-from appliance.wire import ClientProtocol
 
 
 def make_contexts(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:

@@ -1,8 +1,8 @@
 """Lets an entry of the appliance fail, once, when it is next passed: for `test_containment.py`.
 
 It fails before anything was done there, or when all was done: the state is another one then.
-What goes through `appliance.entries` and `Faults.run` is reached by the entry's name alone. Where
-an entry has a `try` of its own, INLINE says what is called in there, and by whom.
+What goes through `appliance.net.callbacks` and `Faults.run` is reached by the entry's name alone.
+Where an entry has a `try` of its own, INLINE says what is called in there, and by whom.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any
 
 import pytest
 
-from appliance import entries
 from appliance.broker.faults import Faults
+from appliance.net import callbacks as entries
 from appliance.ros.contained import ContainedThread
 
 PACKAGE = Path(__file__).parents[1] / "appliance"

@@ -30,7 +30,17 @@ from waiting import PATIENCE, until
 
 from appliance import certs
 from appliance.access import AccessFileError, FileAccess, Passwords
-from appliance.amqtt_broker import (
+from appliance.app.main import App
+from appliance.broker import client as network_client
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Action, Decision, Identity, Refusal
+from appliance.config import Settings, load
+from appliance.mqtt.codec import Property
+from appliance.mqtt.packets import Connect, Will
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.listeners import Admission, Listeners, ListenerSettings
+from appliance.plugins import (
     Answers,
     ApplianceBroker,
     PluginSettingsError,
@@ -39,16 +49,6 @@ from appliance.amqtt_broker import (
     events,
     plugin_kinds,
 )
-from appliance.app import App
-from appliance.broker import client as network_client
-from appliance.broker.broker import Broker
-from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, Refusal
-from appliance.config import Settings, load
-from appliance.listeners import Admission, Listeners, ListenerSettings
-from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Connect, Will
-from appliance.mqtt.reason import ReasonCode
 from appliance.store import MemoryStore
 
 FILE_AUTH = "amqtt.plugins.authentication.FileAuthPlugin"

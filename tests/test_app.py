@@ -15,7 +15,7 @@ from waiting import PATIENCE
 
 from appliance import config
 from appliance.access import Passwords
-from appliance.app import App
+from appliance.app.main import App
 from appliance.mqtt.packets import (
     Connack,
     Connect,

@@ -24,13 +24,13 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 from waiting import eventually
 
-from appliance import audit as audit_module
-from appliance import cli
-from appliance.audit import Audit, AuditError, note
 from appliance.broker.ports import Action, Identity, Secured
 from appliance.broker.session import Session
+from appliance.cli import main as cli
 from appliance.mqtt.packets import Connack, Disconnect, Publish, Subscribe, Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.ops import audit as audit_module
+from appliance.ops.audit import Audit, AuditError, note
 
 WRONG = "a wrong password, never to be seen"
 

@@ -10,10 +10,10 @@ import yaml
 
 from appliance import config
 from appliance.access import Passwords
-from appliance.check import Finding, check
-from appliance.check.commands import commands
-from appliance.init import initialise
-from appliance.ros import ros2
+from appliance.ops.check import Finding, check
+from appliance.ops.check.commands import commands
+from appliance.ops.init import initialise
+from appliance.ros.ros2 import node as ros2
 
 TWIST = "geometry_msgs/msg/Twist"
 VECTOR = "geometry_msgs/msg/Vector3"

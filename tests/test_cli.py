@@ -15,10 +15,11 @@ import typer
 import yaml
 from waiting import PATIENCE, eventually
 
-from appliance import cli, config
+from appliance import config
 from appliance.access import Passwords
-from appliance.check import check
-from appliance.commands import connection
+from appliance.cli import connection
+from appliance.cli import main as cli
+from appliance.ops.check import check
 from appliance.store import database
 
 
@@ -323,7 +324,7 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
     def target(**options: str | int | Path | None) -> object:
         return connection.Connection(host="h", user="alice", **options).target()  # type: ignore[arg-type]
 
-    from appliance.client import Target
+    from appliance.cli.mqtt_client import Target
 
     assert target() == Target("h", 2, here / "certs/ca.crt", "alice", "secret")
     assert target(port=3) == Target("h", 3, None, "alice", "secret")

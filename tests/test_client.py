@@ -15,7 +15,8 @@ from threading import Thread
 import pytest
 from waiting import PATIENCE
 
-from appliance import certs, cli
+from appliance import certs
+from appliance.cli import main as cli
 from appliance.mqtt.codec import Property
 from appliance.mqtt.connect import Connack
 from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubcomp, Pubrec, Suback

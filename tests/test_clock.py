@@ -12,7 +12,7 @@ from raw_client import RawClient
 from waiting import PATIENCE, eventually
 from wall_clock import HOUR, YEAR, WallClock
 
-from appliance.clock import RELEASED, StepWatch, is_unset
+from appliance.host.clock import RELEASED, StepWatch, is_unset
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Connack,

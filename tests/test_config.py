@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from appliance import config, wiring
+from appliance import config
+from appliance.app import wiring
 from appliance.broker.ports import UserLimits
 from appliance.config import Bind, ConfigError, Settings, reading
 

@@ -13,10 +13,10 @@ from house import House, Watches
 from test_websocket import frame, hear_frame, shake_hands
 from waiting import PATIENCE, until
 
-from appliance import wire as wire_module
 from appliance.broker.ports import HERE, Contact
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
-from appliance.sockets import Probe, contact, inbox
+from appliance.net import connection as wire_module
+from appliance.net.sockets import Probe, contact, inbox
 
 HOST = "127.0.0.1"
 

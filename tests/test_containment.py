@@ -30,12 +30,10 @@ from house import Caller, House, check_network, make_contexts
 from saboteur import INLINE, SabotageError, Saboteur, all_entries
 from waiting import PATIENCE, until
 
-from appliance import app as app_module
-from appliance import config, farewell, listeners, tls, wire
-from appliance.app import App
+from appliance import config
+from appliance.app import main as app_module
+from appliance.app.main import App
 from appliance.broker.ports import Decision
-from appliance.control import ControlError, ask
-from appliance.crash import CrashReports
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,
@@ -52,12 +50,17 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
-from appliance.notify import Notifier
+from appliance.net import connection as wire
+from appliance.net import lingering as farewell
+from appliance.net import listeners, tls
+from appliance.ops.control import ControlError, ask
+from appliance.ops.crash import CrashReports
+from appliance.ops.sd_notify import Notifier
 from appliance.ros import bridge as bridge_module
 from appliance.ros.bridge import Bridge, RouteSettings
 from appliance.ros.graph import CallRoutes, ParameterSettings, ServiceSettings
 from appliance.ros.node import FakeNode
-from appliance.ros.rules import CommandRules, OnSilence
+from appliance.ros.topics.rules import CommandRules, OnSilence
 from appliance.store import sqlite
 
 #: How often an entry is reached for, in PATIENCE: a fault may strike who reaches for it.

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance import control
 from appliance.broker.faults import Faults
-from appliance.control import Control, ControlError, NotRunningError, ask
+from appliance.ops import control
+from appliance.ops.control import Control, ControlError, NotRunningError, ask
 
 
 async def answer():

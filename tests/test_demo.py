@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from appliance.demo import ROOM, SCAN_POINTS, Drive
+from appliance.cli.demo_robot import ROOM, SCAN_POINTS, Drive
 
 
 def drive_for(drive, seconds, start=0.0, step=0.05):

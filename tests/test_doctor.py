@@ -17,12 +17,13 @@ import yaml
 from appliance_process import ApplianceProcess
 from waiting import eventually
 
-from appliance import certs, cli, config
+from appliance import certs, config
+from appliance.cli import main as cli
 from appliance.config import Settings
-from appliance.doctor import computer, examination, ports, ros, ros1, secrets
-from appliance.doctor.examination import Part, examine
-from appliance.doctor.finding import Finding
-from appliance.ros import discovery, fastdds
+from appliance.ops.doctor import computer, examination, ports, ros, ros1, secrets
+from appliance.ops.doctor.examination import Part, examine
+from appliance.ops.doctor.finding import Finding
+from appliance.ros.ros2 import discovery, fastdds
 
 
 def run(*arguments: str) -> int:

@@ -22,7 +22,8 @@ from cryptography.x509.oid import NameOID
 from pages import PROJECT, Page, anchor, pages
 from waiting import PATIENCE
 
-from appliance import cli, config
+from appliance import config
+from appliance.cli import main as cli
 
 PAGES = pages()
 README = PAGES[0]

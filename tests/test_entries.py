@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from appliance.broker.faults import Faults
-from appliance.entries import Entries, contained, shield
+from appliance.net.callbacks import Entries, contained, shield
 
 PACKAGE = Path(__file__).parents[1] / "appliance"
 
@@ -93,7 +93,7 @@ def is_allowed(name: str, what: str) -> bool:
 
 def test_nobody_hands_a_callback_to_the_loop_but_the_entries():
     found = [
-        f"appliance/{name}:{node.lineno}: {node.func.attr}: use appliance.entries"
+        f"appliance/{name}:{node.lineno}: {node.func.attr}: use appliance.net.callbacks"
         for name, tree in sources()
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from appliance import config
-from appliance.environment import for_other_programs, of_service
+from appliance.host.environment import for_other_programs, of_service
 
 
 def test_what_the_ros_wheels_added_is_taken_away() -> None:

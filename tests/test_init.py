@@ -11,8 +11,8 @@ import pytest
 from appliance import certs, config
 from appliance.access import Acl, Passwords
 from appliance.broker.ports import Action, Identity
-from appliance.check import check
-from appliance.init import Credentials, InitError, Step, initialise, robot_name
+from appliance.ops.check import check
+from appliance.ops.init import Credentials, InitError, Step, initialise, robot_name
 
 
 def made(steps: list[Step | Credentials]) -> set[str]:

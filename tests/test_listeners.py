@@ -23,10 +23,10 @@ import yaml
 from house import Caller, House, make_contexts
 from waiting import PATIENCE, until
 
-from appliance import config, farewell, listeners, network, sockets, wire, wiring
+from appliance import config
+from appliance.app import wiring
 from appliance.broker.accounts import Accounts
 from appliance.broker.ports import Features, Limits
-from appliance.listeners import Admission, ListenerSettings
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -43,6 +43,11 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
+from appliance.net import connection as wire
+from appliance.net import lingering as farewell
+from appliance.net import listeners, sockets
+from appliance.net import scheduler as network
+from appliance.net.listeners import Admission, ListenerSettings
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')

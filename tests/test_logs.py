@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from appliance import logs
+from appliance.ops import logs
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 from waiting import PATIENCE
 
-from appliance import certs, cli
-from appliance.owners import OwnerError, acting_as_caller, acting_for, owner_of
+from appliance import certs
+from appliance.cli import main as cli
+from appliance.host.owners import OwnerError, acting_as_caller, acting_for, owner_of
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
 

@@ -16,13 +16,13 @@ from aiohttp import web
 from test_amqtt_broker import Login, connect_of, own, running
 from waiting import until
 
-from appliance.amqtt_broker import Answers, PluginSettingsError
-from appliance.amqtt_broker import logins as logins_module
-from appliance.amqtt_broker.guard import redacted
 from appliance.broker.ports import Action, Decision, Identity, Refusal
 from appliance.config import secrets_in
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
+from appliance.plugins import Answers, PluginSettingsError
+from appliance.plugins import logins as logins_module
+from appliance.plugins.guard import redacted
 
 pytest.importorskip("sqlalchemy", reason="amqtt.contrib needs SQLAlchemy: pip install sqlalchemy")
 

@@ -13,7 +13,7 @@ from waiting import until
 from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.packets import Publish
-from appliance.pulse import CLOCK_PATIENCE, Pulse
+from appliance.ops.watchdog import CLOCK_PATIENCE, Pulse
 
 
 class Time:

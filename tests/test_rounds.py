@@ -21,8 +21,8 @@ from appliance.mqtt.packets import (
     Subscription,
     Will,
 )
-from appliance.network import EFFORT_A_ROUND, EFFORT_BEYOND, UNLOOKED
-from appliance.wire import LITTLE, ClientProtocol
+from appliance.net.connection import LITTLE, ClientProtocol
+from appliance.net.scheduler import EFFORT_A_ROUND, EFFORT_BEYOND, UNLOOKED
 
 CROWD = 40
 

@@ -15,8 +15,8 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 from waiting import eventually
 
-from appliance import cli
 from appliance.access import Passwords
+from appliance.cli import main as cli
 from appliance.mqtt.packets import Connack, Connect
 
 BIND = "bind-password-of-a-directory"

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from appliance.clock import LEAST_SHARE, TURN_TAKES, SpareClock
+from appliance.host.clock import LEAST_SHARE, TURN_TAKES, SpareClock
 
 
 def grown(*, worked: float, waited: float, turns: int = 10, seconds: float = 10.0) -> float:

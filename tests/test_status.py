@@ -12,12 +12,13 @@ import pytest
 from appliance_process import ApplianceProcess
 from raw_client import RawClient
 
-from appliance import cli, config
+from appliance import config
+from appliance.app.status import Status, _shortage, topic_shown
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity, InsideLink, Limits
+from appliance.cli import main as cli
 from appliance.config import reading
 from appliance.mqtt.packets import Publish
-from appliance.status import Status, _shortage, topic_shown
 from appliance.store import MemoryStore
 
 

@@ -22,11 +22,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from waiting import PATIENCE, until
 
-from appliance import certs, tls
+from appliance import certs
 from appliance.broker.faults import Faults
-from appliance.entries import Entries
-from appliance.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
-from appliance.turns import Charged, Turn
+from appliance.net import tls
+from appliance.net.callbacks import Entries
+from appliance.net.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
+from appliance.net.turns import Charged, Turn
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')

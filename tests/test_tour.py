@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 from waiting import PATIENCE
 
-from appliance import cli, config, tour
+from appliance import config
+from appliance.cli import demo as tour
+from appliance.cli import main as cli
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.watch import watch
+from appliance.host.watch import watch
 
 #: Seconds that a change may take to be told of, and none that are not told of.
 SOON = 5.0

@@ -44,8 +44,8 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.network import EFFORT_A_ROUND
-from appliance.websocket import FRAME_EFFORT
+from appliance.net.scheduler import EFFORT_A_ROUND
+from appliance.net.websocket import FRAME_EFFORT
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from appliance.access.acl import Acl, Explanation, Verdict
+from appliance.access.files import Changes, FileAccess, Rules
+from appliance.access.passwords import Passwords, check_password, check_username
+from appliance.access.problems import AccessFileError, Problem
+from appliance.access.rules import Permission, Rule
 from appliance.broker.ports import Refusal
-
-from .acl import Acl, Explanation, Verdict
-from .files import Changes, FileAccess, Rules
-from .passwords import Passwords, check_password, check_username
-from .problems import AccessFileError, Problem
-from .rules import Permission, Rule
 
 __all__ = [
     "AccessFileError",

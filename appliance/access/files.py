@@ -12,17 +12,16 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from appliance.addresses import network
+from appliance.access.acl import Acl
+from appliance.access.checks import BusyError, Checks
+from appliance.access.passwords import Passwords
+from appliance.access.problems import AccessFileError, Problem
+from appliance.access.scram import METHOD, ScramExchange, Verifier
+from appliance.access.throttle import Guesses, Recent
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
+from appliance.host.addresses import network
 from appliance.mqtt.codec import quote
 from appliance.mqtt.reason import ReasonCode
-
-from .acl import Acl
-from .checks import BusyError, Checks
-from .guesses import Guesses, Recent
-from .passwords import Passwords
-from .problems import AccessFileError, Problem
-from .scram import METHOD, ScramExchange, Verifier
 
 _log = logging.getLogger(__name__)
 

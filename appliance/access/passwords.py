@@ -22,8 +22,8 @@ from typing import Final
 import argon2
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from . import scram
-from .problems import AccessFileError, Problem, read_text
+from appliance.access import scram
+from appliance.access.problems import AccessFileError, Problem, read_text
 
 _log = logging.getLogger(__name__)
 

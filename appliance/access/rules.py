@@ -11,9 +11,8 @@ from enum import Flag
 from pathlib import Path
 from typing import Final
 
+from appliance.access.problems import AccessFileError, Problem, read_text
 from appliance.mqtt.topics import check_filter, check_topic
-
-from .problems import AccessFileError, Problem, read_text
 
 _log = logging.getLogger(__name__)
 

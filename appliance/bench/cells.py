@@ -20,6 +20,7 @@ from typing import Protocol
 from appliance.bench import peers
 from appliance.bench.load import Result
 from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site
+from appliance.ros.ros2 import fastdds
 
 REPEATS = 3  # of each broker, in turn, so that both see the same disturbances; the median counts
 GRACE_SECONDS = 90.0  # a run's connecting and settling, above the time it measures
@@ -347,7 +348,7 @@ def ros_environment(number: int) -> dict[str, str]:
 
 def image_environment(number: int) -> dict[str, str]:
     """The same where images pass through shared memory, for who sends them, too."""
-    profile = str(Path(__file__).parent.parent / "fastdds.xml")
+    profile = str(fastdds.PROFILE)
     names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
     return {**ros_environment(number), **dict.fromkeys(names, profile)}
 

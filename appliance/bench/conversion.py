@@ -47,8 +47,8 @@ def sample() -> bytes:
 
 def ours() -> Convert:
     """The converter that the bridge uses."""
-    from appliance.ros.convert import Converters
-    from appliance.ros.definitions import load_description
+    from appliance.ros.payload.converter import Converters
+    from appliance.ros.payload.definitions import load_description
 
     return Converters(load_description).get(TYPE).to_json
 

@@ -30,7 +30,7 @@ import yaml
 from appliance import certs
 from appliance.access import Passwords
 from appliance.bench.client import Client, LoadError, Target
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 USER = "bench"
 PASSWORD_VARIABLE = "APPLIANCE_BENCH_PASSWORD"

@@ -3,8 +3,8 @@
 Each place where work comes in from outside is an *entry* and has a name: a received chunk, a turn,
 a timer, a commit, a batch from ROS, a command. It catches what escapes, ends the one thing that was
 being served, hands the exception to `Faults.caught`, and sets up what comes next either way. What
-the event loop calls back is contained by `appliance.entries`, the rest by `Faults.run`, or by a
-`try` of its own where a call more would cost too much.
+the event loop calls back is contained by `appliance.net.callbacks`, the rest by `Faults.run`, or by
+a `try` of its own where a call more would cost too much.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .addresses import Address, local_names
-from .authority import (
+from appliance.certs.addresses import Address, local_names
+from appliance.certs.authority import (
     create_authority,
     issue_client,
     issue_server,
@@ -14,7 +14,7 @@ from .authority import (
     write_crl,
     write_readme,
 )
-from .contexts import (
+from appliance.certs.contexts import (
     ClientCertificates,
     LoadedTls,
     TlsContexts,
@@ -23,13 +23,13 @@ from .contexts import (
     load_tls,
     server_context,
 )
-from .export import check_password, write_bundle, write_pkcs12
-from .files import CertificateError, issued_by, load_certificates, load_key
-from .identity import username_of
-from .listing import Ending, Listed, endings, listed
-from .registry import Issued
-from .renewal import keep_server_certificate, server_outside, server_revoked
-from .requests import REQUEST_SIZE
+from appliance.certs.export import check_password, write_bundle, write_pkcs12
+from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
+from appliance.certs.identity import username_of
+from appliance.certs.listing import Ending, Listed, endings, listed
+from appliance.certs.registry import Issued
+from appliance.certs.renewal import keep_server_certificate, server_outside, server_revoked
+from appliance.certs.requests import REQUEST_SIZE
 
 __all__ = [
     "REQUEST_SIZE",

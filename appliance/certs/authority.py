@@ -26,12 +26,10 @@ from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from appliance.owners import acting_as_caller
-
-from . import readme, registry
-from .addresses import DNS_NAME, Address
-from .constraints import constraints, misleading, outside
-from .files import (
+from appliance.certs import readme, registry
+from appliance.certs.addresses import DNS_NAME, Address
+from appliance.certs.constraints import constraints, misleading, outside
+from appliance.certs.files import (
     CertificateError,
     issued_by,
     load_certificates,
@@ -45,9 +43,10 @@ from .files import (
     write_certificate,
     write_key,
 )
-from .registry import Issued, Kind, fingerprint
-from .requests import load_request
-from .revocation import CRL_SIZE, parse_crls
+from appliance.certs.registry import Issued, Kind, fingerprint
+from appliance.certs.requests import load_request
+from appliance.certs.revocation import CRL_SIZE, parse_crls
+from appliance.host.owners import acting_as_caller
 
 log = logging.getLogger("appliance.certs")
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from cryptography import x509
 
-from .files import issued_by
+from appliance.certs.files import issued_by
 
 #: Authorities between a client and a trusted one that are remembered, and how many may follow each
 #: other. Clients send them; each was verified, so a stranger adds none.

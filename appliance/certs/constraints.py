@@ -19,7 +19,7 @@ from typing import Final
 
 from cryptography import x509
 
-from .addresses import Address
+from appliance.certs.addresses import Address
 
 #: Names that are nobody's in the world's DNS: RFC 6761, 6762 and 8375, ICANN's decision of 2024;
 #: `lan` is what home routers call their network.

@@ -17,10 +17,8 @@ from typing import Final, Literal
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.clock import RELEASED
-
-from .chains import KNOWN, Chains, is_anchored
-from .files import (
+from appliance.certs.chains import KNOWN, Chains, is_anchored
+from appliance.certs.files import (
     CERTIFICATES_SIZE,
     MALFORMED,
     CertificateError,
@@ -30,9 +28,10 @@ from .files import (
     read,
     usable_time,
 )
-from .identity import UsernameFrom, username_of
-from .registry import fingerprint, serial_text
-from .revocation import CRL_SIZE, NOTHING_REVOKED, Revocations, load_revocations
+from appliance.certs.identity import UsernameFrom, username_of
+from appliance.certs.registry import fingerprint, serial_text
+from appliance.certs.revocation import CRL_SIZE, NOTHING_REVOKED, Revocations, load_revocations
+from appliance.host.clock import RELEASED
 
 log = logging.getLogger("appliance.certs")
 

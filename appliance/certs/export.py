@@ -13,8 +13,8 @@ from cryptography.hazmat.primitives.serialization.pkcs12 import (
     serialize_key_and_certificates,
 )
 
-from .authority import check_client_name
-from .files import CertificateError, key_pem, load_certificates, load_key, write
+from appliance.certs.authority import check_client_name
+from appliance.certs.files import CertificateError, key_pem, load_certificates, load_key, write
 
 SHORTEST_PASSWORD: Final = 8
 _ROUNDS: Final = 100_000

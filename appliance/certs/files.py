@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from appliance.clock import RELEASED
+from appliance.host.clock import RELEASED
 
 #: What the library raises over a certificate, a request or a list that is not as it should be; some
 #: of it only when a part of it is looked at.

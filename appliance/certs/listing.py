@@ -7,11 +7,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final, Literal
 
-from .authority import issued
-from .contexts import EXPIRES_SOON, TlsFiles
-from .files import CertificateError, load_certificates, read, usable_time
-from .registry import Issued, serial_text
-from .revocation import CRL_SIZE, load_revocations
+from appliance.certs.authority import issued
+from appliance.certs.contexts import EXPIRES_SOON, TlsFiles
+from appliance.certs.files import CertificateError, load_certificates, read, usable_time
+from appliance.certs.registry import Issued, serial_text
+from appliance.certs.revocation import CRL_SIZE, load_revocations
 
 State = Literal["valid", "replaced", "expired", "revoked"]
 

@@ -6,7 +6,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Final
 
-from .files import make_directory, write
+from appliance.certs.files import make_directory, write
 
 _README: Final = """\
 # Keys and certificates of this appliance

@@ -19,7 +19,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from .files import CertificateError, read, write
+from appliance.certs.files import CertificateError, read, write
 
 Kind = Literal["client", "server"]
 

@@ -11,13 +11,12 @@ from typing import Final
 
 from cryptography import x509
 
-from appliance.clock import is_unset
-
-from .addresses import Address, local_names
-from .authority import issue_server, issued, may_not_sign
-from .constraints import outside
-from .contexts import EXPIRES_SOON, TlsFiles
-from .files import issued_by, load_certificates, usable_time
+from appliance.certs.addresses import Address, local_names
+from appliance.certs.authority import issue_server, issued, may_not_sign
+from appliance.certs.constraints import outside
+from appliance.certs.contexts import EXPIRES_SOON, TlsFiles
+from appliance.certs.files import issued_by, load_certificates, usable_time
+from appliance.host.clock import is_unset
 
 log = logging.getLogger("appliance.certs")
 

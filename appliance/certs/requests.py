@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 from cryptography.x509.oid import NameOID
 
-from .files import MALFORMED, CertificateError
+from appliance.certs.files import MALFORMED, CertificateError
 
 REQUEST_SIZE: Final = 64 << 10
 _CURVES: Final = (ec.SECP256R1, ec.SECP384R1, ec.SECP521R1)

@@ -18,7 +18,7 @@ from typing import Final
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from .files import MALFORMED, CertificateError
+from appliance.certs.files import MALFORMED, CertificateError
 
 #: Some 400,000 entries.
 CRL_SIZE: Final = 16 << 20

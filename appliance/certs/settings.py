@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from appliance.certs.contexts import TlsFiles, TlsPolicy
 from appliance.config import Broker
-
-from .contexts import TlsFiles, TlsPolicy
 
 
 def listener_name(index: int) -> str:

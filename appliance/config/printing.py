@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from appliance.config.settings import Settings
-from appliance.document import KeyPath
+from appliance.config.yaml_document import KeyPath
 
 _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
 

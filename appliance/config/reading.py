@@ -35,8 +35,8 @@ from appliance.config.settings import (
     TopicRoute,
 )
 from appliance.config.values import OF_NODE, InListError
-from appliance.document import Document, KeyPath, Problem
-from appliance.environment import of_service
+from appliance.config.yaml_document import Document, KeyPath, Problem
+from appliance.host.environment import of_service
 
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Where the configuration is looked for when no file is named; the first that exists is used."""

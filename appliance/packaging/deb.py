@@ -18,8 +18,8 @@ from email.utils import formatdate
 from importlib.metadata import metadata, version
 from pathlib import Path
 
-from appliance.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
-from appliance.unit import ENVIRONMENT, VARIABLES, Unit
+from appliance.ops.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
+from appliance.ops.unit import ENVIRONMENT, VARIABLES, Unit
 
 PACKAGE = "appliance"
 DOCUMENTS = Path("/usr/share/doc", PACKAGE)

@@ -1,7 +1,7 @@
 """What the one file runs first: it makes the environment that ROS wants, and calls the command.
 
-`appliance -m appliance.demo …` runs another of its programs, as Python's own option does, since for
-those that are started from within `sys.executable` is the one file.
+`appliance -m appliance.cli.demo_robot …` runs another of its programs, as Python's own option does,
+since for those that are started from within `sys.executable` is the one file.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from appliance.environment import LIBRARIES, ORIGINAL_LIBRARIES
-from appliance.ros import installation
+from appliance.host.environment import LIBRARIES, ORIGINAL_LIBRARIES
+from appliance.ros.ros2 import installation
 
 INSIDE = sys.prefix  # the folder that the file is unpacked to
 PREFIXES = "AMENT_PREFIX_PATH"
@@ -31,7 +31,7 @@ def main() -> None:
         del sys.argv[1:3]
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     else:
-        from appliance.cli import main as run
+        from appliance.cli.main import main as run
 
         run()
 

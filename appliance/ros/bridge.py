@@ -25,29 +25,29 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Objection
 from appliance.broker.session import Session
-from appliance.entries import Entries, Repeated
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.arrivals import Arrivals
-from appliance.ros.commands import Commands
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import UnknownTypeError
+from appliance.net.callbacks import Entries, Repeated
 from appliance.ros.diagnostics import Diagnostics
-from appliance.ros.discovery import TWIN, TWIN_ADVICE
-from appliance.ros.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.graph import CallRoutes, Calls
-from appliance.ros.lease import Leases
-from appliance.ros.leftovers import Owners, is_of_route
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
-from appliance.ros.payloads import CONTENT_TYPE
-from appliance.ros.schema import json_schema, topic_of
-from appliance.ros.skips import Skip, ordered, summary
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import UnknownTypeError
+from appliance.ros.payload.payloads import CONTENT_TYPE
+from appliance.ros.payload.schema import json_schema, topic_of
+from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE
+from appliance.ros.skipped import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
-from appliance.ros.to_mqtt import ToMqtt
-from appliance.ros.to_ros import Surroundings, ToRos
-from appliance.ros.turns import LITTLE, Turns, size_of
+from appliance.ros.topics.arrivals import Arrivals
+from appliance.ros.topics.commands import Commands
+from appliance.ros.topics.conversions import LITTLE, Turns, size_of
+from appliance.ros.topics.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
+from appliance.ros.topics.lease import Leases
+from appliance.ros.leftovers import Owners, is_of_route
+from appliance.ros.topics.to_mqtt import ToMqtt
+from appliance.ros.topics.to_ros import Surroundings, ToRos
 
 __all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
 

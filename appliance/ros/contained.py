@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from appliance.entries import Entries
+from appliance.net.callbacks import Entries
 
 log = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from typing import Any, Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
-from appliance.entries import Entries, Repeated
-from appliance.ros.convert import ConversionError, Converter, Converters
-from appliance.ros.definitions import UnknownTypeError
-from appliance.ros.flows import Tell
+from appliance.net.callbacks import Entries, Repeated
 from appliance.ros.node import BusError, QosProfile, RosNode, RosPublisher
+from appliance.ros.payload.converter import ConversionError, Converter, Converters
+from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.status import RouteStatus
+from appliance.ros.topics.flows import Tell
 
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"

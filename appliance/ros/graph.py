@@ -11,19 +11,19 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from appliance.broker.broker import Broker
-from appliance.entries import Entries
-from appliance.ros.actions import ActionRoutes, ActionSettings
-from appliance.ros.calls import CallCounters, CallLimits, Switchboard
-from appliance.ros.convert import Converters
+from appliance.net.callbacks import Entries
+from appliance.ros.calls.actions import ActionRoutes, ActionSettings
+from appliance.ros.calls.dispatcher import CallCounters, CallLimits, Switchboard
+from appliance.ros.calls.parameter_server import ServerParameters
+from appliance.ros.calls.parameter_topics import ParameterSettings
+from appliance.ros.calls.parameters import ParameterRoutes
+from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.services import ServiceRoutes, ServiceSettings
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
-from appliance.ros.parameter_server import ServerParameters
-from appliance.ros.parameter_topics import ParameterSettings
-from appliance.ros.parameters import ParameterRoutes
-from appliance.ros.requests import Requests
-from appliance.ros.services import ServiceRoutes, ServiceSettings
-from appliance.ros.skips import Skip
-from appliance.ros.turns import Turns
+from appliance.ros.payload.converter import Converters
+from appliance.ros.skipped import Skip
+from appliance.ros.topics.conversions import Turns
 
 __all__ = [
     "ActionSettings",

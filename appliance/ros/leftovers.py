@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros.flows import RouteSettings
 from appliance.ros.graph import CallRoutes
 from appliance.ros.patterns import Names
+from appliance.ros.topics.flows import RouteSettings
 
 _OF_ACTION = re.compile(r"/(_status|_result/[^/]+)\Z")
 _PARAMETER = "/_param/"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from appliance.broker.message import Message
-from appliance.ros.figures import Counters
+from appliance.ros.metrics import Counters
 
 #: The most that waits in all: a loop that was busy for a second with 10 kHz on the bus.
 MAX_MESSAGES = 10_000

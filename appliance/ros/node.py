@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
-from appliance.entries import Entries
-from appliance.ros.definitions import CDR, TypeDescription, UnknownTypeError, Wire, describe
+from appliance.net.callbacks import Entries
+from appliance.ros.payload.definitions import CDR, TypeDescription, UnknownTypeError, Wire, describe
 
 
 class BusError(Exception):

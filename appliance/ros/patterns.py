@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Protocol, TypeVar
 
-from appliance.ros.skips import Skip, Why
+from appliance.ros.skipped import Skip, Why
 
 
 def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from appliance.ros.definitions import Bulk
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
+from appliance.ros.payload.definitions import Bulk
 
 #: ROS's own default, and enough for a reader that is fast.
 DEPTH = 10

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.ros.figures import Counters, Latency
-from appliance.ros.flows import Bridged, Direction, Flow, Route, RouteSettings
-from appliance.ros.payloads import Encoding
+from appliance.ros.metrics import Counters, Latency
+from appliance.ros.payload.payloads import Encoding
+from appliance.ros.topics.flows import Bridged, Direction, Flow, Route, RouteSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 
-from appliance.clock import RELEASED
+from appliance.host.clock import RELEASED
 from appliance.store.schema import Row
 
 #: The key of the one row of its table.

@@ -19,9 +19,9 @@ from appliance.broker.kept import restore
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Held, Session
-from appliance.clock import NUDGE, StepWatch
-from appliance.entries import Entries, Repeated
+from appliance.host.clock import NUDGE, StepWatch
 from appliance.mqtt.packets import Subscription
+from appliance.net.callbacks import Entries, Repeated
 from appliance.store import database
 from appliance.store.clock import KEY, Clocks, Stamp, boot_id, stamp_of
 from appliance.store.loader import (

@@ -12,10 +12,10 @@ from waiting import PATIENCE
 
 from appliance import config
 from appliance.access import Passwords
-from appliance.app import App
-from appliance.check import check
+from appliance.app.main import App
 from appliance.config import Settings
 from appliance.mqtt.packets import Connect, Subscribe, Subscription
+from appliance.ops.check import check
 
 ACL = """\
 topic read open/#

@@ -14,9 +14,9 @@ import pytest
 
 from appliance.access import FileAccess, Passwords
 from appliance.access import checks as checks_module
-from appliance.access import guesses as guesses_module
 from appliance.access import passwords as passwords_module
-from appliance.access.guesses import Guesses, Recent
+from appliance.access import throttle as guesses_module
+from appliance.access.throttle import Guesses, Recent
 from appliance.broker.ports import Accepted, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 

@@ -17,11 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raw_client import RawClient
 
-from appliance import cli
 from appliance.access import AccessFileError, FileAccess, Passwords
 from appliance.access import scram as scram_module
 from appliance.access.scram import METHOD, ScramExchange, Verifier, saslprep
 from appliance.broker.ports import Accepted, Identity, Refusal
+from appliance.cli import main as cli
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Auth,

@@ -24,7 +24,7 @@ from appliance.broker.backpressure import (
 from appliance.broker.broker import LOOKS_FOR_ONE, Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Limits
-from appliance.clock import SpareClock
+from appliance.host.clock import SpareClock
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Disconnect,

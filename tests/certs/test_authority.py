@@ -28,7 +28,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from appliance import certs
 from appliance.certs import CertificateError, addresses, authority, files, load_key
-from appliance.clock import RELEASED
+from appliance.host.clock import RELEASED
 
 
 def load(path: Path) -> x509.Certificate:

@@ -29,7 +29,8 @@ from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as websocket
 from websockets.typing import Subprotocol
 
-from appliance import certs, cli
+from appliance import certs
+from appliance.cli import main as cli
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Auth,

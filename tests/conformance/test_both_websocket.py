@@ -13,8 +13,8 @@ from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity
-from appliance.listeners import Admission, Listeners, ListenerSettings
 from appliance.mqtt.packets import Connect, Pingreq, Publish, Subscribe, Subscription
+from appliance.net.listeners import Admission, Listeners, ListenerSettings
 
 KEY = base64.b64encode(bytes(range(16))).decode()
 ACCEPT = base64.b64encode(

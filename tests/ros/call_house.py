@@ -14,13 +14,13 @@ from appliance.broker.ports import Action, Decision, Identity, InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge
-from appliance.ros.definitions import import_message
 from appliance.ros.graph import (
     ActionSettings,
     CallRoutes,
     ParameterSettings,
     ServiceSettings,
 )
+from appliance.ros.payload.definitions import import_message
 from appliance.store import MemoryStore
 
 

@@ -144,16 +144,16 @@ _VALUES: dict[str, object] = {
 
 def sequences(count: int) -> dict[str, object]:
     """A message that is right to the last field, with so many texts in it."""
-    from appliance.ros.convert import compile_converter
-    from appliance.ros.definitions import load_description
+    from appliance.ros.payload.converter import compile_converter
+    from appliance.ros.payload.definitions import load_description
 
     converter = compile_converter(load_description("test_msgs/msg/UnboundedSequences"))
     return converter.to_dict(converter.from_dict({})) | {"string_values": texts(count)}
 
 
 def sequences_cdr(count: int) -> bytes:
-    from appliance.ros.convert import compile_converter
-    from appliance.ros.definitions import load_description
+    from appliance.ros.payload.converter import compile_converter
+    from appliance.ros.payload.definitions import load_description
 
     converter = compile_converter(load_description("test_msgs/msg/UnboundedSequences"))
     return converter.from_values(sequences(count), 0)

@@ -36,7 +36,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
 from appliance_process import HOST, MOSQUITTO, ROBOT, ApplianceProcess, _free_ports  # noqa: E402
 from waiting import PATIENCE, until  # noqa: E402
 
-from appliance.environment import for_other_programs  # noqa: E402
+from appliance.host.environment import for_other_programs  # noqa: E402
 
 TWIST = "geometry_msgs/msg/Twist"
 

@@ -26,7 +26,7 @@ def load(type_name):
     try:
         return getattr(import_module(f"{package}.msg"), name)
     except ImportError:  # there is no more than its definition
-        return import_module("appliance.ros.ros2").load_message(type_name)
+        return import_module("appliance.ros.ros2.node").load_message(type_name)
 
 
 def profile(reliability, durability):

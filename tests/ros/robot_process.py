@@ -11,7 +11,7 @@ from pathlib import Path
 
 from waiting import PATIENCE
 
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 
 class Robot:

@@ -33,7 +33,7 @@ sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
 from appliance_process import HOST, ROBOT, ApplianceProcess  # noqa: E402
 
-from appliance.environment import for_other_programs  # noqa: E402
+from appliance.host.environment import for_other_programs  # noqa: E402
 from appliance.mqtt.packets import Connect, Subscribe, Subscription  # noqa: E402
 
 IMAGE_SIZE = 1_000_000
@@ -74,7 +74,7 @@ def send(seconds: float) -> None:
     from rclpy.node import Node
     from std_msgs.msg import String, UInt8MultiArray
 
-    from appliance.ros import fastdds
+    from appliance.ros.ros2 import fastdds
 
     fastdds.use_profile(os.environ)
     rclpy.init(args=[])

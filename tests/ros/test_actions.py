@@ -11,12 +11,12 @@ from waiting import until
 pytest.importorskip("test_msgs.action")
 from call_house import AllTypes, House, action, call_routes
 
-from appliance.ros import actions as module
-from appliance.ros import requests
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
-from appliance.ros.goals import STATUS, id_of
+from appliance.ros.calls import actions as module
+from appliance.ros.calls import requests
+from appliance.ros.calls.goals import STATUS, id_of
 from appliance.ros.node import Durability, FakeNode, QosProfile
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
 
 FIBONACCI, CANCEL = "test_msgs/action/Fibonacci", "action_msgs/srv/CancelGoal"
 CONVERTERS = Converters(load_description)

@@ -27,11 +27,11 @@ import cbor2
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
-from appliance.ros import convert
-from appliance.ros.careful import decode as careful_decode
-from appliance.ros.convert import ConversionError, Converters
-from appliance.ros.definitions import import_message, load_description
-from appliance.ros.generate import generate
+from appliance.ros.payload import converter as convert
+from appliance.ros.payload.codegen import generate
+from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.definitions import import_message, load_description
+from appliance.ros.payload.fallback import decode as careful_decode
 
 CONVERTERS = Converters(load_description, now=lambda: 1_700_000_000_123_456_789)
 VARIANTS = ("default", "smallest", "largest", "random 1", "random 2", "random 3")

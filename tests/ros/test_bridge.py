@@ -19,14 +19,14 @@ from appliance.broker.ports import InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import THOROUGH_LOOK, Bridge, Bridged, RouteSettings
-from appliance.ros.flows import Echo, Route
 from appliance.ros.graph import ParameterSettings
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
+from appliance.ros.topics.flows import Echo, Route
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
-from appliance.ros.definitions import import_message
+from appliance.ros.payload.definitions import import_message
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 VECTOR, INT = "geometry_msgs/msg/Vector3", "std_msgs/msg/Int32"
@@ -355,7 +355,7 @@ async def test_a_message_that_cannot_be_converted_is_counted_and_told_once(house
 
 async def test_rate_is_kept_before_conversion(house, monkeypatch):
     now = 100.0
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now)
     house.start(to_mqtt("/a", rate=10, keep=1000))
     peer = house.node.add_publisher("/a", STRING)
     for number in range(200):  # 5 s at 40 Hz, unevenly
@@ -370,7 +370,7 @@ async def test_rate_is_kept_before_conversion(house, monkeypatch):
 @pytest.mark.parametrize(("source", "least"), [(500, 500), (4000, 950)])
 async def test_a_high_rate_is_kept_when_messages_come_in_lots(house, monkeypatch, source, least):
     now = 100.0
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now)
     house.start(to_mqtt("/a", rate=1000, keep=10_000))
     peer = house.node.add_publisher("/a", STRING)
     for lot in range(20):  # in a second
@@ -386,7 +386,7 @@ async def test_a_high_rate_is_kept_when_messages_come_in_lots(house, monkeypatch
 
 async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, monkeypatch):
     now = 100.0
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now)
     house.start(to_mqtt("/a", encoding="text", rate=10), to_mqtt("/b", bytes_per_second=20))
     peer, other = (house.node.add_publisher(name, STRING) for name in ("/a", "/b"))
     for number in range(10):
@@ -406,7 +406,7 @@ async def test_the_last_message_of_a_burst_is_sent_when_the_rate_allows(house, m
 
 
 async def test_what_is_held_back_is_not_lost_with_its_publisher_or_route(house, monkeypatch):
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 100.0)
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: 100.0)
     names = ("/gone/**", "/there", "/taken")
     routes = [to_mqtt(name, encoding="text", rate=1, keep=2) for name in names]
     bridge = house.start(*routes)
@@ -425,7 +425,7 @@ async def test_what_is_held_back_is_not_lost_with_its_publisher_or_route(house, 
     assert house.client.payloads("r2d2/gone/a") == [b"first", b"last"]
     assert house.client.payloads("r2d2/taken") == [b"first", b"last"]
     assert house.client.payloads("r2d2/there") == [b"first"]
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: 102.0)
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: 102.0)
     house.node.spin()
     await house.settle()
     assert house.client.payloads("r2d2/there") == [b"first", b"last"]
@@ -758,7 +758,7 @@ async def test_both_ways_takes_the_type_from_a_publisher_too(house):
 
 def test_echo_knows_padding_and_forgets(monkeypatch):
     now = 0.0
-    monkeypatch.setattr("appliance.ros.flows.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.topics.flows.monotonic", lambda: now)
     echo = Echo()
     sample = string("abcd")
     assert not echo.is_own(sample)

@@ -18,9 +18,9 @@ from waiting import PATIENCE, eventually
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
 
-from appliance import cli
-from appliance.environment import for_other_programs
-from appliance.init import initialise
+from appliance.cli import main as cli
+from appliance.host.environment import for_other_programs
+from appliance.ops.init import initialise
 
 BRIDGE = {
     "node": "bridge",

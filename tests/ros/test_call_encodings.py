@@ -16,10 +16,10 @@ pytest.importorskip("test_msgs.action")
 from call_house import AllTypes, House, action, call_routes, parameters, service
 
 from appliance.mqtt.codec import Property
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import CDR, PACKED, load_description
-from appliance.ros.goals import GOAL_INFO, STATUS, id_of, split_id, with_id
+from appliance.ros.calls.goals import GOAL_INFO, STATUS, id_of, split_id, with_id
 from appliance.ros.node import Durability, FakeNode, QosProfile
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import CDR, PACKED, load_description
 
 CONVERTERS = Converters(load_description)
 SET_BOOL, ARRAYS = "std_srvs/srv/SetBool", "test_msgs/srv/Arrays"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 pytest.importorskip("rclpy")
 from test_ros2 import domain

@@ -30,24 +30,32 @@ from appliance.mqtt.packets import (
     Will,
     decode_packet,
 )
-from appliance.ros import commands, lease
-from appliance.ros.arrivals import EXPECTED, STEADY, WAIT, WITHHELD, Arrivals, Verdict, sent_at
-from appliance.ros.backlog import Backlog
 from appliance.ros.bridge import RouteSettings
-from appliance.ros.calls import Answer, CallCounters, Offer
-from appliance.ros.careful import ConversionError
-from appliance.ros.commands import Commands
-from appliance.ros.convert import Converter
-from appliance.ros.lease import REPEATED
+from appliance.ros.calls.dispatcher import Answer, CallCounters, Offer
+from appliance.ros.calls.replay_guard import Backlog
 from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProfile
-from appliance.ros.payloads import ZSTD_MAGIC
-from appliance.ros.rules import CommandRules, FieldLimits, OnSilence
+from appliance.ros.payload.converter import Converter
+from appliance.ros.payload.fallback import ConversionError
+from appliance.ros.payload.payloads import ZSTD_MAGIC
+from appliance.ros.topics import commands, lease
+from appliance.ros.topics.arrivals import (
+    EXPECTED,
+    STEADY,
+    WAIT,
+    WITHHELD,
+    Arrivals,
+    Verdict,
+    sent_at,
+)
+from appliance.ros.topics.commands import Commands
+from appliance.ros.topics.lease import REPEATED
+from appliance.ros.topics.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
 pytest.importorskip("geometry_msgs.msg")
 from test_bridge import INT, STRING, TWIST, Client, House
 
-from appliance.ros.definitions import import_message, load_description
+from appliance.ros.payload.definitions import import_message, load_description
 
 FLOAT = "std_msgs/msg/Float32"
 TOPIC = "r2d2/cmd_vel"

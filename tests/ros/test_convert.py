@@ -12,14 +12,15 @@ import sys
 import orjson
 import pytest
 
-from appliance.ros.convert import (
+from appliance.ros.payload.codegen import generate
+from appliance.ros.payload.converter import (
     LARGEST_LENIENT,
     ConversionError,
     Converter,
     Converters,
     compile_converter,
 )
-from appliance.ros.definitions import (
+from appliance.ros.payload.definitions import (
     PRIMITIVES,
     TIME,
     Array,
@@ -34,7 +35,6 @@ from appliance.ros.definitions import (
     import_message,
     load_description,
 )
-from appliance.ros.generate import generate
 
 FLOAT64 = PRIMITIVES["float64"]
 FLOAT32 = PRIMITIVES["float32"]

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from waiting import until
 
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess

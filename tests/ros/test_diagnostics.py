@@ -9,17 +9,17 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.ros.bridge import Bridge
-from appliance.ros.figures import BOUNDS, Counters, Latency, Meter
+from appliance.ros.metrics import BOUNDS, Counters, Latency, Meter
 from appliance.ros.node import FakeNode
-from appliance.ros.rules import CommandRules
+from appliance.ros.topics.rules import CommandRules
 
 pytest.importorskip("diagnostic_msgs.msg")
 from test_bridge import STRING, TWIST, Client, House, string, to_mqtt, to_ros
 from test_commands import GO, All, AllAllowed, Driver
 
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
 from appliance.ros.diagnostics import TYPE
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
 from appliance.store import MemoryStore
 
 OK, WARN, ERROR = 0, 1, 2

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from waiting import until
 
-from appliance.environment import for_other_programs
-from appliance.ros import discovery, fastdds
-from appliance.ros.reach import Reach, reach
+from appliance.host.environment import for_other_programs
+from appliance.ros.ros2 import discovery, fastdds
+from appliance.ros.ros2.network_scope import Reach, reach
 
 RANGE = discovery.RANGE
 
@@ -177,7 +177,7 @@ def test_another_computer_of_the_network():
 
 async def test_with_security_enforced_and_no_keys_nothing_is_joined(monkeypatch, tmp_path):
     pytest.importorskip("rclpy")
-    from appliance.ros.ros2 import Ros2Node
+    from appliance.ros.ros2.node import Ros2Node
 
     monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
     monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")

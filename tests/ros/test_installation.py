@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from appliance.ros import installation
-from appliance.ros.installation import find, find_sourced, is_wanted
+from appliance.ros.ros2 import installation
+from appliance.ros.ros2.installation import find, find_sourced, is_wanted
 
 HERE = sys.version_info[:2]
 OTHER = (3, 99)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 
 from appliance.broker.message import Message
-from appliance.ros.figures import Counters
 from appliance.ros.mailbox import Lane, Mailbox
+from appliance.ros.metrics import Counters
 
 
 def payloads(taken):

@@ -10,12 +10,12 @@ from waiting import until
 pytest.importorskip("rcl_interfaces.srv")
 from call_house import AllTypes, House, action, call_routes, parameters
 
-from appliance.ros import parameters as module
-from appliance.ros.calls import CallError
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
+from appliance.ros.calls import parameters as module
+from appliance.ros.calls.dispatcher import CallError
+from appliance.ros.calls.parameters import EVENT, EVENTS, to_value
 from appliance.ros.node import FakeNode
-from appliance.ros.parameters import EVENT, EVENTS, to_value
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
 
 CONVERTERS = Converters(load_description)
 

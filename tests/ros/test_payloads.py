@@ -10,17 +10,22 @@ import pytest
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros import cbor
-from appliance.ros.careful import ConversionError
+from appliance.ros.payload import cbor
+from appliance.ros.payload.fallback import ConversionError
 
 pytest.importorskip("sensor_msgs.msg")
 import zstandard
 from test_bridge import STRING, TWIST, House, both, string, to_mqtt, to_ros
 
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import UnknownTypeError, import_message, load_description, select
-from appliance.ros.payloads import InputLimits, packer, unpacker
-from appliance.ros.schema import json_schema
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import (
+    UnknownTypeError,
+    import_message,
+    load_description,
+    select,
+)
+from appliance.ros.payload.payloads import InputLimits, packer, unpacker
+from appliance.ros.payload.schema import json_schema
 
 CONVERTERS = Converters(load_description)
 PICTURE, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
@@ -343,7 +348,7 @@ async def test_schemas_from_before_a_crash_are_taken_back(house):
 
 async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("appliance.ros.to_mqtt.monotonic", lambda: now[0])
+    monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now[0])
     house.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
     peer = house.node.add_publisher("/chatter", STRING)
     text = string("x" * 991)  # a thousand bytes

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from appliance.ros.definitions import Bulk
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
+from appliance.ros.payload.definitions import Bulk
 from appliance.ros.qos import mqtt_qos, mqtt_retain, publisher_qos, subscription_qos
 
 BEST_EFFORT, RELIABLE = Reliability.BEST_EFFORT, Reliability.RELIABLE

@@ -25,7 +25,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 V5, V311 = paho.MQTTv5, paho.MQTTv311
 both = pytest.mark.parametrize("version", [V5, V311], ids=["v5", "v311"])

@@ -11,9 +11,9 @@ import pytest
 from waiting import until
 
 from appliance.broker.faults import Faults
-from appliance.entries import Entries
-from appliance.ros import ros1_ends
-from appliance.ros.ros1 import Ros1Node
+from appliance.net.callbacks import Entries
+from appliance.ros.ros1 import endpoints as ros1_ends
+from appliance.ros.ros1.node import Ros1Node
 
 
 def fail(*_: object) -> None:
@@ -51,7 +51,7 @@ async def test_a_message_is_taken_behind_one_that_failed(
 ) -> None:
     made: list[Any] = []
     monkeypatch.setattr(
-        "appliance.ros.ros1.Subscription", lambda *arguments: made.append(arguments[-1])
+        "appliance.ros.ros1.node.Subscription", lambda *arguments: made.append(arguments[-1])
     )
     monkeypatch.setattr(node, "_definition", lambda type_name: None)
     qos: Any = SimpleNamespace(durability=None)

@@ -19,14 +19,15 @@ from waiting import PATIENCE, until
 from appliance.broker.broker import Broker
 from appliance.broker.faults import Faults
 from appliance.broker.message import Message
-from appliance.entries import Entries
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros import fastdds, installation, ros2
+from appliance.net.callbacks import Entries
 from appliance.ros.bridge import Bridge, RouteSettings
-from appliance.ros.convert import compile_converter
 from appliance.ros.node import BusError, QosProfile, Reliability
+from appliance.ros.payload.converter import compile_converter
+from appliance.ros.ros2 import fastdds, installation
+from appliance.ros.ros2 import node as ros2
 from appliance.store import MemoryStore
 
 pytest.importorskip("rclpy")
@@ -723,7 +724,7 @@ async def test_demo_robot_drives_and_stops(house):
         route("/cmd_vel", "ros"),
     )
     robot = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.demo", env=for_other_programs()
+        sys.executable, "-m", "appliance.cli.demo_robot", env=for_other_programs()
     )
     try:
         for name in ("odom", "battery", "scan", "chatter", "robot_description"):

@@ -10,10 +10,10 @@ from test_ros2 import STRING, domain, peer, string
 from waiting import until
 
 from appliance.broker.faults import Faults
-from appliance.entries import Entries
-from appliance.ros import ros2
+from appliance.net.callbacks import Entries
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import QosProfile
+from appliance.ros.ros2 import node as ros2
 
 __all__ = ["domain", "peer"]  # fixtures
 

@@ -17,13 +17,14 @@ pytest.importorskip("rclpy")
 from test_ros2 import BYTES, STRING, domain, house, peer, route, string
 
 from appliance.broker.faults import Faults
-from appliance.entries import Entries
-from appliance.ros import ros2, ros2_loop
+from appliance.net.callbacks import Entries
 from appliance.ros.bridge import Bridge
-from appliance.ros.convert import compile_converter
-from appliance.ros.definitions import load_description
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import QosProfile
+from appliance.ros.payload.converter import compile_converter
+from appliance.ros.payload.definitions import load_description
+from appliance.ros.ros2 import loop_subscription as ros2_loop
+from appliance.ros.ros2 import node as ros2
 
 JOINTS = "sensor_msgs/msg/JointState"
 

@@ -17,20 +17,21 @@ import yaml
 from waiting import until
 
 from appliance import config
-from appliance.doctor import ros as doctor
-from appliance.environment import for_other_programs
-from appliance.ros import ros2, ros2_loop
+from appliance.host.environment import for_other_programs
+from appliance.ops.doctor import ros as doctor
 from appliance.ros.bridge import Bridge
+from appliance.ros.ros2 import loop_subscription as ros2_loop
+from appliance.ros.ros2 import node as ros2
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
 from test_ros2 import STRING, House, Peer, domain, route, string
 
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
 from appliance.ros.diagnostics import TYPE
 from appliance.ros.graph import CallRoutes, ServiceSettings
-from appliance.ros.reach import Reach, reach
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
+from appliance.ros.ros2.network_scope import Reach, reach
 
 __all__ = ["domain"]  # a fixture for all tests here
 

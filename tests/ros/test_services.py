@@ -18,13 +18,13 @@ from appliance.broker.message import Late, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros import calls
 from appliance.ros.bridge import Bridge
-from appliance.ros.calls import CallLimits
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
+from appliance.ros.calls import dispatcher as calls
+from appliance.ros.calls.dispatcher import CallLimits
 from appliance.ros.node import FakeNode
-from appliance.ros.payloads import InputLimits
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
+from appliance.ros.payload.payloads import InputLimits
 
 SET_BOOL, TRIGGER = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
 CONVERTERS = Converters(load_description)

@@ -16,15 +16,16 @@ from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
 from appliance.broker.ledger import Ledger
 from appliance.broker.ports import Identity, Limits
-from appliance.entries import Entries
-from appliance.ros import actions, turns
+from appliance.net.callbacks import Entries
 from appliance.ros.bridge import RouteSettings
-from appliance.ros.calls import CallLimits
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import load_description
-from appliance.ros.fair import FairTable
+from appliance.ros.calls import actions
+from appliance.ros.calls.dispatcher import CallLimits
+from appliance.ros.calls.fair import FairTable
 from appliance.ros.node import FakeNode
-from appliance.ros.payloads import InputLimits
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.definitions import load_description
+from appliance.ros.payload.payloads import InputLimits
+from appliance.ros.topics import conversions as turns
 from appliance.store import MemoryStore
 
 CONVERTERS = Converters(load_description)

@@ -11,11 +11,12 @@ from waiting import until
 pytest.importorskip("std_srvs.srv")
 from call_house import AllTypes, House, action, call_routes, parameters, service
 
-from appliance import cli, control
+from appliance.cli import main as cli
+from appliance.ops import control
 from appliance.ros.bridge import RouteSettings
-from appliance.ros.definitions import UnknownTypeError
 from appliance.ros.node import FakeNode
-from appliance.ros.skips import MOST_TOLD
+from appliance.ros.payload.definitions import UnknownTypeError
+from appliance.ros.skipped import MOST_TOLD
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from appliance.ros import uncompiled
-from appliance.ros.definitions import UnknownTypeError, describe, load_description
-from appliance.ros.ros2 import load_message
+from appliance.ros.payload import uncompiled
+from appliance.ros.payload.definitions import UnknownTypeError, describe, load_description
+from appliance.ros.ros2.node import load_message
 
 INSTALLED = sorted(
     Path(sys.prefix).glob("share/*/msg/*.msg"), key=lambda path: (path.parts[-3], path.stem)

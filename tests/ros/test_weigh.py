@@ -14,12 +14,9 @@ pytest.importorskip("test_msgs.msg")
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.ros.arrays import Numbers
-from appliance.ros.careful import ConversionError, TooLargeError
-from appliance.ros.convert import Converters
-from appliance.ros.definitions import PRIMITIVES, load_description
-from appliance.ros.payloads import InputLimits, unpacker
-from appliance.ros.weigh import (
+from appliance.ros.payload.arrays import Numbers
+from appliance.ros.payload.converter import Converters
+from appliance.ros.payload.cost import (
     TAG_WEIGHT,
     TEXT_BYTES,
     WEIGHT,
@@ -27,6 +24,9 @@ from appliance.ros.weigh import (
     weigh_cbor,
     weigh_json,
 )
+from appliance.ros.payload.definitions import PRIMITIVES, load_description
+from appliance.ros.payload.fallback import ConversionError, TooLargeError
+from appliance.ros.payload.payloads import InputLimits, unpacker
 
 MIB = (1 << 20) - 4096  # with what is around it
 CONVERTERS = Converters(load_description)

@@ -40,9 +40,9 @@ def talker(name, inside=None):
 
 
 def listen(discovery):
-    from appliance.ros import discovery as discoveries
     from appliance.ros.node import QosProfile
-    from appliance.ros.ros2 import Ros2Node
+    from appliance.ros.ros2 import discovery as discoveries
+    from appliance.ros.ros2.node import Ros2Node
 
     discoveries.use(discovery, os.environ)
     node = Ros2Node("bridge")

@@ -24,12 +24,12 @@ from pathlib import Path
 import genpy
 import rospy
 
-from appliance.ros import cbor
-from appliance.ros.careful import decode as careful_decode
-from appliance.ros.convert import ConversionError, Converters
-from appliance.ros.generate import MISFIT
-from appliance.ros.ros1_types import describe, full_name, installed
-from appliance.ros.schema import json_schema
+from appliance.ros.payload import cbor
+from appliance.ros.payload.codegen import MISFIT
+from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.fallback import decode as careful_decode
+from appliance.ros.payload.schema import json_schema
+from appliance.ros.ros1.types import describe, full_name, installed
 
 VARIANTS = ("default", "smallest", "largest", "random 1", "random 2")
 

@@ -38,7 +38,7 @@ else:
     import tomli as tomllib
 
 import appliance
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 #: Runs a command of the appliance's: its exit code, and what it says.

@@ -25,7 +25,7 @@ from ros1_world import (
 )
 from waiting import PATIENCE, eventually
 
-from appliance.environment import for_other_programs
+from appliance.host.environment import for_other_programs
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -288,7 +288,7 @@ def test_parameters(world: World, appliance: Ros1Appliance) -> None:
 def test_the_commands_show_what_is_bridged(robot: Node, appliance: Ros1Appliance) -> None:
     out = subprocess.run(
         [appliance.python, "-m", "appliance", "routes", "-c", appliance.config],
-        env={**os.environ, **appliance.environment},
+        env={**os.environ, **appliance.host.environment},
         capture_output=True,
         text=True,
         check=True,

@@ -19,8 +19,8 @@ from ros1_world import Mqtt, Node, Python, Ros1Appliance, Run, World, end, is_in
 from waiting import eventually
 
 from appliance.ros.node import BusError
-from appliance.ros.ros1 import POLL_INTERVAL
-from appliance.ros.ros1_peers import ask_publisher
+from appliance.ros.ros1.node import POLL_INTERVAL
+from appliance.ros.ros1.peers import ask_publisher
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"

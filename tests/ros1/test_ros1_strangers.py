@@ -20,7 +20,7 @@ import pytest
 from ros1_world import SYSTEM_PYTHON, Mqtt, Python, Ros1Appliance, World, end, is_installed
 from waiting import PATIENCE, eventually
 
-from appliance.ros.ros1_types import LARGEST_MESSAGE
+from appliance.ros.ros1.types import LARGEST_MESSAGE
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"

@@ -8,14 +8,14 @@ import struct
 import pytest
 
 from appliance.ros.bridge import Bridge  # noqa: F401  (it knows all modules that it needs)
-from appliance.ros.convert import ConversionError, compile_converter
-from appliance.ros.definitions import PACKED, UnknownTypeError
-from appliance.ros.flows import Echo
-from appliance.ros.goals import STATES
+from appliance.ros.calls.goals import STATES
 from appliance.ros.node import BusError
-from appliance.ros.ros1_actions import describe_action, find_actions, to_feedback, to_status
-from appliance.ros.ros1_peers import parse_header
-from appliance.ros.ros1_types import describe, full_name, installed, ros1_name
+from appliance.ros.payload.converter import ConversionError, compile_converter
+from appliance.ros.payload.definitions import PACKED, UnknownTypeError
+from appliance.ros.ros1.actions import describe_action, find_actions, to_feedback, to_status
+from appliance.ros.ros1.peers import parse_header
+from appliance.ros.ros1.types import describe, full_name, installed, ros1_name
+from appliance.ros.topics.flows import Echo
 
 RULE = "\n" + "=" * 80 + "\n"
 STAMPED = f"""\

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from appliance import config, crash, logs
+from appliance import config
 from appliance.broker.faults import Faults
-from appliance.crash import KEPT, LARGEST, OF_ONE_RUN, CrashReports
+from appliance.ops import crash, logs
+from appliance.ops.crash import KEPT, LARGEST, OF_ONE_RUN, CrashReports
 
 SETTINGS = """\
 robot: r2d2
@@ -92,7 +93,7 @@ def test_secrets_in_what_failed_are_masked_too(
 def test_what_is_no_text_is_reported_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file's name may have any bytes in it, and be in an error."""
     # pytest sends what is logged to another process, which such text keeps it from.
-    monkeypatch.setattr(logging.getLogger("appliance.crash"), "propagate", False)
+    monkeypatch.setattr(logging.getLogger("appliance.ops.crash"), "propagate", False)
     found = started(folder)
     found.report(OSError("no such file: \udcff.yaml"), "a task failed")
     found.stop()
@@ -153,7 +154,7 @@ def test_a_signal_whoever_else_wants_its_report(folder: Path) -> None:
 
 
 def test_killed_is_no_crash(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "appliance.crash")
+    caplog.set_level(logging.INFO, "appliance.ops.crash")
     killed = started(folder)
     os.close(killed._running or -1)
     killed._running = None

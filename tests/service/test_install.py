@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 import yaml
 
-from appliance.commands.install import install as install_command
+from appliance.cli.install import install as install_command
 from appliance.config import load
-from appliance.init import Credentials
-from appliance.install import Installation, InstallError
-from appliance.unit import Unit
+from appliance.ops.init import Credentials
+from appliance.ops.install import Installation, InstallError
+from appliance.ops.unit import Unit
 
 PROJECT = Path(__file__).resolve().parent.parent.parent
 COMMAND = Path("usr/local/bin/appliance")
@@ -548,8 +548,8 @@ def test_the_debian_package(tmp_path: Path) -> None:
 
 
 def test_the_first_configuration_is_one(tmp_path: Path) -> None:
-    from appliance.init import CONFIGURATION
-    from appliance.install import _SERVICE_PATHS
+    from appliance.ops.init import CONFIGURATION
+    from appliance.ops.install import _SERVICE_PATHS
 
     text = CONFIGURATION.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1).format(robot="r2d2")
     assert yaml.safe_load(text).keys() == {

@@ -17,9 +17,9 @@ from raw_client import RawClient
 from waiting import eventually
 
 from appliance.broker.faults import Faults
-from appliance.control import ask
-from appliance.entries import Entries
-from appliance.notify import Notifier
+from appliance.net.callbacks import Entries
+from appliance.ops.control import ask
+from appliance.ops.sd_notify import Notifier
 from service.supervisor import NotifySocket, Supervised
 
 WATCHDOG = 1.0
@@ -157,7 +157,7 @@ async def test_what_systemd_did_not_take_is_told_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it waits for READY=1, and ends a service that has long been ready."""
-    monkeypatch.setattr("appliance.notify.PATIENCE", 0.01)
+    monkeypatch.setattr("appliance.ops.sd_notify.PATIENCE", 0.01)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         listening.bind(str(tmp_path / "notify"))
         listening.setblocking(False)
@@ -183,7 +183,7 @@ async def test_what_systemd_did_not_take_is_told_again(
 async def test_a_status_that_fails_does_not_end_the_signs_of_life(
     monkeypatch: pytest.MonkeyPatch, escaped: list[str]
 ) -> None:
-    monkeypatch.setattr("appliance.notify.STATUS_INTERVAL", 0.02)
+    monkeypatch.setattr("appliance.ops.sd_notify.STATUS_INTERVAL", 0.02)
     own = entries()
     texts = iter(["fine"])
     with NotifySocket() as notify:

@@ -14,7 +14,7 @@ import pytest
 from appliance_process import ACL, ApplianceProcess
 from raw_client import RawClient
 
-from appliance import cli
+from appliance.cli import main as cli
 from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription
 
 

@@ -1,0 +1,245 @@
+"""Taking over changed files while everything runs: all of them, or none."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final, cast
+
+from pydantic import BaseModel
+
+from appliance import config
+from appliance.access import AccessFileError, Changes, FileAccess, Rules
+from appliance.app import wiring
+from appliance.broker.broker import Broker
+from appliance.certs import CertificateError, LoadedTls, TlsContexts
+from appliance.certs.settings import tls_files, tls_policies
+from appliance.config import ConfigError, Settings
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.listeners import Listeners
+from appliance.ops import logs
+from appliance.ops.audit import Audit
+from appliance.ros import settings as ros_settings
+from appliance.ros.bridge import Bridge
+
+log = logging.getLogger(__name__)
+
+#: What holds from the start on, for as long as the process runs.
+NEEDS_RESTART: Final = (
+    "robot",
+    "control",
+    "reload_on_change",
+    "crash_reports",
+    "broker.store",
+    "broker.plugins",
+    "broker.plugin_answers",
+    "broker.audit",
+    "broker.sys_interval",
+    "broker.limits.connect_timeout",
+    "broker.limits.failed_logins",
+    "bridge.bus",
+    "bridge.discovery",
+    "bridge.node",
+    "bridge.namespace",
+    "bridge.domain_id",
+    "bridge.ros_arguments",
+    "bridge.use_sim_time",
+    "bridge.diagnostics",
+)
+
+
+class ReloadError(Exception):
+    """Nothing was taken over; the text says all that is in the way."""
+
+
+@dataclass(slots=True)
+class Parts:
+    """What a reload changes."""
+
+    settings: Settings
+    access: FileAccess
+    tls: TlsContexts | None
+    broker: Broker
+    listeners: Listeners
+    bridge: Bridge | None
+    audit: Audit | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a reload went: when by the loop's clock, whether it was done, and what was said of it."""
+
+    at: float
+    done: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """What all files say now, checked, and not in force yet."""
+
+    settings: Settings
+    rules: Rules
+    tls: LoadedTls | None
+
+
+class Reload:
+    """Reloads the parts, one time after the other; belongs to the event loop's thread."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._turn = asyncio.Lock()
+        #: Of the last one; None when there was none.
+        self.outcome: Outcome | None = None
+        #: What the last one that changed anything has changed, and when; empty when none did.
+        self.last_change = ""
+
+    @property
+    def settings(self) -> Settings:
+        """Those that are in force."""
+        return self._parts.settings
+
+    def files(self) -> set[Path]:
+        """Everything that a reload reads."""
+        parts = self._parts
+        found = set(parts.access.in_force.files)
+        if parts.settings.file is not None:
+            found.add(parts.settings.file)
+        if parts.tls is not None:
+            files = parts.tls.files
+            paths = (files.certificate, files.key, files.ca, files.revocations)
+            found |= {path for path in paths if path is not None}
+        return found
+
+    async def run(self) -> list[str]:
+        """Take over what the files say now; returns what has changed, in words.
+
+        Raises:
+            ReloadError: something is wrong; what was in force stays so.
+        """
+        async with self._turn:
+            try:
+                changed = await self._run()
+            except ReloadError as error:
+                self._ended(False, str(error))
+                told = str(error).replace("\n", "; ")
+                log.error("not reloaded, what was in force stays so: %s", told)
+                if self._parts.audit is not None:
+                    self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
+                raise
+            text = ", ".join(changed) or "nothing has changed"
+            if changed:
+                self.last_change = f"which was at {datetime.now():%H:%M:%S}: {text}"
+            self._ended(True, text)
+            log.info("reloaded: %s", text)
+            return changed
+
+    def _ended(self, done: bool, text: str) -> None:
+        self.outcome = Outcome(asyncio.get_running_loop().time(), done, text)
+
+    async def renewed(self) -> None:
+        """Take over the server's certificate, which is a new one.
+
+        Raises:
+            CertificateError: it, or another file of certificates, cannot be used.
+        """
+        async with self._turn:
+            tls = self._parts.tls
+            if tls is not None:
+                self._take_certificates(tls, await asyncio.to_thread(tls.prepare))
+
+    async def _run(self) -> list[str]:
+        parts = self._parts
+        try:
+            # In a thread: long files take their time, and a password in one does not wait for that.
+            read = await asyncio.to_thread(_read, parts)
+        except (ConfigError, AccessFileError, CertificateError) as error:
+            raise ReloadError(str(error)) from None
+        before, settings = parts.settings, read.settings
+        wanted = wiring.listener_settings(settings, parts.tls)
+        try:
+            doors = parts.listeners.prepare(wanted)
+        except OSError as error:
+            raise ReloadError(str(error)) from None
+        # From here on nothing fails.
+        parts.settings = settings
+        changed = [*_differences(before, settings)]
+        parts.broker.use(wiring.broker_limits(settings), wiring.features(settings))
+        parts.listeners.take(doors, wanted, wiring.admission(settings))
+        if parts.tls is not None and read.tls is not None:
+            changed += self._take_certificates(parts.tls, read.tls)
+        rights = parts.access.adopt(read.rules)
+        changed += self._take_access(rights)
+        if parts.bridge is not None:
+            parts.bridge.replace(ros_settings.routes(settings))
+            parts.bridge.calls.replace(ros_settings.call_routes(settings))
+            parts.bridge.forget_leftovers()
+        if before.log != settings.log:
+            logs.setup(settings.log.level, settings.log.levels, settings.log.format)
+        parts.broker.rules_changed()
+        parts.broker.flush()
+        if parts.audit is not None and changed:
+            parts.audit.changed(", ".join(changed), **asdict(rights))
+        return changed
+
+    def _take_certificates(self, tls: TlsContexts, loaded: LoadedTls) -> list[str]:
+        """Let them hold for the connections that are open, too."""
+        if not tls.take(loaded):
+            return []
+        listeners = self._parts.listeners
+        listeners.network.in_background(listeners.check_certificates())
+        return ["certificates"]
+
+    def _take_access(self, changes: Changes) -> list[str]:
+        """Let connected clients have the rights that they have now, and no others."""
+        removed = set(changes.users_removed)  # others are known to plugins
+        for session in list(self._parts.broker.sessions.values()):
+            if session.identity and session.identity.username in removed:
+                session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
+        words = {
+            "users_added": "new users: ",
+            "users_removed": "users removed: ",
+            "passwords_changed": "new passwords of: ",
+        }
+        told = [
+            text + ", ".join(names)
+            for field, text in words.items()
+            if (names := getattr(changes, field))
+        ]
+        return told + (["access rules"] if changes.rules_changed else [])
+
+
+def _read(parts: Parts) -> _Read:
+    """Everything that a reload needs from files; raises what is wrong with them."""
+    before = parts.settings
+    settings = before if before.file is None else config.load(before.file)
+    fixed = [
+        f"{path} can only change with a restart"
+        for path in _differences(before, settings)
+        if path.startswith(NEEDS_RESTART)
+    ]
+    policies = tls_policies(settings.broker)
+    if bool(policies) is not (parts.tls is not None):
+        fixed.append("the first listener with TLS, and the last, can only change with a restart")
+    if fixed:
+        raise ReloadError("; ".join(fixed))
+    rules = Rules.read(*wiring.access_files(settings), settings.robot, settings.broker.anonymous)
+    tls = None
+    if parts.tls is not None:
+        broker = settings.broker
+        tls = parts.tls.prepare(tls_files(broker), policies, broker.tls.username_from)
+    return _Read(settings, rules, tls)
+
+
+def _differences(before: BaseModel, after: BaseModel, path: str = "") -> Iterator[str]:
+    """The keys whose values are not the same."""
+    for name in type(before).model_fields:
+        old, new = getattr(before, name), getattr(after, name)
+        if isinstance(old, BaseModel):
+            yield from _differences(old, cast(BaseModel, new), f"{path}{name}.")
+        elif old != new:
+            yield path + name

@@ -1,0 +1,177 @@
+"""The commands `appliance user` and `appliance acl`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from appliance.cli.console import (
+    CommandError,
+    ConfigOption,
+    GenerateOption,
+    PasswordFileOption,
+    load,
+    new_password,
+    shown,
+)
+
+if TYPE_CHECKING:
+    from appliance.access import Passwords
+    from appliance.config import Settings
+
+user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
+acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
+
+
+@user_app.command("add")
+def user_add(
+    name: str,
+    config: ConfigOption = None,
+    password_file: PasswordFileOption = None,
+    generate: GenerateOption = False,
+    scram: Annotated[
+        bool,
+        typer.Option(
+            "--scram",
+            help="Keep the password for SCRAM-SHA-256, MQTT 5's login that does not send it; one "
+            "that sends it works too.",
+        ),
+    ] = False,
+) -> None:
+    """Add a user; the password is asked for unless an option says where it comes from."""
+    settings = load(config)
+    with _users(settings, new=True) as users:
+        if name in users.users():
+            raise CommandError(
+                f"there is a user {name!r} already; `appliance user passwd` changes it"
+            )
+        _set_password(users, name, password_file, generate, scram)
+    typer.echo(f"user {name} added to {shown(users.path)}")
+    _note(settings, "user added", name)
+
+
+@user_app.command("passwd")
+def user_passwd(
+    name: str,
+    config: ConfigOption = None,
+    password_file: PasswordFileOption = None,
+    generate: GenerateOption = False,
+    scram: Annotated[
+        bool | None,
+        typer.Option(
+            "--scram/--no-scram",
+            help="Keep the password for SCRAM-SHA-256, or as argon2id; else as it is kept now.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Change a user's password."""
+    settings = load(config)
+    with _users(settings) as users:
+        if name not in users.users():
+            raise CommandError(_no_user(name, users))
+        _set_password(users, name, password_file, generate, scram)
+    typer.echo(f"password of user {name} changed")
+    _note(settings, "password changed", name)
+
+
+@user_app.command("remove")
+def user_remove(name: str, config: ConfigOption = None) -> None:
+    """Remove a user."""
+    settings = load(config)
+    with _users(settings) as users:
+        try:
+            users.remove(name)
+        except KeyError:
+            raise CommandError(_no_user(name, users)) from None
+        users.save()
+    typer.echo(f"user {name} removed")
+    _note(settings, "user removed", name)
+
+
+@user_app.command("list")
+def user_list(config: ConfigOption = None) -> None:
+    """Print the users' names, one a line, and how each one's password is kept."""
+    with _users(load(config)) as users:
+        names = users.users()
+        width = max(map(len, names), default=0)
+        for name in names:
+            typer.echo(f"{name:{width}}  {users.kind_of(name)}")
+
+
+@contextmanager
+def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
+    """The users file; what is wrong with it, or with writing it, is a CommandError."""
+    from appliance.access import AccessFileError, Passwords
+    from appliance.host.owners import OwnerError, acting_for
+
+    path = settings.broker.users
+    try:
+        with acting_for(settings.file, path):
+            users = Passwords(path) if new and not path.exists() else Passwords.load(path)
+            yield users
+    except (AccessFileError, OwnerError) as error:
+        raise CommandError(str(error)) from None
+
+
+def _note(settings: Settings, what: str, user: str) -> None:
+    """Have a change in the audit log, if there is one; it is done whether that works or not."""
+    from appliance.host.owners import OwnerError, acting_for
+    from appliance.ops.audit import note
+
+    path = settings.broker.audit.path
+    try:
+        with acting_for(settings.file, path):
+            note(path, what, user=user)
+    except (OSError, OwnerError) as error:
+        reason = getattr(error, "strerror", None) or error
+        message = f"appliance: {path}: this is not in the audit log ({reason})"
+        typer.secho(message, fg="yellow", err=True)
+
+
+def _no_user(name: str, users: Passwords) -> str:
+    return f"there is no user {name!r} in {shown(users.path)}"
+
+
+def _set_password(
+    users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
+) -> None:
+    password = new_password(name, file, generate)
+    try:
+        users.set(name, password, scram)
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+    users.save()
+    if generate:
+        typer.echo(f"password {password}")
+
+
+@acl_app.command("explain")
+def acl_explain(
+    user: Annotated[str, typer.Argument(help="The user's name; '' for a client without one.")],
+    topic: Annotated[str, typer.Argument(help="A topic, or a filter with + and #.")],
+    client_id: Annotated[
+        str, typer.Option(help="For rules with %c; else one that no rule speaks of.")
+    ] = "",
+    config: ConfigOption = None,
+) -> None:
+    """Say what a user may do with a topic, and which rule of which file decides it."""
+    settings = load(config)
+    from appliance.access import AccessFileError, Acl, Passwords
+    from appliance.broker.ports import Identity
+
+    try:
+        acl = Acl.load(settings.broker.acl, settings.robot)
+        explanation = acl.explain(Identity(user or None, client_id), topic)
+    except AccessFileError as error:
+        raise CommandError(str(error)) from None
+    except ValueError as error:
+        raise typer.BadParameter(f"{topic!r}: {error}") from None
+    typer.echo(str(explanation))
+    with suppress(AccessFileError):
+        users = Passwords.load(settings.broker.users)
+        if user and user not in users.users():
+            typer.secho(f"note: {_no_user(user, users)}", fg="yellow", err=True)

@@ -1,0 +1,90 @@
+"""The commands `appliance pub` and `appliance sub`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.cli.connection import Connection, connecting
+from appliance.cli.console import CommandError
+
+_EXPLAINED = "On the robot, `appliance acl explain USER TOPIC` says which rule decides it."
+
+
+@connecting
+def pub(
+    connection: Connection,
+    topic: str,
+    message: Annotated[
+        str | None, typer.Option("--message", "-m", help="The payload; else standard input.")
+    ] = None,
+    file: Annotated[
+        Path | None, typer.Option("--file", "-f", metavar="FILE", help="The payload's file.")
+    ] = None,
+    lines: Annotated[
+        bool, typer.Option("--lines", "-l", help="Each line of standard input is a message.")
+    ] = False,
+    qos: Annotated[
+        int, typer.Option("--qos", "-q", min=0, max=2, help="From 1 on, a refusal is told.")
+    ] = 1,
+    retain: Annotated[bool, typer.Option("--retain", "-r", help="Keep it on the broker.")] = False,
+) -> None:
+    """Publish a message."""
+    if (message is not None) + (file is not None) + lines > 1:
+        raise typer.BadParameter("--message, --file and --lines exclude each other")
+    payloads: Iterable[bytes]
+    if lines:
+        payloads = (line.rstrip(b"\r\n") for line in sys.stdin.buffer)
+    elif file is not None:
+        payloads = [file.read_bytes()]
+    else:
+        payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
+    from appliance.cli import mqtt_client as client
+
+    try:
+        client.publish(connection.target(), topic, payloads, qos, retain)
+    except client.RefusedError as error:
+        raise CommandError(str(error.advised(_EXPLAINED))) from None
+    except client.ClientError as error:
+        raise CommandError(str(error)) from None
+
+
+@connecting
+def sub(
+    connection: Connection,
+    filters: Annotated[list[str], typer.Argument(metavar="FILTER...")],
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="The topic before each payload.")
+    ] = False,
+    count: Annotated[
+        int | None, typer.Option("--count", "-C", min=1, help="End after so many messages.")
+    ] = None,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", "-W", min=0, help="End after so many seconds (1 if too few)."),
+    ] = None,
+    qos: Annotated[int, typer.Option("--qos", "-q", min=0, max=2)] = 0,
+) -> None:
+    """Subscribe, and print what comes, a message a line."""
+    from appliance.cli import mqtt_client as client
+
+    try:
+        received = client.subscribe(
+            connection.target(),
+            filters,
+            qos,
+            sys.stdout.buffer,
+            verbose=verbose,
+            count=count,
+            timeout=timeout,
+        )
+    except client.RefusedError as error:
+        raise CommandError(str(error.advised(_EXPLAINED))) from None
+    except client.ClientError as error:
+        raise CommandError(str(error)) from None
+    if count is not None and received < count:
+        raise CommandError(f"{received} of {count} messages came within {timeout:g} s")

@@ -1,0 +1,202 @@
+"""A small robot to try the bridge with: `python -m appliance.cli.demo_robot`.
+
+It drives as `/cmd_vel` says and stops by itself when it has not been told anything for a second. It
+publishes `/odom`, `/battery`, `/scan`, `/chatter` and, once and kept for late comers,
+`/robot_description`. The service `/reset` (std_srvs/srv/Trigger) puts it back to its start. Units
+as in REP 103: m, rad, s, V. SIGTERM and SIGINT stop it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+import threading
+from importlib import import_module
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from appliance.ros.payload.definitions import import_message
+from appliance.ros.ros2 import fastdds
+from appliance.ros.ros2.node import available
+
+COMMAND_TIMEOUT = 1.0  # seconds
+ODOMETRY_RATE = 20.0  # Hz
+SCAN_RATE = 5.0  # Hz
+ROOM = 4.0  # m, the side of the square room that the laser scanner sees
+SCAN_POINTS = 360
+FULL, EMPTY = 12.6, 10.0  # V
+FULL_CHARGE_LASTS = 3600.0  # seconds
+
+TWIST = "geometry_msgs/msg/Twist"
+ODOMETRY = "nav_msgs/msg/Odometry"
+BATTERY = "sensor_msgs/msg/BatteryState"
+SCAN = "sensor_msgs/msg/LaserScan"
+STRING = "std_msgs/msg/String"
+TYPES = (TWIST, ODOMETRY, BATTERY, SCAN, STRING)
+
+DESCRIPTION = """<robot name="demo">
+  <link name="base_link">
+    <visual><geometry><cylinder radius="0.2" length="0.1"/></geometry></visual>
+  </link>
+</robot>
+"""
+
+
+class Drive:
+    """Where a robot with two wheels is, `x` and `y` in m and `heading` in rad, and its speed."""
+
+    def __init__(self) -> None:
+        self.x = self.y = self.heading = 0.0
+        self.linear = self.angular = 0.0
+        self._commanded_at = -math.inf
+
+    def command(self, linear: float, angular: float, now: float) -> None:
+        """Drive at `linear` m/s and `angular` rad/s; what is not a finite number stops."""
+        finite = math.isfinite(linear) and math.isfinite(angular)
+        self.linear, self.angular = (linear, angular) if finite else (0.0, 0.0)
+        self._commanded_at = now
+
+    def advance(self, seconds: float, now: float) -> None:
+        """Move on; without a command for COMMAND_TIMEOUT the robot stands."""
+        if now - self._commanded_at > COMMAND_TIMEOUT:
+            self.linear = self.angular = 0.0
+        middle = self.heading + self.angular * seconds / 2
+        self.x += self.linear * math.cos(middle) * seconds
+        self.y += self.linear * math.sin(middle) * seconds
+        heading = self.heading + self.angular * seconds
+        self.heading = math.atan2(math.sin(heading), math.cos(heading))
+
+    def scan(self) -> list[float]:
+        """The distances in m to the walls of the room, counter-clockwise from straight ahead.
+
+        The room moves along when the robot leaves it, so that there is always something to see.
+        """
+        half = ROOM / 2
+        x = (self.x + half) % ROOM - half
+        y = (self.y + half) % ROOM - half
+        distances = []
+        for point in range(SCAN_POINTS):
+            angle = self.heading + 2 * math.pi * point / SCAN_POINTS
+            cos, sin = math.cos(angle), math.sin(angle)
+            to_x = (math.copysign(half, cos) - x) / cos if abs(cos) > 1e-9 else math.inf
+            to_y = (math.copysign(half, sin) - y) / sin if abs(sin) > 1e-9 else math.inf
+            distances.append(min(to_x, to_y))
+        return distances
+
+
+class DemoRobot:
+    """The ROS node; everything in it happens on the executor's thread."""
+
+    def __init__(self, node: Any) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+
+        # By name, as these packages come without types for mypy.
+        self._types = {name: import_message(name) for name in TYPES}
+        twist, odometry, battery, scan, string = self._types.values()
+        self._node = node
+        self._drive = Drive()
+        self._started = monotonic()
+        self._moved_at = self._started
+        self._count = 0
+        self._odometry = node.create_publisher(odometry, "/odom", 10)
+        self._battery = node.create_publisher(battery, "/battery", 10)
+        self._scan = node.create_publisher(scan, "/scan", qos_profile_sensor_data)
+        self._chatter = node.create_publisher(string, "/chatter", 10)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._description = node.create_publisher(string, "/robot_description", latched)
+        self._description.publish(string(data=DESCRIPTION))
+        node.create_subscription(twist, "/cmd_vel", self._on_command, 10)
+        trigger = import_module("std_srvs.srv").Trigger
+        node.create_service(trigger, "/reset", self._on_reset)
+        node.create_timer(1 / ODOMETRY_RATE, self._publish_odometry)
+        node.create_timer(1 / SCAN_RATE, self._publish_scan)
+        node.create_timer(1.0, self._publish_battery_and_chatter)
+
+    def _on_command(self, twist: Any) -> None:
+        self._drive.command(twist.linear.x, twist.angular.z, monotonic())
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        response.success = True
+        response.message = f"was {math.hypot(self._drive.x, self._drive.y):.1f} m from its start"
+        self._drive = Drive()
+        return response
+
+    def _new(self, type_name: str, frame: str) -> Any:
+        message: Any = self._types[type_name]()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = frame
+        return message
+
+    def _publish_odometry(self) -> None:
+        now = monotonic()
+        drive = self._drive
+        drive.advance(now - self._moved_at, now)
+        self._moved_at = now
+        message = self._new(ODOMETRY, "odom")
+        message.child_frame_id = "base_link"
+        message.pose.pose.position.x = drive.x
+        message.pose.pose.position.y = drive.y
+        message.pose.pose.orientation.z = math.sin(drive.heading / 2)
+        message.pose.pose.orientation.w = math.cos(drive.heading / 2)
+        message.twist.twist.linear.x = drive.linear
+        message.twist.twist.angular.z = drive.angular
+        self._odometry.publish(message)
+
+    def _publish_scan(self) -> None:
+        message = self._new(SCAN, "base_link")
+        message.angle_increment = 2 * math.pi / SCAN_POINTS
+        message.angle_max = 2 * math.pi - message.angle_increment
+        message.scan_time = 1 / SCAN_RATE
+        message.range_min = 0.05
+        message.range_max = 2 * ROOM
+        message.ranges = self._drive.scan()
+        self._scan.publish(message)
+
+    def _publish_battery_and_chatter(self) -> None:
+        message = self._new(BATTERY, "base_link")
+        charge = 1 - (monotonic() - self._started) % FULL_CHARGE_LASTS / FULL_CHARGE_LASTS
+        message.voltage = EMPTY + charge * (FULL - EMPTY)
+        message.percentage = charge
+        message.present = True
+        message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
+        # What is not measured is NaN, as the message's definition wants it.
+        message.current = message.charge = message.capacity = math.nan
+        message.design_capacity = message.temperature = math.nan
+        self._battery.publish(message)
+        self._count += 1
+        self._chatter.publish(self._types[STRING](data=f"Hello World: {self._count}"))
+
+
+def main() -> int:
+    """Run the robot until SIGTERM or SIGINT; returns the exit code."""
+    is_available, reason = available()
+    if not is_available:
+        sys.stderr.write(f"{Path(__file__).stem}: {reason}\n")
+        return 1
+    fastdds.use_profile(os.environ)
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.signals import SignalHandlerOptions
+
+    stopping = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopping.set())
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("demo_robot")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    DemoRobot(node)
+    while not stopping.is_set():
+        executor.spin_once(timeout_sec=0.2)
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

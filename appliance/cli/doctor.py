@@ -1,0 +1,40 @@
+"""The command itself: what is found, a line each, for people or for machines."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from appliance.cli.console import ConfigOption
+
+_COLOURS = {"ok": "green", "warning": "yellow", "problem": "red"}
+
+
+def doctor(
+    config: ConfigOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a finding.")] = False,
+) -> None:
+    """Look at all that the appliance needs, change nothing, and say what to do.
+
+    At ports, clock, certificates, disk, permissions, memory and ROS. The exit
+    code is 1 when there is a problem.
+    """
+    from appliance.ops.doctor.examination import examine
+
+    counts: Counter[str] = Counter()
+    for finding in examine(config):
+        counts[finding.level] += 1
+        if as_json:
+            typer.echo(json.dumps(asdict(finding), ensure_ascii=False))
+            continue
+        typer.secho(f"{finding.level:<8}", fg=_COLOURS[finding.level], nl=False)
+        typer.echo(f"{finding.subject}: {finding.text}")
+        if finding.advice:
+            typer.echo(f"{'':8}what to do: {finding.advice}")
+    if not as_json:
+        typer.echo(f"\nproblems: {counts['problem']}, warnings: {counts['warning']}")
+    raise typer.Exit(1 if counts["problem"] else 0)

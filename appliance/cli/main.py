@@ -1,0 +1,118 @@
+"""The command `appliance`.
+
+Imports are inside the commands, so that `--help` and `pub` do not wait for what they do not use.
+Exit codes: 0 done, 1 refused or failed (the reason is on standard error), 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from appliance.cli.access import acl_app, user_app
+from appliance.cli.calls import call, goal, param_app
+from appliance.cli.certs import cert_app
+from appliance.cli.client import pub, sub
+from appliance.cli.console import CommandError
+from appliance.cli.doctor import doctor
+from appliance.cli.fastdds import fastdds
+from appliance.cli.install import install, uninstall
+from appliance.cli.routes import routes
+from appliance.cli.running import bench, check, demo, init, reload, run
+from appliance.cli.status import status
+from appliance.cli.store import store_app
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="The robot's MQTT broker, with the bridge to ROS inside it.",
+)
+# In the order of the help.
+SETTING_UP = (init, run, check, reload)
+LOOKING = (status, doctor, routes)
+USING = (pub, sub, call, goal)
+for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
+    app.command()(command)
+GROUPS = {
+    "param": param_app,
+    "user": user_app,
+    "acl": acl_app,
+    "cert": cert_app,
+    "store": store_app,
+}
+for name, group in GROUPS.items():
+    app.add_typer(group, name=name)
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Runs the command and exits with its code; what a user can mend is told in plain words."""
+    _open_standard_streams()
+    given = sys.argv[1:] if arguments is None else arguments
+    given, ros_arguments = _split_ros_arguments(given)
+    try:
+        app(args=given, prog_name="appliance", obj=ros_arguments)
+    except CommandError as error:
+        typer.secho(f"appliance: {error}", fg="red", err=True)
+    except BrokenPipeError:  # `appliance sub … | head`: the reader has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except OSError as error:
+        what = error.strerror or str(error)
+        what = f"{error.filename}: {what}" if error.filename else what
+        typer.secho(f"appliance: {what}", fg="red", err=True)
+    sys.exit(1)
+
+
+def _open_standard_streams() -> None:
+    """Nothing else gets their numbers, such as the database, which C libraries would write to."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+
+
+def _split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Those of the command, and those between `--ros-args` and `--`, as ROS tools add them."""
+    ours: list[str] = []
+    ros: list[str] = []
+    to = ours
+    for argument in arguments:
+        if argument == "--ros-args":
+            to = ros
+        elif argument == "--" and to is ros:
+            to = ours
+        else:
+            to.append(argument)
+    return ours, ros
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.machinery import ExtensionFileLoader
+        from importlib.metadata import PackageNotFoundError, version
+        from importlib.util import find_spec
+
+        try:
+            text = f"appliance {version('ros-mqtt-appliance')}"
+        except PackageNotFoundError:
+            text = "appliance, run from its source without being installed"
+        broker = find_spec("appliance.broker.broker")
+        if broker is not None and isinstance(broker.loader, ExtensionFileLoader):
+            text += ", compiled"
+        typer.echo(text)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of `appliance` itself."""

@@ -1,0 +1,313 @@
+"""`appliance pub` and `appliance sub`: the command line's own MQTT client, on paho-mqtt and TLS."""
+
+from __future__ import annotations
+
+import re
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from appliance.ops.logs import VISIBLE, VISIBLE_IN_LINES
+
+ANSWER_TIMEOUT = 10.0  # seconds to wait for the broker's answer to a packet that needs one
+
+
+class ClientError(Exception):
+    """The broker could not be reached, or refused; the message says what and why."""
+
+
+class RefusedError(ClientError):
+    """The broker refused it; the message says what and, if the broker said so, why.
+
+    `by_rules` is whether its access rules may be the reason.
+    """
+
+    def __init__(self, message: str, *, by_rules: bool) -> None:
+        super().__init__(message)
+        self.by_rules = by_rules
+
+    def advised(self, advice: str) -> RefusedError:
+        """With what to do about access rules, where these may be the reason."""
+        return RefusedError(f"{self}. {advice}", by_rules=True) if self.by_rules else self
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the broker said of a packet: a code and, in MQTT 5, perhaps why."""
+
+    code: ReasonCode
+    properties: Properties | None
+
+    def __str__(self) -> str:
+        """In words, without what could command a terminal."""
+        return f"{self.code}: {self.why}" if self.why else str(self.code)
+
+    @property
+    def why(self) -> str:
+        """The server's reason string, if it gave one."""
+        return str(getattr(self.properties, "ReasonString", "")).translate(VISIBLE)
+
+    @property
+    def may_be_rules(self) -> bool:
+        """Whether it may be access rules that refuse it; 3.1.1 has one code for everything."""
+        return self.code.value in (0x80, 0x87)
+
+
+@dataclass(frozen=True)
+class Target:
+    """Which broker to talk to, how its certificate is checked, and as whom.
+
+    `certificate` is the client's own, with its key in the same file or in `key`.
+    """
+
+    host: str
+    port: int
+    ca: Path | None
+    username: str | None
+    password: str | None
+    client_id: str = ""
+    version: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv5
+    insecure: bool = False
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @property
+    def address(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def publish(target: Target, topic: str, payloads: Iterable[bytes], qos: int, retain: bool) -> None:
+    """Publishes each payload and waits for its acknowledgement. Raises ClientError."""
+    connection = Connection(target)
+    try:
+        for payload in payloads:
+            connection.publish(topic, payload, qos, retain)
+    finally:
+        connection.close()
+
+
+def subscribe(
+    target: Target,
+    filters: list[str],
+    qos: int,
+    output: BinaryIO,
+    *,
+    verbose: bool = False,
+    count: int | None = None,
+    timeout: float | None = None,
+) -> int:
+    """Writes messages to `output`, one a line, and returns how many there were.
+
+    Ends after `count` messages or `timeout` seconds, whichever is first; without either it goes on
+    until interrupted. Raises ClientError, also when the broker ends the connection.
+    """
+    received = 0
+
+    def show(message: paho.MQTTMessage) -> None:
+        nonlocal received
+        if count is not None and received >= count:
+            return
+        received += 1
+        line = (
+            message.topic.encode() + b" " + message.payload if verbose else bytes(message.payload)
+        )
+        write_line(output, line)
+
+    connection = Connection(target, show)
+    try:
+        connection.subscribe(filters, qos)
+        deadline = None if timeout is None else time.monotonic() + timeout
+        connection.run(lambda: count is not None and received >= count, deadline)
+    finally:
+        connection.close()
+    return received
+
+
+def write_line(output: BinaryIO, line: bytes) -> None:
+    """Writes it as it is, or so that a payload cannot send commands to a terminal."""
+    if output.isatty():
+        line = line.decode(errors="backslashreplace").translate(VISIBLE_IN_LINES).encode()
+    output.write(line + b"\n")
+    output.flush()
+
+
+class Connection:
+    """One connection, driven by the caller's thread; every failure is a ClientError."""
+
+    def __init__(
+        self, target: Target, on_message: Callable[[paho.MQTTMessage], None] = lambda message: None
+    ) -> None:
+        self._target = target
+        self._answer: Answer | None = None
+        self._granted: dict[int | None, list[Answer]] = {}
+        self._published: dict[int, Answer] = {}
+        self._ended: Answer | None = None
+        self._client = client = paho.Client(
+            CallbackAPIVersion.VERSION2, target.client_id, protocol=target.version
+        )
+        client.username_pw_set(target.username, target.password)
+        client.on_connect = lambda c, u, flags, code, p: setattr(self, "_answer", Answer(code, p))
+        client.on_disconnect = lambda c, u, flags, code, p: setattr(self, "_ended", Answer(code, p))
+        client.on_subscribe = lambda c, u, mid, codes, p: self._granted.update(
+            {mid: [Answer(code, p) for code in codes]}
+        )
+        client.on_publish = lambda c, u, mid, code, p: self._published.update(
+            {mid: Answer(code, p)}
+        )
+        client.on_message = lambda c, u, message: on_message(message)
+        context = _tls(target)
+        if target.certificate is not None:
+            _show_certificate(context, target.certificate, target.key)
+        client.tls_set_context(context)
+        client.tls_insecure_set(target.insecure)
+        self._connect()
+
+    def _connect(self) -> None:
+        target = self._target
+        try:
+            self._client.connect(target.host, target.port, keepalive=60)
+        except ssl.SSLCertVerificationError as error:
+            trusted = f"by {target.ca}" if target.ca else "by this computer's own list of CAs"
+            raise ClientError(
+                f"the certificate of {target.address} is not trusted {trusted}: "
+                f"{error.verify_message.rstrip('.')}. Name the ca.crt that this appliance's "
+                "`init` made with --ca, and connect by a name that the certificate has."
+            ) from None
+        except socket.gaierror:
+            raise ClientError(f"there is no computer called {target.host!r}") from None
+        except ssl.SSLError as error:
+            raise ClientError(
+                f"no TLS with {target.address}: {_reason(error)}; is this the port of a listener "
+                "with tls: true?"
+            ) from None
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise ClientError(f"{target.address} cannot be reached: {reason}") from None
+        self._wait(lambda: self._answer is not None, "the login")
+        answer = self._answer
+        if answer is not None and answer.code.is_failure:
+            who = f"user {target.username!r}" if target.username else "a client without user name"
+            hint = "" if answer.why else " (its log says why)"
+            raise ClientError(f"{target.address} refused {who}: {answer}{hint}")
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        qos: int,
+        retain: bool,
+        properties: Properties | None = None,
+    ) -> ReasonCode:
+        """Publishes, and returns what the broker said of it when it has taken it (QoS 0: when it
+        was sent). Raises RefusedError."""
+        try:
+            message = self._client.publish(topic, payload, qos, retain, properties)
+        except ValueError as error:
+            raise ClientError(f"{topic!r} cannot be published: {error}") from None
+        self._wait(lambda: message.mid in self._published, "a message")
+        answer = self._published.pop(message.mid)
+        if answer.code.is_failure:
+            # Of QoS 2 the library tells the end alone, and not the PUBREC that says why.
+            hint = " (--qos 1 tells why)" if qos == 2 and not answer.why else ""
+            text = f"{topic!r} was refused: {answer}{hint}"
+            raise RefusedError(text, by_rules=answer.may_be_rules)
+        return answer.code
+
+    def subscribe(self, filters: list[str], qos: int, *, retained: bool = True) -> None:
+        """Subscribes to all of the filters; with MQTT 5 also without what is retained there.
+
+        Raises RefusedError that names those refused.
+        """
+        handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+        if not retained:
+            handling = SubscribeOptions.RETAIN_DO_NOT_SEND
+        options = [(name, SubscribeOptions(qos, retainHandling=handling)) for name in filters]
+        try:
+            if self._target.version == MQTTProtocolVersion.MQTTv5:
+                _, mid = self._client.subscribe(options)
+            else:
+                _, mid = self._client.subscribe([(name, qos) for name in filters])
+        except ValueError as error:
+            raise ClientError(f"{', '.join(filters)}: {error}") from None
+        self._wait(lambda: mid in self._granted, "the subscription")
+        refused = [
+            (name, answer)
+            for name, answer in zip(filters, self._granted[mid], strict=False)
+            if answer.code.is_failure
+        ]
+        if refused:
+            text = "; ".join(f"{name!r} was refused: {answer.code}" for name, answer in refused)
+            why = refused[0][1].why  # one for all of them
+            by_rules = any(answer.may_be_rules for _, answer in refused)
+            raise RefusedError(f"{text}: {why}" if why else text, by_rules=by_rules)
+
+    def run(
+        self, done: Callable[[], bool], deadline: float | None = None, step: float = 1.0
+    ) -> bool:
+        """Works until `done()` or the deadline (monotonic clock); returns `done()`, which is asked
+        when something has come, and every `step` seconds."""
+        while not done():
+            left = step if deadline is None else min(step, deadline - time.monotonic())
+            if left <= 0:
+                return False
+            code = self._client.loop(left)
+            if done():
+                break
+            if self._ended is not None or code != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                known = self._ended is not None and self._ended.code.value >= 0x80
+                why = str(self._ended) if known else "without giving a reason"
+                raise ClientError(f"{self._target.address} ended the connection: {why}")
+        return True
+
+    def _wait(self, done: Callable[[], bool], what: str) -> None:
+        if not self.run(done, time.monotonic() + ANSWER_TIMEOUT):
+            raise ClientError(f"{self._target.address} gave no answer to {what}")
+
+    def close(self) -> None:
+        """Says goodbye and closes; harmless when the connection is gone already."""
+        self._client.disconnect()
+
+
+def _reason(error: ssl.SSLError) -> str:
+    """What OpenSSL says, without the line of Python's source that it came by."""
+    said = error.reason or re.sub(r"^\[SSL\] | \(_ssl\.c:\d+\)$", "", str(error.args[-1]))
+    return said.lower().replace("_", " ")
+
+
+def _tls(target: Target) -> ssl.SSLContext:
+    if target.insecure:
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        return context
+    try:
+        # With a CA given, only that one counts: a public one has no say about a robot.
+        return ssl.create_default_context(cafile=str(target.ca) if target.ca else None)
+    except ssl.SSLError:
+        raise ClientError(f"{target.ca} is not a CA certificate in PEM form") from None
+    except OSError as error:
+        raise ClientError(f"{target.ca} cannot be read: {error.strerror}") from None
+
+
+def _show_certificate(context: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
+    def no_password() -> str:
+        raise ClientError(f"{key or certificate} is encrypted; take its password off first")
+
+    try:
+        context.load_cert_chain(certificate, key, no_password)
+    except ssl.SSLError as error:
+        files = f"{certificate} and {key}" if key else f"{certificate} (without --key)"
+        raise ClientError(f"{files}: no certificate with its key: {_reason(error)}") from None
+    except OSError as error:
+        files = f"{certificate} or {key}" if key else str(certificate)
+        raise ClientError(f"{files} cannot be read: {error.strerror}") from None

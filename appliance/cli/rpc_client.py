@@ -1,0 +1,279 @@
+"""What `appliance call`, `goal` and `param` do: an MQTT client that calls.
+
+The answer to a call is asked for below the caller's own `_reply/{client id}`, which both versions
+of MQTT can and which takes no right to publish anywhere else.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import orjson
+import paho.mqtt.client as paho
+from paho.mqtt.enums import MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from appliance.cli.mqtt_client import ANSWER_TIMEOUT, ClientError, Connection, RefusedError, Target
+
+NO_MATCHING_SUBSCRIBERS = 0x10
+
+#: Seconds between two looks at whether the user wants to stop.
+STEP = 0.1
+
+#: Seconds without a further message after which all retained ones have come.
+QUIET = 0.5
+
+
+class CallFailedError(ClientError):
+    """The answer is an error; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a goal ended, `succeeded`, `canceled` or `aborted`, and the JSON of its result."""
+
+    status: str
+    result: bytes
+
+
+class Caller:
+    """A connection for calls. Every failure is a ClientError; `close` ends it."""
+
+    def __init__(self, target: Target) -> None:
+        if not target.client_id:  # which has to be known: it is a level of the answers' topics
+            target = replace(target, client_id=f"appliance-{secrets.token_hex(6)}")
+        self._target = target
+        self._is_v5 = target.version == MQTTProtocolVersion.MQTTv5
+        self._received: list[paho.MQTTMessage] = []
+        self._listening: set[str] = set()
+        self._connection = Connection(target, self._received.append)
+
+    def close(self) -> None:
+        self._connection.close()
+
+    def call(self, topic: str, payload: bytes, timeout: float) -> bytes:
+        """The JSON of the answer to a call that begins with JSON; waits up to `timeout` seconds."""
+        above = topic.rpartition("/")[0]
+        replies = f"{above}/_reply/{self._target.client_id}"
+        self._listen(f"{replies}/#", replies.replace(self._target.client_id, "%c"))
+        token = secrets.token_hex(4)
+        self._send(topic, token, payload, f"{replies}/{token}")
+
+        def answer() -> paho.MQTTMessage | None:
+            # What could not be answered as it was asked for is told one level above.
+            return self._take(lambda to: to in (replies, f"{replies}/{token}"))
+
+        message = self._wait_for(answer, timeout)
+        if message is None:
+            raise ClientError(f"no answer from {topic} within {timeout:g} s{self._perhaps()}")
+        value = decode(message)
+        if isinstance(value, dict) and isinstance(value.get("error"), dict):
+            error = value["error"]
+            text = f"{error.get('code')}: {error.get('message')}"
+            if error.get("code") == "bad_request" and not self._is_v5:
+                text += "; MQTT 3.1.1 cannot say that this is JSON, where the route takes another"
+            raise CallFailedError(text)
+        return encode(value)
+
+    def _listen(self, topic_filter: str, rule: str) -> None:
+        if topic_filter in self._listening:
+            return
+        try:
+            self._connection.subscribe([topic_filter], 1, retained=False)
+        except RefusedError as error:
+            advice = _as_ros_name(topic_filter)
+            line = f"The ACL line that allows it: pattern read {rule}/#"
+            raise error.advised(advice or line) from None
+        self._listening.add(topic_filter)
+
+    def _send(self, topic: str, token: str, payload: bytes, reply: str) -> None:
+        properties = None
+        if self._is_v5:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.ResponseTopic = reply
+            properties.CorrelationData = token.encode()
+            properties.ContentType = "application/json"
+        to = topic if self._is_v5 else f"{topic}/{token}"
+        try:
+            code: ReasonCode = self._connection.publish(to, payload, 1, False, properties)
+        except RefusedError as error:
+            advice = _as_ros_name(topic)
+            line = f"The ACL line that allows it: topic write {topic}/#"
+            raise error.advised(advice or line) from None
+        if code.value == NO_MATCHING_SUBSCRIBERS:
+            raise ClientError(
+                f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
+                f"`appliance routes` shows what is. {_as_ros_name(topic)}".rstrip()
+            )
+
+    def _perhaps(self) -> str:
+        if self._is_v5:
+            return ""
+        return "; MQTT 3.1.1 cannot tell whether nothing takes the call, or it was not allowed"
+
+    def _take(self, is_wanted: Callable[[str], bool]) -> paho.MQTTMessage | None:
+        for message in self._received:
+            if is_wanted(message.topic):
+                self._received.remove(message)
+                return message
+        return None
+
+    def _wait_for(
+        self, find: Callable[[], paho.MQTTMessage | None], timeout: float | None
+    ) -> paho.MQTTMessage | None:
+        found: list[paho.MQTTMessage] = []
+
+        def is_there() -> bool:
+            message = find()
+            found.extend([message] if message is not None else [])
+            return bool(found)
+
+        deadline = None if timeout is None else time.monotonic() + timeout
+        return found[0] if self._connection.run(is_there, deadline, STEP) else None
+
+    # Goals
+
+    def goal(
+        self,
+        action: str,
+        payload: bytes,
+        *,
+        accepted: Callable[[str], None],
+        feedback: Callable[[bytes], None] | None,
+        is_over: Callable[[], bool],
+        timeout: float | None,
+    ) -> Outcome:
+        """Sends a goal to the action at that MQTT topic and follows it to its end.
+
+        `accepted` is called with its id, `feedback` with each one's JSON. When `is_over()` or the
+        timeout, in seconds, comes first, the goal is cancelled. Raises CallFailedError when it is
+        refused, or its cancelling is.
+        """
+        # Before the goal is sent, or the first feedback would be missed.
+        topics = [f"{action}/_result/+"] + ([f"{action}/_feedback/+"] if feedback else [])
+        try:
+            self._connection.subscribe(topics, 1, retained=False)
+        except RefusedError as error:
+            advice = _as_ros_name(f"{action}/_goal")
+            line = f"The ACL line that allows it: topic read {action}/#"
+            raise error.advised(advice or line) from None
+        id_ = orjson.loads(self.call(f"{action}/_goal", payload, ANSWER_TIMEOUT))["goal_id"]
+        accepted(id_)
+        deadline = None if timeout is None else time.monotonic() + timeout
+        is_cancelled = False
+        result: paho.MQTTMessage | None = None
+
+        def work() -> bool:
+            nonlocal result
+            waiting, self._received[:] = self._received[:], []
+            for message in waiting:
+                if message.topic == f"{action}/_result/{id_}":
+                    result = message
+                elif feedback is not None and message.topic == f"{action}/_feedback/{id_}":
+                    feedback(shown(message))
+            is_late = deadline is not None and time.monotonic() > deadline
+            return result is not None or (not is_cancelled and (is_over() or is_late))
+
+        try:
+            self._connection.run(work, None, STEP)
+            if result is None:
+                is_cancelled = True
+                self._cancel(action, id_)
+                self._connection.run(work, time.monotonic() + ANSWER_TIMEOUT, STEP)
+        except CallFailedError:
+            raise
+        except ClientError as error:
+            where = f"{action}/_result/{id_}"
+            raise ClientError(f"{error}; the goal may go on, its result is at {where}") from None
+        if result is None:
+            raise ClientError(f"goal {id_} is being cancelled, and there is no result yet")
+        if content_type(result) in ("application/cdr", "application/x-ros1"):
+            from appliance.ros.calls.goals import status_of
+            from appliance.ros.payload.payloads import RAW, named_encoding
+
+            wire = RAW[named_encoding(content_type(result)) or "cdr"]
+            return Outcome(status_of(bytes(result.payload), wire), shown(result))
+        value = decode(result)
+        if "error" in value:
+            raise CallFailedError(f"{value['error']['code']}: {value['error']['message']}")
+        return Outcome(value["status"], encode(value["result"]))
+
+    def _cancel(self, action: str, id_: str) -> None:
+        try:
+            self.call(f"{action}/_cancel", orjson.dumps({"goal_id": id_}), ANSWER_TIMEOUT)
+        except CallFailedError as error:
+            if not str(error).startswith("unknown_goal"):  # it has ended meanwhile
+                raise CallFailedError(f"goal {id_} goes on: {error}") from None
+
+    # Parameters
+
+    def parameters(self, topic_filter: str, timeout: float) -> dict[str, bytes]:
+        """The JSON of what is retained there, by topic; waits up to `timeout` seconds for the
+        first."""
+        self._connection.subscribe([topic_filter], 1)
+        self._connection.run(lambda: bool(self._received), time.monotonic() + timeout, STEP)
+        if "+" in topic_filter:
+            seen = 0
+            while len(self._received) > seen:
+                seen = len(self._received)
+                self._connection.run(lambda: False, time.monotonic() + QUIET, STEP)
+        return {m.topic: shown(m) for m in self._received if m.payload}
+
+
+def _as_ros_name(topic: str) -> str:
+    """What was meant when a call's topic has nothing above what it calls: no robot; else ""."""
+    name = topic.partition("/")[0]
+    if "/_" not in topic or not topic.removeprefix(name).startswith("/_"):
+        return ""
+    return f"A ROS name begins with a slash; did you mean /{name}?"
+
+
+def content_type(message: paho.MQTTMessage) -> str | None:
+    """What the message says to be; None where it does not, as in MQTT 3.1.1."""
+    said = getattr(message.properties, "ContentType", None)
+    return said if isinstance(said, str) else None
+
+
+def decode(message: paho.MQTTMessage) -> Any:
+    """The value of JSON or CBOR. Raises ClientError."""
+    said, payload = content_type(message), bytes(message.payload)
+    if said != "application/cbor":
+        try:
+            return orjson.loads(payload)
+        except orjson.JSONDecodeError:
+            pass
+    if said in (None, "application/cbor"):
+        from appliance.ros.payload import cbor
+        from appliance.ros.payload.fallback import ConversionError
+
+        with contextlib.suppress(ConversionError):
+            return cbor.loads(payload)
+    raise ClientError(f"{message.topic} has something else than {said or 'JSON or CBOR'}")
+
+
+def shown(message: paho.MQTTMessage) -> bytes:
+    """The JSON of a message, or, for what has none, what it is."""
+    try:
+        return encode(decode(message))
+    except ClientError:
+        said = content_type(message) or "of an unknown encoding"
+        return f"({said}, {len(message.payload)} bytes)".encode()
+
+
+def encode(value: Any) -> bytes:
+    """One line of JSON; bytes, which CBOR has, as base64."""
+
+    def to_base64(value: object) -> str:
+        if isinstance(value, bytes):
+            return base64.b64encode(value).decode()
+        return str(value)
+
+    return orjson.dumps(value, to_base64)

@@ -1,0 +1,158 @@
+"""The commands `appliance init`, `run`, `reload`, `check`, `demo` and `bench`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from appliance.cli.console import CommandError, ConfigOption, load, shown
+
+
+def init(
+    directory: Annotated[
+        Path, typer.Option("--dir", metavar="DIR", help="Where everything goes.")
+    ] = Path(),
+    robot: Annotated[
+        str | None, typer.Option(help="The robot's name; else this computer's.")
+    ] = None,
+    user: Annotated[str, typer.Option(help="The first user's name.")] = "operator",
+    demo: Annotated[
+        bool,
+        typer.Option("--demo", help="With routes for the demo robot, and the password in a file."),
+    ] = False,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DNS_NAME",
+            help="Under which clients reach it too, beside this computer's own. Repeatable.",
+        ),
+    ] = None,
+) -> None:
+    """Make certificates, a first user, access rules and appliance.yaml; keep what is there."""
+    from appliance.access import AccessFileError
+    from appliance.certs import CertificateError
+    from appliance.config import ConfigError
+    from appliance.host.owners import OwnerError, acting_for
+    from appliance.ops.init import Credentials, InitError, Step, initialise
+
+    try:
+        with acting_for(directory / "appliance.yaml"):
+            for step in initialise(directory, robot=robot, user=user, demo=demo, names=name or []):
+                if isinstance(step, Step):
+                    verb = "made" if step.made else "kept"
+                    typer.echo(f"{verb}  {shown(step.path)}: {step.text}")
+                elif isinstance(step, Credentials):
+                    typer.secho(
+                        f"\nuser {step.user}, password {step.password}\n"
+                        "This is the only time that it is shown.\n",
+                        bold=True,
+                    )
+    except (AccessFileError, CertificateError, ConfigError, InitError, OwnerError) as error:
+        raise CommandError(str(error)) from None
+
+
+def run(
+    context: typer.Context,
+    config: ConfigOption = None,
+    log_format: Annotated[
+        Literal["human", "json"] | None, typer.Option(help="In place of log.format.")
+    ] = None,
+    log_level: Annotated[
+        Literal["debug", "info", "warning", "error"] | None,
+        typer.Option(help="In place of log.level."),
+    ] = None,
+) -> None:
+    """Run the appliance until SIGINT or SIGTERM; ROS arguments come behind `--ros-args`."""
+    settings = load(config)
+    from appliance.app import main as app
+    from appliance.ops import logs
+
+    log = settings.log
+    logs.setup(log_level or log.level, log.levels, log_format or log.format)
+    with _start_errors():
+        raise typer.Exit(app.run(settings, context.obj or ()))
+
+
+@contextmanager
+def _start_errors() -> Iterator[None]:
+    """What keeps the appliance from starting and a user can mend, as a CommandError."""
+    from appliance.app.main import START_ERRORS
+
+    try:
+        yield
+    except OSError:  # told by main
+        raise
+    except START_ERRORS as error:
+        raise CommandError(str(error)) from None
+
+
+def reload(config: ConfigOption = None) -> None:
+    """Have the running appliance take over its files as they are now: all of them, or none."""
+    settings = load(config)
+    from appliance.ops.control import ControlError, ask
+
+    try:
+        changed = ask(settings.control, "reload")
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    typer.echo("\n".join(changed) if changed else "nothing has changed")
+
+
+def check(
+    config: ConfigOption = None,
+    show: Annotated[
+        bool, typer.Option("--show", help="Also print every setting in force, secrets masked.")
+    ] = False,
+) -> None:
+    """Read everything that `run` would use, say what is found, and change nothing."""
+    settings = load(config)
+    from appliance.config import describe
+    from appliance.ops.check import check as find
+
+    colours = {"ok": "green", "warning": "yellow", "error": "red"}
+    failed = False
+    for finding in find(settings):
+        typer.secho(f"{finding.level:<8}", fg=colours[finding.level], nl=False)
+        typer.echo(f"{finding.subject}: {finding.text}")
+        failed |= finding.level == "error"
+    if show:
+        import yaml
+
+        typer.echo("\n" + yaml.safe_dump(describe(settings), sort_keys=False), nl=False)
+    raise typer.Exit(1 if failed else 0)
+
+
+def demo(config: ConfigOption = None) -> None:
+    """Run the appliance beside a demo robot, and print what to type to see and drive it."""
+    settings = load(config)
+    from appliance.cli import demo as tour
+    from appliance.ops import logs
+
+    logs.setup(settings.log.level, settings.log.levels, settings.log.format)
+    try:
+        with _start_errors():
+            raise typer.Exit(tour.run(settings))
+    except tour.TourError as error:
+        raise CommandError(str(error)) from None
+
+
+def bench(
+    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    cell: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this cell; may be repeated.")
+    ] = None,
+    bridge: Annotated[bool, typer.Option("--bridge", help="Only the cells of the bridge.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long each cell is measured.")] = 3.0,
+    peer: Annotated[
+        str | None, typer.Option(metavar="PATH", help="The mosquitto to compare with.")
+    ] = None,
+) -> None:
+    """Measure this broker, and mosquitto beside it where it is installed."""
+    from appliance import bench
+
+    cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
+    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))

@@ -1,0 +1,129 @@
+"""The command `appliance store`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.cli.console import CommandError, ConfigOption, load, print_table, shown
+
+HEAD = ("CLIENT ID", "USER", "SUBSCRIPTIONS", "MESSAGES", "BYTES", "OLDEST", "ENDS")
+
+store_app = typer.Typer(help="What outlives a restart.")
+
+
+@store_app.callback(invoke_without_command=True)
+def store_show(context: typer.Context, config: ConfigOption = None) -> None:
+    """What outlives a restart: sessions, what waits for them, retained messages."""
+    if context.invoked_subcommand is not None:
+        return
+    path, _ = _store_path(config)
+    from datetime import datetime
+
+    from appliance.config import format_size
+    from appliance.store import StoreError
+    from appliance.store.inspection import summarise
+
+    try:
+        summary = summarise(path)
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+    def when(moment: float | None) -> str:
+        return "" if moment is None else f"{datetime.fromtimestamp(moment):%Y-%m-%d %H:%M:%S}"
+
+    rows = [
+        (
+            repr(session.client_id),
+            "" if session.username is None else repr(session.username),
+            str(session.subscriptions),
+            str(session.messages),
+            str(session.size),
+            when(session.oldest),
+            when(session.ends_at) or "connected",
+        )
+        for session in summary.sessions
+    ]
+    if rows:
+        print_table([HEAD, *rows])
+        typer.echo()
+    typer.echo(
+        f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
+        f"{summary.retained_size} bytes; all {summary.messages} messages have "
+        f"{summary.payload_size} bytes, {shown(path)} has {format_size(summary.file_size)}"
+    )
+
+
+@store_app.command("export")
+def store_export(config: ConfigOption = None) -> None:
+    """Print all of it as JSON, one session or retained message a line."""
+    path, _ = _store_path(config)
+    from appliance.ops.logs import json_text
+    from appliance.store import StoreError
+    from appliance.store.inspection import export
+
+    try:
+        for entry in export(path):
+            typer.echo(json_text(entry))
+    except StoreError as error:
+        raise CommandError(str(error)) from None
+
+
+@store_app.command("prune")
+def store_prune(
+    older_than: Annotated[
+        str | None,
+        typer.Option(metavar="DURATION", help="Messages that wait for longer, such as 7 d."),
+    ] = None,
+    client: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Of this client only; else its whole session. Repeatable."),
+    ] = None,
+    retained: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILTER", help="Retained messages: r2d2/old, or r2d2/#. Repeatable."),
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Delete sessions, what has waited too long for them, or retained messages, while the appliance
+    is stopped.
+
+    Retained messages of routes that are gone are taken back by the appliance itself.
+    """
+    if older_than is None and not client and not retained:
+        raise typer.BadParameter("say what: --older-than, --client, both, or --retained")
+    path, file = _store_path(config)
+    import sqlite3
+
+    from appliance.config import parse_duration
+    from appliance.host.owners import OwnerError, acting_for
+    from appliance.store import StoreError
+    from appliance.store.inspection import prune, prune_retained
+
+    try:
+        age = None if older_than is None else parse_duration(older_than)
+    except ValueError as error:
+        raise typer.BadParameter(f"--older-than {error}") from None
+    try:
+        with acting_for(file, path):
+            if retained:
+                count = prune_retained(path, retained)
+                typer.echo(f"{count} retained messages deleted")
+            if age is not None or client:
+                sessions, messages = prune(path, age, client or [])
+                typer.echo(f"{sessions} sessions and {messages} messages deleted")
+    except ValueError as error:
+        raise typer.BadParameter(f"--retained {error}") from None
+    except (OwnerError, StoreError, sqlite3.Error) as error:
+        raise CommandError(str(error)) from None
+
+
+def _store_path(config: Path | None) -> tuple[Path, Path | None]:
+    """The database, and the file that says so."""
+    settings = load(config)
+    store = settings.broker.store
+    if store.durability == "off":
+        raise CommandError("nothing is stored: broker.store.durability is off")
+    return store.path, settings.file

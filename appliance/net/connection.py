@@ -1,0 +1,966 @@
+"""One network connection: an `asyncio.Protocol` that is a client's `Wire`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import socket
+import ssl
+from collections import deque
+from dataclasses import replace
+from typing import cast
+
+from appliance.broker.accounts import Account
+from appliance.broker.client import Client
+from appliance.broker.inflow import PAUSE_BEHIND
+from appliance.broker.ports import HERE, Contact, Exchange, Identity, Refusal, Secured
+from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.packets import Connect
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.net import lingering as farewell
+from appliance.net import tls
+from appliance.net.callbacks import contained, contained_made
+from appliance.net.scheduler import PUBLISH_BURST, Network
+from appliance.net.sockets import Probe, contact, inbox
+from appliance.net.websocket import WebSocket
+
+#: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
+#: read them: what a healthy one takes in one round of the event loop, with room to spare.
+OUTPUT_HIGH_WATER = 1024 * 1024
+
+#: The same while the output of all clients takes more than a quarter of `limits.memory`. Less than
+#: this in a transport is not counted, so that writing costs nothing as long as clients read.
+OUTPUT_LOW_WATER = 16 * 1024
+
+#: Bytes that the system keeps, beside those that are on their way, for a client that is sent large
+#: messages of QoS 0.
+SYSTEM_OUTPUT = 128 * 1024
+
+#: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
+WRITE_PORTION = 512 * 1024
+
+#: A chunk this large means that more is waiting. The loop would read on without writing out, up to
+#: 32 chunks in one go; reading is paused for the rest of the round, so that the receivers get
+#: theirs before they count as slow.
+LARGE_CHUNK = 128 * 1024
+
+#: Bytes of a chunk that are little: after more than these it is checked whether who sends them has
+#: to wait.
+LITTLE = 16 * 1024
+
+#: Turns that a client takes, without a second's rest, until the log is told.
+MANY_TURNS = 200
+
+#: Seconds that a publisher is not read, after each check, while memory is short.
+SHORT_OF_MEMORY_PAUSE = 0.05
+
+#: Seconds that a client is slow before the log is told.
+SLOW_AFTER = 1.0
+
+#: Seconds that a client gets to read the last bytes before its connection is cut.
+CLOSE_TIMEOUT = 10.0
+
+#: Seconds that a client's computer is asked for a sign of life.
+PROBED = 3.0
+
+#: Seconds that one gets whose certificate was revoked.
+REVOKED_TIMEOUT = 1.0
+
+
+_NOTHING = memoryview(b"")
+
+
+class ClientProtocol:
+    """One connection: bytes to the `Client`, and as its `Wire` bytes from it.
+
+    It is an `asyncio.Protocol` without being derived from it, which makes it faster when compiled.
+    """
+
+    def __init__(
+        self, network: Network, address: str, host: str, anonymous: bool | None = None
+    ) -> None:
+        self.address = address
+        self._anonymous = anonymous  # what its listener says of clients without a user name
+        #: The part of it that all connections of one computer share; empty for a Unix socket.
+        self.host = host
+        #: Who is charged for what waits here: nobody in particular until the login.
+        self.account = network.broker.ledger.accounts.strangers
+        #: What was accepted, until there is a transport for it.
+        self._accepted: socket.socket | None = None
+        self._network = network
+        self._broker = network.broker
+        self._ledger = network.broker.ledger
+        self._counters = network.broker.counters
+        self._transport: asyncio.Transport | None = None
+        self._entries = network.entries
+        self._loop = network.entries.loop
+        self._client = Client(self._broker, self)
+        self._closing = False
+        self._is_lost = False
+        # Input: what was received and waits, and what it waits for.
+        self._held = _NOTHING
+        self._held_size = 0  # bytes of the chunk that it is the rest of, in the ledger
+        self._frame = 0  # bytes of a WebSocket frame that is not complete
+        self._is_record_cut = False  # the same of TLS
+        self._below = 0  # bytes that TLS and WebSocket have not taken apart
+        self._sends_on = False  # the client has more to do, and wants its turn
+        self._turn_over = False
+        self._in_turn = False
+        self._turns_taken = 0  # without a second's rest
+        self._turned_at = 0.0
+        self._resting: asyncio.TimerHandle | None = None
+        self._looks: asyncio.TimerHandle | None = None  # whether it has caught up
+        self._looks_at = 0.0
+        self._choked = False
+        self._logging_in = False
+        self._who: Identity | Refusal | None = None  # what came of it, not told yet
+        self._stopped = False  # the client takes in nothing until its next turn
+        self._waits: asyncio.TimerHandle | None = None  # for that, unless it comes before
+        # How fast it publishes.
+        self._little = min(LITTLE, network.portion)
+        self._countdown = network.check_every  # of messages, to the next check
+        self._checked_at = self._loop.time()
+        self._allowed = PUBLISH_BURST * network.publish_rate  # messages, at the last check
+        # Output: what the transport was not given yet, and what of it is counted.
+        self._waiting: deque[bytes] = deque()
+        self._waiting_size = 0  # bytes that are left of them
+        self._begun = 0  # bytes of the first chunk that the transport was given
+        self._unshared = 0  # bytes of the chunks that wait for this client only
+        self._paused = False
+        self._withheld: asyncio.TimerHandle | None = None  # paused until then, on purpose
+        self._counted = 0  # bytes in the ledger
+        self._slow: asyncio.TimerHandle | None = None
+        self._is_system_limited = False
+        self._probe: Probe | None = None
+        self._has_told_behind = False  # and the client wants to know when it has caught up
+        #: Bytes in the output from which on the client is not listened to.
+        self._output_limit = 0
+        #: The connection under the transport, to be closed after it.
+        self._connection: socket.socket | None = None
+        # Slow strangers: the whole way to the end of CONNECT has one time limit.
+        self._timeout = self._entries.later(
+            "connection.login_timeout",
+            network.connect_timeout,
+            self._too_late,
+            served=self,
+            failed=self.abort,
+        )
+
+    def __str__(self) -> str:
+        return str(self._client)
+
+    # --- the connection ------------------------------------------------------------------------
+
+    async def begin(
+        self, connection: socket.socket, context: ssl.SSLContext | None, *, websocket: bool
+    ) -> None:
+        """Take over an accepted connection, with TLS through its handshake."""
+        # Not left to asyncio's own server for one reason: when a handshake fails, that would
+        # say nothing, and who it was and why is what the log is asked for.
+        network = self._network
+        protocol = cast(asyncio.Protocol, WebSocket(self, network) if websocket else self)
+        self._accepted = connection
+        try:
+            if connection.family != socket.AF_UNIX:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                # A client without keep alive whose computer is gone is found out by the system.
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            if context is None:
+                await self._loop.connect_accepted_socket(lambda: protocol, connection)
+            else:
+                timeout = network.connect_timeout
+                await tls.accept(connection, context, protocol, timeout, network, network.part)
+        except (OSError, asyncio.TimeoutError) as error:
+            if self in self._network.open:  # else it had to make room
+                self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
+            connection.close()
+            self._forget()
+        except Exception as error:
+            self._broker.faults.caught("connection.begin", error, self)
+            self.abort()  # it may have been made: nobody would know of it
+            if self._transport is None:
+                connection.close()
+        finally:
+            self._accepted = None
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        broker, client = self._broker, self._client
+        broker.fault(entry, error, client)
+        broker.faults.run("connection.flush", broker.flush, otherwise=None)
+        if self._transport is None:
+            client.cut_off()
+            self._forget()
+        elif not self._closing:
+            # Its last bytes wait for a commit; or not even the flush went well.
+            self._cut_after(CLOSE_TIMEOUT)
+
+    @contained_made("connection.made")
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The connection is there, its TLS handshake done."""
+        self._transport = cast(asyncio.Transport, transport)
+        self._transport.set_write_buffer_limits(high=OUTPUT_LOW_WATER)
+        if self not in self._network.open:  # the handshake ended just after its time
+            self._transport.abort()
+        else:
+            self.check_certificate()
+
+    @property
+    def _tls(self) -> ssl.SSLObject | None:
+        """The TLS of the connection, if it has any."""
+        if self._transport is None:
+            return None
+        return cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object"))
+
+    def check_certificate(self) -> None:
+        """Close the connection when the client's certificate is not, or no longer, accepted.
+
+        One that has logged in is told why, and has a second to read it.
+        """
+        certificates, tls_object = self._network.certificates, self._tls
+        if certificates is None or tls_object is None or self._closing:
+            return
+        reason = certificates.refusal(tls_object)
+        if not reason:
+            return
+        if self._client.session is None:
+            self.complain("no TLS connection", reason)
+            self._client.output.abandon()
+        else:
+            self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
+        self._broker.flush()
+        self._entries.later("connection.revoked", REVOKED_TIMEOUT, self.abort, served=self)
+
+    def _too_late(self) -> None:
+        timeout = f"{self._network.connect_timeout:g} s"
+        self.complain(f"no complete CONNECT within {timeout}", "broker.limits.connect_timeout")
+        self.abort()
+
+    def complain(self, what: str, why: str) -> None:
+        """Tell the log, unless it is a flood of the same from the same host."""
+        now = self._loop.time()
+        message = f"{self.address}: {what}: {why:.200}"
+        self._broker.complaints.tell(now, (self.host, what), "%s", message)
+        if self._broker.journal is not None:
+            self._broker.journal.refused(self.address, f"{what}: {why}")
+
+    @contained("connection.eof")
+    def eof_received(self) -> None:
+        """The client sends no more; the transport closes."""
+
+    @contained("connection.lost")
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection ended, whoever ended it."""
+        self._is_lost = True
+        self._forget()
+        while self._waiting:
+            self._take_waiting(self._waiting_size)
+        self._paused = False
+        if self._withheld is not None:
+            self._withheld.cancel()
+            self._withheld = None
+        self._count_output()
+        if self._slow is not None:
+            self._slow.cancel()
+        self._ledger.now = self._loop.time()
+        if self._waits is not None:
+            self._waits.cancel()
+        if self._looks is not None:
+            self._looks.cancel()
+        if not self._closing:
+            self._closing = True
+            held, self._held = bytes(self._held), _NOTHING
+            try:
+                self._client.hurry()
+                self._client.receive(held)
+            except Exception as error:
+                self._broker.fault("connection.last_chunk", error, self._client)
+        self._transport = None
+        self.keep(0)
+        self._let_go_of_held()
+        self._ledger.take(self.account, -self._below)
+        self._below = 0
+        if self._connection is not None:
+            self._network.part(self._connection)
+        if self._network.is_busy():
+            self._leave_later()
+        else:
+            self._leave()
+
+    def _leave_later(self) -> None:
+        """Let the others have their turn, then end the client."""
+        if not self._turn_over:
+            self._turn_over = True
+            self._network.queue_turn(self)
+
+    def _leave(self) -> None:
+        """End the client when what it said before it left is done, in as many turns as it takes."""
+        if self._sends_on:
+            self._sends_on = False
+            try:
+                self._client.send_on()
+            except Exception as error:
+                self._broker.fault("connection.last_turn", error, self._client)
+            self._broker.flush()
+            self._leave_later()
+        else:
+            self._client.lost()
+            self._broker.flush()
+            # The client and its wire know each other: this lets both, and the TLS connection with
+            # them, go now, and not when all that lives here is searched for garbage.
+            self._client.let_go(_Gone(self.address))
+
+    def _forget(self) -> None:
+        self._network.closed(self)
+        self._timeout.cancel()
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self._transport is not None:
+            try:
+                self._transport.abort()
+            except Exception as error:
+                self._broker.faults.caught("connection.abort", error, self)
+        self._forget()
+
+    def _cut_after(self, seconds: float) -> None:
+        """However its end goes on, and whether or not it reads: then it is over."""
+        self._timeout.cancel()
+        self._timeout = self._entries.later(
+            "connection.cut", seconds, self.abort, served=self, failed=self.abort
+        )
+
+    def make_room(self) -> None:
+        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+        if not self._closing:
+            self.complain("makes room for others", "it has not logged in (broker.limits)")
+        if self._transport is None and self._accepted is not None:
+            with contextlib.suppress(OSError):  # so the handshake fails
+                self._accepted.shutdown(socket.SHUT_RDWR)
+        self.abort()
+
+    # --- bytes in ------------------------------------------------------------------------------
+
+    def data_received(self, data: bytes) -> None:
+        """Hand the chunk to the client; then everyone is written to, once, what it caused."""
+        try:
+            counters = self._counters
+            if (
+                len(data) > self._little or counters.effort > self._network.checkpoint
+            ) and not self._in_turn:
+                data = self._receive_in_turn(data)
+                if not data:
+                    return
+            self._ledger.now = self._loop.time()
+            published = counters.publish_received
+            self._client.receive(data)
+            published -= counters.publish_received
+            if self._broker.unflushed:
+                self._broker.flush()
+            if published:  # so many less than none
+                self._countdown += published
+                if self._countdown <= 0:
+                    self._check_publisher()
+            if self._slow is not None and self._output_size() > self._output_limit:
+                # It asks on, and does not read the answers.
+                self._choked = True
+                self._pause_reading()
+        except Exception as error:
+            self.fault("connection.chunk", error)
+
+    def _receive_in_turn(self, data: bytes) -> bytes:
+        """Let who sends much wait where that is due; returns what is to be taken in now."""
+        network, account = self._network, self.account
+        if len(data) <= self._little:
+            if not network.is_round_over():
+                return data
+            if network.may_go_beyond(account):
+                begun = self._counters.effort
+                self._take_portion(data)
+                network.went_beyond(account, self._counters.effort - begun)
+            else:
+                self._hold(data, 0)
+                self._read_later()
+            return b""
+        self._check_memory()
+        portion = 0 if network.is_busy() else network.portion
+        if len(data) >= LARGE_CHUNK or len(data) > portion:
+            self._read_later()
+        if len(data) > portion:
+            self._hold(data, portion)
+        return data[:portion]
+
+    def _check_publisher(self) -> None:
+        """Let a publisher wait that is too fast, by its own limit or by everyone's."""
+        network = self._network
+        rate = network.publish_rate
+        now = self._ledger.now
+        # What it may publish grows with time, and shrinks by what it has published since the last
+        # check.
+        allowed = min(self._allowed + (now - self._checked_at) * rate, PUBLISH_BURST * rate)
+        self._allowed = allowed - (network.check_every - self._countdown)
+        self._countdown = network.check_every
+        self._checked_at = now
+        if self._allowed < 0:
+            self._rest(-self._allowed / rate)
+        else:
+            self._check_memory()
+
+    def _check_memory(self) -> None:
+        if self._ledger.queued_bytes > self._network.short_of_memory and self._resting is None:
+            # Not for longer: it may be this client that has to acknowledge what takes the memory.
+            self._rest(SHORT_OF_MEMORY_PAUSE)
+            self._broker.complaints.tell(
+                self._ledger.now,
+                "memory",
+                "%s is slowed: %d bytes are in use, of the %d allowed (broker.limits.memory)",
+                self._client,
+                self._ledger.queued_bytes,
+                self._broker.limits.memory,
+            )
+
+    def _rest(self, seconds: float) -> None:
+        """Read nothing for so long."""
+        if self._resting is not None:
+            self._resting.cancel()
+        self._resting = self._entries.later(
+            "connection.rested", seconds, self._rested, served=self, failed=self.abort
+        )
+        self._pause_reading()
+
+    def _rested(self) -> None:
+        self._resting = None
+        if self._network.is_busy():
+            self._read_later()
+        else:
+            self._read_on()
+
+    def _read_later(self) -> None:
+        """Let the others have their turn, then read on."""
+        self._pause_reading()
+        if not self._turn_over:
+            self._turn_over = True
+            self._network.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._turn_over = False
+        if self._is_lost:
+            self._leave()
+        else:
+            self._read_on()
+
+    def _pause_reading(self) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self.is_not_read()
+            self._transport.pause_reading()
+
+    def _read_on(self) -> None:
+        """Go on with what waits, in its order, unless there is a reason to wait."""
+        if self._turn_over or self._resting or self._choked or self._logging_in or self._closing:
+            return
+        if self._transport is None or self._transport.is_closing():
+            return
+        if self._who is not None:
+            who, self._who = self._who, None
+            self._answer_connect(who)
+            self._read_on()
+        elif self._sends_on:
+            self._send_on()
+        elif self._stopped:
+            return
+        elif self._held:
+            portion = bytes(self._held[: self._network.portion])
+            self._held = self._held[self._network.portion :]
+            if not self._held:  # an empty part would keep the whole
+                self._let_go_of_held()
+            self._take_portion(portion)
+            self._read_later()
+        else:
+            self.is_read()
+            self._transport.resume_reading()
+
+    def is_not_read(self) -> None:
+        """What has come waits: here, or in a layer below that has told so."""
+        self._client.inflow.not_read(self._loop.time())
+
+    def is_read(self) -> None:
+        """It waits no longer."""
+        inflow = self._client.inflow
+        inflow.read(self._loop.time())
+        if inflow.is_behind:
+            self._see_whether_caught_up()
+
+    def _see_whether_caught_up(self) -> None:
+        """Look whether all is read of what the client has said while it was not, now and later."""
+        if self._transport is None:
+            return
+        known = inbox(self._transport.get_extra_info("socket"))
+        if self._transport.get_extra_info("has_unread"):
+            known = known._replace(unread=True)
+        inflow = self._client.inflow
+        seconds = inflow.look(self._loop.time(), **known._asdict())
+        if seconds:
+            self._look_after(seconds)
+
+    def _look_after(self, seconds: float) -> None:
+        """Look again, then or before."""
+        looks_at = self._loop.time() + seconds
+        if self._looks is not None:
+            if self._looks_at <= looks_at:
+                return
+            self._looks.cancel()
+        self._looks_at = looks_at
+        self._looks = self._entries.later("connection.look", seconds, self._look_again, served=self)
+
+    def _look_again(self) -> None:
+        self._looks = None
+        self._see_whether_caught_up()
+
+    def _hold(self, data: bytes, begin: int) -> None:
+        """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
+        self._held = memoryview(data)[begin:]
+        self._ledger.take(self.account, len(data) - self._held_size)
+        self._held_size = len(data)
+
+    def _let_go_of_held(self) -> None:
+        self._held = _NOTHING
+        self._ledger.take(self.account, -self._held_size)
+        self._held_size = 0
+
+    def _take_portion(self, data: bytes) -> None:
+        """Take in what is not to wait for a turn, or has had it."""
+        self._in_turn = True
+        self.data_received(data)  # which never raises
+        self._in_turn = False
+
+    def _send_on(self) -> None:
+        self._sends_on = self._stopped = False
+        self._ledger.now = self._loop.time()
+        published = self._counters.publish_received
+        self._client.send_on()
+        self._countdown -= self._counters.publish_received - published
+        self._broker.flush()
+        if self._countdown <= 0:
+            self._check_publisher()
+        self._read_on()
+
+    def frame_limit(self) -> int:
+        """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
+        if self._client.session is None:
+            return MAXIMUM_CONTROL
+        return self._client.connection.maximum_packet_size + MAXIMUM_CONTROL
+
+    def set_apart(self, size: int) -> None:
+        """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
+        if not self._is_lost:
+            self._ledger.take(self.account, size - self._below)
+            self._below = size
+
+    def keep(self, size: int) -> None:
+        """Count the bytes of a WebSocket frame that is not complete; without room, close."""
+        ledger = self._ledger
+        grown = size - self._frame
+        if size or self._frame:
+            self._note_part(size > 0 or self._is_record_cut)
+        self._frame = size
+        ledger.take(self.account, grown)
+        if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
+            reason = (
+                f"no memory for {size} bytes of a WebSocket frame "
+                "(broker.limits.memory, broker.limits.user.memory)"
+            )
+            self._client.fail(ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason))
+            self._broker.flush()
+
+    def has_part(self, part: bool) -> None:
+        """Whether TLS keeps the beginning of a record."""
+        self._is_record_cut = part
+        self._note_part(part or self._frame > 0)
+
+    def _note_part(self, is_kept: bool) -> None:
+        """Know since when the beginning of something is kept below: what it holds is as old."""
+        inflow, connection = self._client.inflow, self._client.connection
+        if is_kept:
+            inflow.unfinished = inflow.unfinished or self._loop.time()
+        elif not (connection.unfinished or connection.paused or self._held):
+            inflow.unfinished = 0.0  # what it held is done, or it was a ping
+
+    # --- bytes out -----------------------------------------------------------------------------
+
+    def _write_on(self) -> None:
+        """Give the transport what waits, until it asks for a pause."""
+        assert self._transport is not None
+        while self._waiting and not self._paused and not self._transport.is_closing():
+            portion = [self._take_waiting(WRITE_PORTION)]
+            room = WRITE_PORTION - len(portion[0])
+            while self._waiting and room:
+                portion.append(self._take_waiting(room))
+                room -= len(portion[-1])
+            self._transport.write(portion[0] if len(portion) == 1 else b"".join(portion))
+        self._count_output()
+        if self._closing and not self._waiting:
+            self._close_transport()
+
+    def _take_waiting(self, most: int) -> bytes | memoryview:
+        """What is left of the first chunk that waits, or so many bytes of it."""
+        chunk, begun = self._waiting[0], self._begun
+        left = len(chunk) - begun
+        if left > most:
+            self._begun += most
+            self._waiting_size -= most
+            return memoryview(chunk)[begun : self._begun]
+        self._waiting.popleft()
+        self._waiting_size -= left
+        self._begun = 0
+        if len(chunk) > WRITE_PORTION:
+            self._network.unshare(self.account, chunk)
+        else:
+            self._unshared -= len(chunk)
+        return memoryview(chunk)[begun:] if begun else chunk
+
+    def _output_size(self) -> int:
+        transport = self._transport
+        return self._waiting_size + (0 if transport is None else transport.get_write_buffer_size())
+
+    def _count_output(self) -> None:
+        """Enter in the ledger what waits for this client, and tell it when that is too much."""
+        network = self._network
+        counted = self._unshared
+        if self._paused and self._transport is not None:
+            counted += self._transport.get_write_buffer_size()
+        network.count_output(self.account, counted - self._counted)
+        self._counted = counted
+        limit = OUTPUT_LOW_WATER if network.is_much(self.account) else OUTPUT_HIGH_WATER
+        size = self._output_size()
+        if size > limit and self._slow is None:
+            self._client.output.writable = False
+            # From here on its output grows by what it is answered only, and by no more than this.
+            self._output_limit = size + limit
+            self._slow = self._entries.later("connection.slow", SLOW_AFTER, self._tell_slow)
+
+    def _tell_slow(self) -> None:
+        self._broker.complaints.tell(
+            self._loop.time(),
+            "slow",
+            "%s is slow: it does not read %d bytes, and is sent nothing more until it does",
+            self._client,
+            self._output_size(),
+        )
+
+    @contained("connection.pause")
+    def pause_writing(self) -> None:
+        """The client reads slower than it is written to."""
+        self._paused = True
+        self._count_output()
+
+    @contained("connection.resume")
+    def resume_writing(self) -> None:
+        """It has caught up."""
+        if self._withheld is not None:
+            return
+        self._paused = False
+        if self._transport is None:
+            return
+        self._write_on()
+        if self._paused or self._closing:
+            return
+        if self._slow is None:
+            if self._has_told_behind:
+                self._has_told_behind = False
+                self._client.output.caught_up()
+                self._broker.flush()
+            return
+        self._slow.cancel()
+        self._slow = None
+        self._has_told_behind = False
+        self._choked = False
+        self._client.output.resume_writing()
+        self._broker.flush()
+        self._read_on()
+
+    # --- the client's Wire ---------------------------------------------------------------------
+
+    def authenticate(self, connect: Connect) -> None:
+        """Find out in the background who sent the CONNECT; read nothing more until then."""
+        self._logging_in = True
+        self._pause_reading()
+        self._network.in_background(self._log_in(connect))
+
+    async def _log_in(self, connect: Connect) -> None:
+        try:
+            self._who = await self._network.authenticate(
+                connect, self.address, self._tls, self._anonymous
+            )
+            self._logging_in = False
+            if self._network.is_busy():  # crowds come at once, when the robot's network is back
+                self._read_later()
+            else:
+                self._read_on()
+        except Exception as error:
+            self.fault("connection.login", error)
+
+    def _answer_connect(self, who: Identity | Refusal) -> None:
+        if isinstance(who, Refusal):
+            self._client.refuse(who.code, who.reason)
+        else:
+            self._client.accept(who.username)
+        self._broker.flush()
+
+    def exchange(self, method: str) -> Exchange | None:
+        """Begin an enhanced authentication; None when the method is not offered.
+
+        None is to a client whose certificate says who it is: it could only say something else.
+        """
+        certificates, tls_object = self._network.certificates, self._tls
+        if certificates is not None and tls_object is not None:
+            try:
+                if certificates.username(tls_object) is not None:
+                    return None
+            except ValueError:
+                return None
+        stranger = self._client.session is None
+        return self._network.exchange(method, self.address if stranger else None)
+
+    def now(self) -> float:
+        """Seconds of the event loop's clock."""
+        return self._loop.time()
+
+    def admit(self, account: Account) -> str:
+        """The client has logged in as this user, and may be silent now; or why it may not."""
+        refusal = self._network.doorkeeper.admit(self, account)
+        if refusal:
+            return refusal
+        self._timeout.cancel()
+        self._network.count_output(self.account, -self._counted)
+        self._network.count_output(account, self._counted)
+        waits = self._frame + self._below + self._held_size
+        self._ledger.take(self.account, -waits)
+        self._ledger.take(account, waits)
+        self.account = account
+        return ""
+
+    def holds(self, size: int) -> None:
+        """A chunk is not little that may be the last byte of a large packet."""
+        self._little = 0 if size > LITTLE else min(LITTLE, self._network.portion)
+
+    def secured(self) -> Secured:
+        """The version of TLS, and the name in the client's certificate."""
+        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
+        if peer is None:
+            return Secured()
+        return Secured(peer.version() or "", tls.name_in(peer.getpeercert()))
+
+    def later(self) -> None:
+        """Let the others have their turn, then let the client go on; it is not read before that."""
+        self._sends_on = True
+        self._read_later()
+        now = self._ledger.now
+        if now - self._turned_at > 1.0:  # it was idle
+            self._turns_taken = 0
+        self._turned_at = now
+        self._turns_taken += 1
+        if self._turns_taken == MANY_TURNS:
+            self._turns_taken = 0
+            self._broker.complaints.tell(
+                self._ledger.now,
+                "turns",
+                "%s asks for more than there is time for, and is read later",
+                self._client,
+            )
+
+    def stop_reading(self) -> None:
+        """Read nothing more until the client had its turn."""
+        self._stopped = True
+        self._pause_reading()
+
+    def wait(self, seconds: float) -> None:
+        """Let the client have a turn after so many seconds."""
+        if self._waits is not None:
+            self._waits.cancel()
+        self._waits = self._entries.later(
+            "connection.wait", seconds, self.proceed, served=self, failed=self.abort
+        )
+
+    def proceed(self) -> None:
+        """Let the others have their turn, then the client."""
+        if self._waits is not None:
+            self._waits.cancel()
+            self._waits = None
+        self._sends_on = True
+        self._read_later()
+
+    def write(self, chunks: list[bytes]) -> None:
+        """Write the chunks, joined when they are small; to who is slow, in portions."""
+        if not self._paused:
+            data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
+            size = len(data)
+            if size <= WRITE_PORTION:
+                self._counters.bytes_sent += size
+                if self._transport is not None:
+                    self._transport.write(data)
+                return
+        self._write_later(chunks)
+
+    def _write_later(self, chunks: list[bytes]) -> None:
+        if len(chunks[-1]) <= WRITE_PORTION:  # a large payload is one object for all its receivers
+            chunks = [b"".join(chunks)]
+        self._counters.bytes_sent += sum(map(len, chunks))
+        if self._transport is None or self._transport.is_closing():
+            return
+        for chunk in chunks:
+            self._waiting.append(chunk)
+            self._waiting_size += len(chunk)
+            if len(chunk) > WRITE_PORTION:
+                self._network.share(self.account, chunk)
+            else:
+                self._unshared += len(chunk)
+        self._write_on()
+
+    def is_behind(self) -> bool:
+        """Whether the transport has asked for a pause."""
+        if not self._is_system_limited:
+            self._limit_system_output()
+        self._has_told_behind |= self._paused
+        return self._paused
+
+    def _limit_system_output(self) -> None:
+        """What the system has taken cannot be overtaken any more, and for a slow client it takes
+        megabytes, some seconds' worth."""
+        self._is_system_limited = True
+        if self._transport is None:
+            return
+        connection = self._transport.get_extra_info("socket")
+        if connection.family != socket.AF_UNIX and hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT)
+
+    def contact(self) -> Contact:
+        """How the computer at the other end answers."""
+        if self._transport is None:
+            return HERE
+        known = contact(self._transport.get_extra_info("socket"))
+        has_unread = known.has_unread or bool(self._held) or self._sends_on
+        has_unread = has_unread or bool(self._transport.get_extra_info("has_unread"))
+        now = self._ledger.now  # of the chunk that is being taken in, if one is
+        inflow = self._client.inflow
+        held = inflow.held(now, has_unread=has_unread)
+        flowing = inflow.flowing(now)
+        if held:
+            self._look_after(PAUSE_BEHIND)
+        return replace(known, has_unread=has_unread, flowing=flowing, held=held)
+
+    def probe(self) -> None:
+        """Have it answer within two seconds, if it can."""
+        if self._transport is not None and self._probe is None:
+            self._probe = Probe(self._transport.get_extra_info("socket"))
+            self._entries.later("connection.probe", PROBED, self._end_probe, served=self)
+
+    def _end_probe(self) -> None:
+        probe, self._probe = self._probe, None
+        if probe is not None and self._transport is not None:
+            probe.end()
+
+    def withhold(self, seconds: float) -> None:
+        """Write nothing for so long; with 0, no longer."""
+        if self._withheld is not None:
+            self._withheld.cancel()
+            self._withheld = None
+        if self._transport is None or self._transport.is_closing():
+            return
+        if seconds:
+            self._paused = True
+            self._withheld = self._entries.later(
+                "connection.withhold", seconds, self.withhold, 0.0, served=self, failed=self.abort
+            )
+        elif self._paused and self._transport.get_write_buffer_size() <= OUTPUT_LOW_WATER:
+            self.resume_writing()
+
+    def close(self) -> None:
+        """Write out what waits, then close."""
+        if self._transport is None or self._closing:
+            return
+        self._closing = True
+        self._cut_after(CLOSE_TIMEOUT)
+        self._network.leaves(self)
+        if self._waiting:
+            self._pause_reading()
+        else:
+            self._close_transport()
+
+    def _close_transport(self) -> None:
+        assert self._transport is not None
+        if not self._transport.get_write_buffer_size():
+            self._cut_after(farewell.TIMEOUT)
+        if self._connection is None and not self._transport.is_closing():
+            # A transport closes its socket as soon as it has written: of that only a copy is left.
+            with contextlib.suppress(OSError):
+                file = os.dup(self._transport.get_extra_info("socket").fileno())
+                self._connection = socket.socket(fileno=file)
+                self._connection.setblocking(False)
+        self._transport.close()
+
+
+class _Gone:
+    """The wire of a client whose connection has ended: nothing comes of what it is told."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def authenticate(self, connect: Connect) -> None:
+        """Nobody waits for it."""
+
+    def exchange(self, method: str) -> Exchange | None:
+        """There is none to be had."""
+        return None
+
+    def now(self) -> float:
+        """No time passes."""
+        return 0.0
+
+    def admit(self, account: Account) -> str:
+        """Nobody waits for it."""
+        return ""
+
+    def holds(self, size: int) -> None:
+        """Nothing more comes."""
+
+    def secured(self) -> Secured:
+        """Nothing is left to be secured."""
+        return Secured()
+
+    def later(self) -> None:
+        """There is nothing to go on with."""
+
+    def stop_reading(self) -> None:
+        """There is nothing to be read."""
+
+    def wait(self, seconds: float) -> None:
+        """No time passes."""
+
+    def proceed(self) -> None:
+        """There is nothing to go on with."""
+
+    def write(self, chunks: list[bytes]) -> None:
+        """Nobody reads it."""
+
+    def is_behind(self) -> bool:
+        """Nothing waits for anybody."""
+        return False
+
+    def contact(self) -> Contact:
+        """Nobody is at the other end."""
+        return Contact(silence=math.inf)
+
+    def probe(self) -> None:
+        """Nobody would answer."""
+
+    def withhold(self, seconds: float) -> None:
+        """Nothing is written anyway."""
+
+    def close(self) -> None:
+        """It is closed."""
+
+    def abort(self) -> None:
+        """It is closed."""

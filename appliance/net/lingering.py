@@ -1,0 +1,59 @@
+"""The end of a connection whose last bytes are on their way, so that they arrive."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+from appliance.net.callbacks import Entries
+
+#: Seconds that a closed connection is listened to, and the bytes that may come.
+TIMEOUT = 2.0
+BYTES = 64 * 1024 * 1024
+
+_SCRATCH = bytearray(256 * 1024)
+
+
+class Farewell:
+    """A connection after its last byte was written, until the other side has closed it as well.
+
+    To close a socket that has unread input is to reset the connection, and that may take from the
+    other side what it has not read yet: the reason why it was disconnected. So this side says that
+    nothing more will come, and what still comes in is thrown away, for a while.
+    """
+
+    def __init__(
+        self, connection: socket.socket, ended: Callable[[Farewell], None], entries: Entries
+    ) -> None:
+        self._socket = connection
+        self._ended = ended
+        self._left = BYTES
+        self._entries = entries
+        self._timeout = entries.later("farewell.timeout", TIMEOUT, self.end, failed=self.end)
+
+    def listen(self) -> None:
+        """Begin; it ends by itself."""
+        try:
+            self._socket.shutdown(socket.SHUT_WR)
+            self._entries.reader("farewell.chunk", self._socket, self._discard, failed=self.end)
+        except OSError:  # the other side was quicker
+            self.end()
+
+    def _discard(self) -> None:
+        try:
+            size = self._socket.recv_into(_SCRATCH)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            size = 0
+        self._left -= size
+        if not size or self._left < 0:
+            self.end()
+
+    def end(self) -> None:
+        """Close it; may be called twice."""
+        self._timeout.cancel()
+        if self._socket.fileno() >= 0:
+            self._entries.loop.remove_reader(self._socket)
+            self._socket.close()
+        self._ended(self)

@@ -1,0 +1,486 @@
+"""Listening: TCP, TLS, WebSocket and Unix sockets, and how many may come, and how fast."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import socket
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, cast
+
+from appliance.broker.accounts import Account
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Exchange
+from appliance.host.addresses import network
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.connection import ClientProtocol
+from appliance.net.scheduler import FAREWELLS, Authenticate, Certificates, Member, Network
+from appliance.net.sockets import allow_files, listen, listen_on_path
+
+log = logging.getLogger(__name__)
+
+#: Connections that are accepted in one go: a TLS handshake takes a millisecond, and other clients
+#: want their turn.
+ACCEPTED_A_TURN = 16
+
+#: Seconds until connections are accepted again after the system refused one.
+ACCEPT_PAUSE = 0.5
+
+#: TLS handshakes at a time; who comes meanwhile waits in the system's backlog, where waiting costs
+#: nothing and no time limit of ours runs.
+HANDSHAKES = 64
+
+#: Seconds without one handshake ending after which those under way no longer keep others waiting:
+#: it is the network that they wait for, or they are not meant to end.
+HANDSHAKE_STALL = 0.25
+
+#: Certificates that are looked at in one go when they are looked at anew, at most 0.2 ms each.
+CHECKED_A_TURN = 16
+
+#: Seconds that one address may open connections ahead of `limits.connection_rate`.
+CONNECTION_BURST = 5.0
+
+#: What stands for the address of Unix sockets.
+UNIX = b""
+
+#: Addresses that are remembered before those are looked for that can be forgotten.
+ADDRESSES = 1024
+
+#: Seconds that clients get at the stop to read what was written to them.
+STOP_TIMEOUT = 1.0
+
+#: Connections that have not logged in, or are closing, beside as many clients as there may be.
+GUESTS = 256
+
+#: Files that the process opens beside its connections.
+OTHER_FILES = GUESTS + FAREWELLS + 256
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """How many may come, and how fast: of `broker.limits` in appliance.yaml, infinity for none."""
+
+    connections: int
+    connect_timeout: float
+    connections_per_address: float = math.inf
+    connection_rate: float = math.inf
+    publish_rate: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerSettings:
+    """Where a listener listens: an address, or with `path` a Unix socket of that mode.
+
+    `context` is asked at each connection for its TLS settings, so that these can be replaced; None
+    is for connections without TLS. `anonymous` is whether it lets in who gives no user name, None
+    for what holds everywhere.
+    """
+
+    host: str
+    port: int
+    context: Callable[[], ssl.SSLContext] | None
+    protocol: Literal["mqtt", "websocket"] = "mqtt"
+    path: Path | None = None
+    mode: int = 0o660
+    anonymous: bool | None = None
+
+    @property
+    def place(self) -> tuple[str, int, Path | None]:
+        """What no two listeners can share."""
+        return self.host, self.port, self.path
+
+
+class Listeners:
+    """All listening sockets; `network` has the connections made to them."""
+
+    def __init__(
+        self,
+        broker: Broker,
+        authenticate: Authenticate,
+        exchange: Callable[[str, str | None], Exchange | None],
+        admission: Admission,
+        certificates: Certificates | None = None,
+    ) -> None:
+        self.broker = broker
+        self.admission = admission
+        self._addresses = _Addresses(admission)
+        self.network = Network(
+            broker,
+            authenticate,
+            exchange,
+            self._addresses,
+            connect_timeout=admission.connect_timeout,
+            publish_rate=admission.publish_rate,
+            certificates=certificates,
+        )
+        self._doors: list[_Door] = []
+        self._handshakes: set[ClientProtocol] = set()
+        self._stall: asyncio.TimerHandle | None = None
+
+    @property
+    def addresses(self) -> list[tuple[str, int]]:
+        """Where is listened, with the port that the system chose where it was 0."""
+        return [door.address for door in self._doors]
+
+    def doors(self) -> list[tuple[str, ListenerSettings]]:
+        """Each listener's address, as the log has it, and its settings."""
+        return [(str(door), door.settings) for door in self._doors]
+
+    def prepare(self, settings: list[ListenerSettings]) -> list[_Door]:
+        """Get ready to listen there, for `take`; where is listened already nothing changes yet.
+
+        Raises:
+            OSError: an address cannot be listened on; nothing has changed then.
+        """
+        leaving = list(self._doors)
+        kept: list[_Door | None] = []
+        for listener in settings:
+            # The first of several: those whose ports the system chose are told apart by order.
+            same = (door for door in leaving if door.settings.place == listener.place)
+            kept.append(next(same, None))
+            if kept[-1] is not None:
+                leaving.remove(kept[-1])
+        doors: list[_Door] = []
+        try:
+            for listener, door in zip(settings, kept, strict=True):
+                doors.append(door or _Door(self, listener, leaving))
+        except BaseException:
+            self.drop(doors)
+            raise
+        return doors
+
+    def drop(self, doors: list[_Door]) -> None:
+        """Not to be taken after all."""
+        for door in doors:
+            if door not in self._doors:
+                door.close()
+
+    def take(
+        self, doors: list[_Door], settings: list[ListenerSettings], admission: Admission
+    ) -> None:
+        """Listen there from now on, like this; connections that were made elsewhere stay."""
+        self.admission = admission
+        self._addresses.use(admission)
+        self.network.use(admission.connect_timeout, admission.publish_rate)
+        allow_files(admission.connections + OTHER_FILES)
+        before, self._doors = self._doors, doors
+        for door in before:
+            if door not in doors:
+                door.close()
+                log.info("closed the listener on %s", door)
+        for door, listener in zip(doors, settings, strict=True):
+            door.use(listener)
+            door.open()
+            if door not in before:
+                kind = " for WebSocket" if listener.protocol == "websocket" else ""
+                log.info("listening%s on %s", kind, door)
+
+    async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
+        """Listen; returns the addresses, with the port that the system chose where it was 0.
+
+        Raises:
+            OSError: an address cannot be listened on; nothing is left listening.
+        """
+        self.take(self.prepare(settings), settings, self.admission)
+        return self.addresses
+
+    def admit(self, connection: socket.socket, peer: object, listener: ListenerSettings) -> None:
+        """Begin a new connection, or close it when there are as many as allowed."""
+        counters = self.broker.counters
+        counters.sockets += 1
+        now = asyncio.get_running_loop().time()
+        refusal = host = ""
+        if listener.path is not None:
+            # In the place of a port a number that no other connection has at the time.
+            address = f"unix:{listener.path}:{connection.fileno()}"
+        else:
+            host, port = cast("tuple[str, int]", peer)[:2]
+            address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        if listener.path is None:
+            refusal = self._addresses.come(host, now)
+        if not refusal:
+            refusal = self._make_room()
+        if refusal:
+            connection.close()
+            counters.connections_refused += 1
+            self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            if self.broker.journal is not None:
+                self.broker.journal.refused(address, refusal)
+            return
+        protocol = ClientProtocol(self.network, address, host, listener.anonymous)
+        self.network.open.add(protocol)
+        self._addresses.came(protocol)
+        context = None
+        if listener.context is not None:
+            context = listener.context()
+            self._handshakes.add(protocol)
+        is_websocket = listener.protocol == "websocket"
+        self.network.in_background(self._begin(protocol, connection, context, is_websocket))
+
+    async def _begin(
+        self,
+        protocol: ClientProtocol,
+        connection: socket.socket,
+        context: ssl.SSLContext | None,
+        is_websocket: bool,
+    ) -> None:
+        try:
+            await protocol.begin(connection, context, websocket=is_websocket)
+        finally:
+            self._handshakes.discard(protocol)
+            if self._stall is not None:
+                self._open_doors()
+
+    def _make_room(self) -> str:
+        """Let there be room for a connection more; or why there cannot be.
+
+        Who has logged in does not count: among users the broker decides who makes room, when it
+        knows who comes. Of the others the one goes that has waited longest, out of the address
+        with most of them: as many strangers as may come from everywhere keep nobody out.
+        """
+        limit = self.admission.connections
+        if len(self.network.open) < max(limit, self.broker.ledger.accounts.connections + GUESTS):
+            return ""
+        guest = self._addresses.oldest_guest()
+        if guest is None:
+            return f"{limit} connections, as many as allowed (broker.limits.connections)"
+        guest.make_room()
+        return ""
+
+    @property
+    def crowded(self) -> bool:
+        """Whether there are as many TLS handshakes as there may be at a time."""
+        return len(self._handshakes) >= HANDSHAKES
+
+    def wait_for_handshakes(self) -> None:
+        """Open the doors again when a handshake has ended, or when none does for a while."""
+        if self._stall is None:
+            self._stall = self.network.entries.later(
+                "listener.stall", HANDSHAKE_STALL, self._pass_stalled, failed=self._open_doors
+            )
+
+    def _pass_stalled(self) -> None:
+        self._handshakes.clear()  # they go on, and are not counted any more
+        self._open_doors()
+
+    def _open_doors(self) -> None:
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+        for door in self._doors:
+            try:
+                door.open()
+            except Exception as error:
+                self.broker.faults.caught("listener.open", error, door)
+                door.pause()
+
+    async def check_certificates(self) -> None:
+        """End the connections whose client's certificate is not, or no longer, accepted."""
+        for number, member in enumerate(list(self.network.open)):
+            try:
+                member.check_certificate()
+            except Exception as error:
+                member.fault("connection.certificate", error)
+            if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
+                await asyncio.sleep(0)
+
+    async def stop(self) -> None:
+        """Listen no more and close what is open; may be called twice."""
+        doors, self._doors = self._doors, []
+        for door in doors:
+            door.close()
+        if self._stall is not None:
+            self._stall.cancel()
+        self.broker.close(
+            lambda session: session.close_link(ReasonCode.SERVER_SHUTTING_DOWN, "shutting down")
+        )
+        await self.network.close(STOP_TIMEOUT)
+
+
+class _Door:
+    """One listening socket; it may take over the port of one that is `leaving`."""
+
+    def __init__(
+        self, listeners: Listeners, settings: ListenerSettings, leaving: list[_Door]
+    ) -> None:
+        self._listeners = listeners
+        self.settings = settings
+        self._entries = listeners.network.entries
+        self._is_open = False
+        if settings.path is not None:
+            self._socket = listen_on_path(settings.path, settings.mode)
+            self._inode = settings.path.stat().st_ino
+            self.address = (f"unix:{settings.path}", 0)
+        else:
+            same = [door._socket for door in leaving if door.address[1] == settings.port > 0]
+            self._socket = listen(settings.host, settings.port, same)
+            self.address = (settings.host, self._socket.getsockname()[1])
+
+    def __str__(self) -> str:
+        host, port = self.address
+        return host if self.settings.path is not None else f"{host or '*'}:{port}"
+
+    def use(self, settings: ListenerSettings) -> None:
+        """Let these settings hold for those who come from now on."""
+        if settings.path is not None and settings.mode != self.settings.mode:
+            with contextlib.suppress(OSError):  # it may be gone
+                settings.path.chmod(settings.mode)
+        self.settings = settings
+
+    def open(self) -> None:
+        """Accept what comes; does nothing when it is open, or closed for good."""
+        if not self._is_open and self._socket.fileno() >= 0:
+            self._is_open = True
+            self._entries.reader(
+                "listener.accept", self._socket, self._accept, served=self, failed=self.pause
+            )
+
+    def _shut(self) -> None:
+        if self._is_open:
+            self._is_open = False
+            self._entries.loop.remove_reader(self._socket)
+
+    def pause(self) -> None:
+        """Accept nothing for a while."""
+        self._shut()
+        self._entries.later(
+            "listener.reopen", ACCEPT_PAUSE, self.open, served=self, failed=self.pause
+        )
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTED_A_TURN):
+            if self.settings.context is not None and self._listeners.crowded:
+                self._shut()
+                self._listeners.wait_for_handshakes()
+                return
+            try:
+                connection, peer = self._socket.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return
+            except OSError as error:
+                # Out of file descriptors, most likely: it passes, and asking on would spin.
+                log.error("no connection can be accepted: %s", error)
+                self.pause()
+                return
+            try:
+                self._listeners.admit(connection, peer, self.settings)
+            except Exception as error:
+                self._listeners.broker.faults.caught("listener.admit", error, self)
+                connection.close()
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._shut()
+        self._socket.close()
+        path = self.settings.path
+        if path is not None:
+            with contextlib.suppress(OSError):  # it may be gone, or another's by now
+                if path.stat().st_ino == self._inode:
+                    path.unlink()
+
+
+@dataclass(slots=True)
+class _Neighbour:
+    """What is known of one address."""
+
+    #: Connections that have not logged in yet, or are closing, in the order of their coming.
+    guests: dict[Member, None] = field(default_factory=dict)
+    #: And those that have, by their users.
+    clients: dict[Account, int] = field(default_factory=dict)
+    #: When the connections that it opened are paid for at the rate allowed.
+    paid_at: float = 0.0
+
+
+class _Addresses:
+    """How many connections each address has, and how fast it opens new ones: the `Doorkeeper`.
+
+    Those of one user, and those before their login, are counted for themselves: who knows a
+    password keeps nobody out who shares its address. All Unix sockets are one address, without a
+    limit.
+    """
+
+    def __init__(self, admission: Admission) -> None:
+        self.use(admission)
+        self._known: dict[bytes, _Neighbour] = {}
+        self._many = ADDRESSES
+
+    def use(self, admission: Admission) -> None:
+        """Let these limits hold from now on."""
+        self._limit = admission.connections_per_address
+        self._rate = admission.connection_rate
+
+    def come(self, host: str, now: float) -> str:
+        """Count a new connection's coming; or, uncounted, why it is not allowed."""
+        where = network(host)
+        neighbour = self._known.get(where)
+        if neighbour is None:
+            if len(self._known) >= self._many:
+                self._forget_idle(now)
+            neighbour = self._known[where] = _Neighbour()
+        if len(neighbour.guests) >= self._limit:
+            return (
+                f"its address has {len(neighbour.guests)} connections that have not logged in "
+                "(broker.limits.connections_per_address)"
+            )
+        paid_at = max(neighbour.paid_at, now) + 1 / self._rate
+        if paid_at > now + CONNECTION_BURST:
+            return (
+                f"its address opens more than {self._rate:g} connections a second "
+                "(broker.limits.connection_rate)"
+            )
+        neighbour.paid_at = paid_at
+        return ""
+
+    def _of(self, member: Member) -> _Neighbour:
+        where = network(member.host) if member.host else UNIX
+        return self._known.setdefault(where, _Neighbour())
+
+    def came(self, member: Member) -> None:
+        """A new connection is there."""
+        self._of(member).guests[member] = None
+
+    def admit(self, member: Member, account: Account) -> str:
+        """See `Doorkeeper.admit`."""
+        neighbour = self._of(member)
+        count = neighbour.clients.get(account, 0)
+        if member.host and count >= self._limit:
+            return (
+                f"its address has {count} connections of its user "
+                "(broker.limits.connections_per_address)"
+            )
+        neighbour.guests.pop(member, None)
+        neighbour.clients[account] = count + 1
+        return ""
+
+    def leaves(self, member: Member) -> None:
+        """See `Doorkeeper`."""
+        self._of(member).guests[member] = None
+
+    def ended(self, member: Member) -> None:
+        """See `Doorkeeper`."""
+        neighbour = self._of(member)
+        neighbour.guests.pop(member, None)
+        count = neighbour.clients.get(member.account, 0)
+        if count > 1:
+            neighbour.clients[member.account] = count - 1
+        else:
+            neighbour.clients.pop(member.account, None)
+
+    def oldest_guest(self) -> Member | None:
+        """Of the address that has most of them, the guest that came first."""
+        most = max(self._known.values(), key=lambda each: len(each.guests), default=None)
+        return next(iter(most.guests), None) if most is not None else None
+
+    def _forget_idle(self, now: float) -> None:
+        self._known = {
+            where: neighbour
+            for where, neighbour in self._known.items()
+            if neighbour.guests or neighbour.clients or neighbour.paid_at > now
+        }
+        # Each is looked at once for every two that come: the work stays in proportion.
+        self._many = max(ADDRESSES, 2 * len(self._known))

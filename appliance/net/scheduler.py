@@ -1,0 +1,333 @@
+"""All network connections together: whose turn it is, and what their output takes in all."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
+from typing import Protocol, TypeAlias
+
+from appliance.broker.accounts import Account
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.host.clock import SpareClock
+from appliance.mqtt.packets import Connect
+from appliance.net.callbacks import Entries
+from appliance.net.lingering import Farewell
+from appliance.net.turns import Charged, Turn
+
+#: Messages that are few: after more than these it is checked whether who sends them has to wait.
+FEW_MESSAGES = 64
+
+#: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
+LARGEST_PORTION = 256 * 1024
+
+#: What all clients may cause in one round of the event loop, see `Counters.effort`: some six
+#: milliseconds. And what each user may cause beyond that with little chunks: who sends little does
+#: not wait for who sends much, or are many.
+EFFORT_A_ROUND = 1500
+EFFORT_BEYOND = 100
+
+#: Effort after which it is looked where the round began.
+UNLOOKED = 300
+
+#: Seconds that a client may publish ahead of `limits.publish_rate`.
+PUBLISH_BURST = 1.0
+
+#: Closed connections that are listened to at a time, see `Farewell`.
+FAREWELLS = 256
+
+#: Who sent this CONNECT, from this address, over this TLS connection, if it is one; and does its
+#: listener let in who gives no user name (None: as everywhere)?
+Authenticate: TypeAlias = Callable[
+    [Connect, str, "ssl.SSLObject | None", "bool | None"], Awaitable["Identity | Refusal"]
+]
+
+
+class Certificates(Protocol):
+    """What is to be known of a client's certificate, of a connection with TLS."""
+
+    def refusal(self, tls: ssl.SSLObject) -> str:
+        """Why the client is not, or no longer, let in with it; empty when it is."""
+
+    def username(self, tls: ssl.SSLObject) -> str | None:
+        """The user that it names; None when that is not asked for. ValueError: it names none."""
+
+
+class Member(Turn, Protocol):
+    """One of the connections."""
+
+    #: What all connections of one computer share; empty for a Unix socket.
+    host: str
+    #: The user it has logged in as, or that of strangers.
+    account: Account
+
+    def check_certificate(self) -> None:
+        """Close the connection when the client's certificate is not, or no longer, accepted."""
+
+    def close(self) -> None:
+        """Write out what waits, then close."""
+
+    def abort(self) -> None:
+        """Close at once."""
+
+    def make_room(self) -> None:
+        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+
+
+class Doorkeeper(Protocol):
+    """Who lets connections in, and knows how many may be there."""
+
+    def admit(self, member: Member, account: Account) -> str:
+        """A connection logs in as that user: why it may not, or nothing."""
+
+    def leaves(self, member: Member) -> None:
+        """It is told its last bytes."""
+
+    def ended(self, member: Member) -> None:
+        """It has ended, once."""
+
+
+class Network:
+    """All connections, and what they share; the doorkeeper is told what becomes of each.
+
+    `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        authenticate: Authenticate,
+        exchange: Callable[[str, str | None], Exchange | None],
+        doorkeeper: Doorkeeper,
+        *,
+        connect_timeout: float,
+        publish_rate: float,
+        certificates: Certificates | None = None,
+    ) -> None:
+        self.broker = broker
+        self._spare = broker.ledger.spare = SpareClock()
+        self.certificates = certificates
+        self.authenticate = authenticate
+        self.exchange = exchange
+        self.entries = Entries(asyncio.get_running_loop(), broker.faults)
+        self.use(connect_timeout, publish_rate)
+        self.open: set[Member] = set()
+        #: What runs in the background for a connection: TLS handshakes and logins.
+        self.tasks: set[asyncio.Task[None]] = set()
+        #: Bytes in the output of all clients, as far as they are counted.
+        self.output = 0
+        self.doorkeeper = doorkeeper
+        #: For how many clients a large chunk waits, by its id: in all, and of each account.
+        self._shared: dict[tuple[int, int], int] = {}
+        #: Who has more to do than there was time for; in turn, with all others in between.
+        self._turns: deque[Turn] = deque()
+        #: `Counters.effort` from which on it is to be asked whether the round is over.
+        self.checkpoint = 0
+        self._next_turns: asyncio.Handle | None = None
+        self._counting = False
+        #: What each account has caused beyond the end of the round.
+        self._beyond: dict[Account, int] = {}
+        self._farewells: set[Farewell] = set()
+        self._all_closed: asyncio.Event | None = None
+
+    def use(self, connect_timeout: float, publish_rate: float) -> None:
+        """Let these limits hold from now on, and those that the broker has now."""
+        self.connect_timeout = connect_timeout
+        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
+        #: Messages of a client after which it is checked.
+        self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
+        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
+        self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
+        #: `Ledger.queued_bytes` from which on publishers are slowed.
+        self.short_of_memory = self.broker.limits.memory * 3 // 4
+        #: Bytes in the output of all clients from which on less is allowed to each of them.
+        self.much_output = self.broker.limits.memory // 4
+
+    def is_busy(self) -> bool:
+        """Whether as much was done in this round of the event loop as one round is for, or others
+        wait for the next one.
+
+        Who sends much then waits, too.
+        """
+        return self.is_round_over() or bool(self._turns)
+
+    def is_round_over(self) -> bool:
+        """Whether as much was done in this round of the event loop as one round is for.
+
+        To be asked when `Counters.effort` is beyond the `checkpoint`, by who sends little.
+        """
+        effort = self.broker.counters.effort
+        if not self._counting:
+            self._counting = True
+            self.checkpoint = effort + EFFORT_A_ROUND
+            self.entries.soon("network.round", self._new_round, failed=self._new_round)
+        return effort > self.checkpoint
+
+    def _new_round(self) -> None:
+        self._counting = False
+        self.checkpoint = self.broker.counters.effort + UNLOOKED
+        self._beyond.clear()
+
+    def may_go_beyond(self, account: Account) -> bool:
+        """Whether its clients have sent little since the round is over."""
+        return self._beyond.get(account, 0) < EFFORT_BEYOND
+
+    def went_beyond(self, account: Account, effort: int) -> None:
+        """So much was done for one of them nevertheless."""
+        self._beyond[account] = self._beyond.get(account, 0) + effort
+
+    def count(self, effort: int, charged: Charged) -> None:
+        """So much was done for it, see `Counters.effort`."""
+        counters = self.broker.counters
+        counters.effort += effort
+        if self._counting and counters.effort > self.checkpoint:
+            self.went_beyond(charged.account, effort)
+
+    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
+        """Whether a chunk is to be taken apart in a turn, see `Turns`."""
+        if not is_little:
+            return self.is_busy()
+        if self.broker.counters.effort <= self.checkpoint or not self.is_round_over():
+            return False
+        return not self.may_go_beyond(charged.account)
+
+    def queue_turn(self, member: Turn) -> None:
+        """Call `take_turn` when it is the member's."""
+        self._turns.append(member)
+        if len(self._turns) == 1:
+            self._schedule_turns()
+
+    def _schedule_turns(self) -> None:
+        """Run them in the next round, once: also when a fault comes after they were scheduled."""
+        if self._next_turns is not None:
+            self._next_turns.cancel()
+        self._next_turns = self.entries.soon(
+            "network.turns", self._run_turns, failed=self._schedule_turns
+        )
+
+    def _run_turns(self) -> None:
+        end = self.broker.counters.effort + EFFORT_A_ROUND
+        left = len(self._turns)
+        try:
+            while left:
+                left -= 1
+                member = self._turns[0]
+                try:
+                    member.take_turn()
+                except Exception as error:
+                    member.fault("connection.turn", error)
+                finally:
+                    # After its turn, so that no entry meanwhile is the first, to be scheduled.
+                    self._turns.popleft()
+                if self.broker.counters.effort > end:
+                    break
+        finally:
+            if self._turns:
+                self._schedule_turns()
+
+    def in_background(self, work: Coroutine[object, object, None]) -> None:
+        """Run a connection's handshake or login beside everything else."""
+        task = self.entries.task("network.background", work)
+        self.tasks.add(task)
+        self.entries.when_done("network.background_end", task, self.tasks.discard, task)
+
+    def count_output(self, account: Account, size: int) -> None:
+        """So many bytes more, or less, wait to be read by a client of the account."""
+        self._count_in_all(size)
+        self._count_for(account, size)
+
+    def _count_in_all(self, size: int) -> None:
+        self.output += size
+        self.broker.ledger.queued_bytes += size
+
+    def _count_for(self, account: Account, size: int) -> None:
+        account.output += size
+        account.bytes += size
+
+    def is_much(self, account: Account) -> bool:
+        """Whether so much output waits that less is allowed to the account's clients.
+
+        Those of a user with less than most have of it are not the reason.
+        """
+        return (
+            self.output > self.much_output
+            and account.output * len(self.broker.ledger.accounts) > self.much_output
+        )
+
+    def share(self, account: Account, chunk: bytes) -> None:
+        """Count a large chunk that waits for a client of the account.
+
+        It is counted once for however many it waits, and once for each account of these.
+        """
+        for key, count in self._sharers(account, chunk):
+            clients = self._shared.get(key, 0)
+            if not clients:
+                count(len(chunk))
+            self._shared[key] = clients + 1
+
+    def unshare(self, account: Account, chunk: bytes) -> None:
+        """It waits for one client of the account less."""
+        for key, count in self._sharers(account, chunk):
+            clients = self._shared.pop(key) - 1
+            if clients:
+                self._shared[key] = clients
+            else:
+                count(-len(chunk))
+
+    def _sharers(
+        self, account: Account, chunk: bytes
+    ) -> tuple[tuple[tuple[int, int], Callable[[int], None]], ...]:
+        return (
+            ((id(chunk), 0), self._count_in_all),
+            ((id(chunk), id(account)), partial(self._count_for, account)),
+        )
+
+    def leaves(self, member: Member) -> None:
+        """A connection is told its last bytes; one that has ended is nobody's guest any more."""
+        if member in self.open:
+            self.doorkeeper.leaves(member)
+
+    def closed(self, member: Member) -> None:
+        """A connection ended."""
+        if member in self.open:
+            self.open.discard(member)
+            self.doorkeeper.ended(member)
+        self._tell_when_all_closed()
+
+    def part(self, connection: socket.socket) -> None:
+        """Close a connection whose last bytes are on their way, see `Farewell`."""
+        if len(self._farewells) < FAREWELLS:
+            farewell = Farewell(connection, self._parted, self.entries)
+            self._farewells.add(farewell)
+            farewell.listen()
+        else:
+            connection.close()
+
+    def _parted(self, farewell: Farewell) -> None:
+        self._farewells.discard(farewell)
+        self._tell_when_all_closed()
+
+    def _tell_when_all_closed(self) -> None:
+        if self._all_closed is not None and not self.open and not self._farewells:
+            self._all_closed.set()
+
+    async def close(self, timeout: float) -> None:
+        """Close everything; who does not read the last bytes in so many seconds is cut off."""
+        for member in list(self.open):
+            member.close()
+        for task in list(self.tasks):
+            task.cancel()
+        if self.open or self._farewells:
+            self._all_closed = asyncio.Event()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._all_closed.wait(), timeout)
+        for member in list(self.open):
+            member.abort()
+        for farewell in list(self._farewells):
+            farewell.end()
+        self._spare.close()

@@ -1,0 +1,486 @@
+"""TLS on the connections of a listener, made for many connections with small messages.
+
+asyncio and uvloop have TLS transports of their own. They look for another record behind every one,
+which ends in an exception and costs as much as the record itself, and keep a read buffer a
+connection. Here an idle connection takes half the memory, and a message less CPU time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import ssl
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, TypeAlias, cast
+
+from appliance.net.callbacks import Faulty, contained, contained_made
+from appliance.net.turns import Charged, Turns
+
+Data: TypeAlias = "bytes | bytearray | memoryview"
+
+#: Bytes of plaintext in a record, at most (RFC 8446, section 5.1): a read of this size never leaves
+#: a part of a record behind.
+RECORD_SIZE: Final = 16 * 1024
+
+#: Bytes that OpenSSL is handed at once. Its buffers to and from the network never shrink: for each
+#: connection they would keep the size of its largest message.
+PIECE = 2 * RECORD_SIZE
+
+#: Records that are read of one connection, then it is the turn of others: a chunk from the network
+#: may hold ten thousand, of a byte each. And the effort of one, where they are many.
+RECORDS_A_TURN = 256
+RECORD_EFFORT = 1
+
+#: Bytes of a chunk that are little: it may be read although others have to be served.
+LITTLE = 4096
+
+#: Seconds that a client gets to read the last bytes before its connection is cut.
+CLOSE_TIMEOUT = 10.0
+
+#: What `get_extra_info` knows besides what the TCP connection does.
+_TLS_INFO: dict[str, Callable[[ssl.SSLObject], object]] = {
+    "ssl_object": lambda tls: tls,
+    "sslcontext": lambda tls: tls.context,
+    "peercert": lambda tls: tls.getpeercert(),
+    "cipher": lambda tls: tls.cipher(),
+    "compression": lambda tls: tls.compression(),
+}
+
+_NOTHING: Final = memoryview(b"")
+
+#: Who hears of a connection after its end.
+_NOBODY: Final = asyncio.Protocol()
+
+
+async def accept(
+    connection: socket.socket,
+    context: ssl.SSLContext,
+    protocol: asyncio.Protocol,
+    timeout: float,
+    turns: Turns,
+    part: Callable[[socket.socket], None] = socket.socket.close,
+) -> None:
+    """Shake hands as the server on an accepted connection; from then on it is the protocol's.
+
+    Of many records in one chunk only some are read at a time, in `turns` with other connections.
+
+    When this fails the connection is closed, and the protocol has not heard of it. `part` closes
+    one on which an alert was written, which says why: in TLS 1.3 the client may be sending already.
+
+    Raises:
+        asyncio.TimeoutError: no handshake within `timeout` seconds.
+        ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
+        OSError: the client is gone.
+    """
+    error = await TlsTransport(protocol, context, turns, part).shake_hands(connection, timeout)
+    if error is not None:
+        try:
+            raise error
+        finally:
+            # It holds the frames that it comes through. None of them may hold it, as what holds
+            # itself is only freed when garbage is looked for; hence `with_traceback(None)` below.
+            del error
+
+
+class TlsTransport:
+    """A TLS connection: to its TCP connection the protocol, to the client's protocol the transport.
+
+    What arrives in one chunk is handed on in one chunk, unless it has too many records, and before
+    the end of the connection or a broken record behind it takes effect. There are no half-closed
+    connections, as in asyncio.
+
+    It is an `asyncio.Transport` and an `asyncio.Protocol` without being derived from them, which
+    makes it faster when compiled.
+    """
+
+    def __init__(
+        self,
+        protocol: asyncio.Protocol,
+        context: ssl.SSLContext,
+        turns: Turns,
+        part: Callable[[socket.socket], None] = socket.socket.close,
+    ) -> None:
+        self._entries = turns.entries
+        self._loop = self._entries.loop
+        #: The end of the handshake, and why it failed if it did.
+        self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
+        self._protocol = protocol
+        self._part = part
+        #: The connection under the TCP transport, when an alert is the last thing written to it.
+        self._connection: socket.socket | None = None
+        self._turns = turns
+        #: What arrived and OpenSSL was not given, and whether that or OpenSSL has more to read.
+        self._rest = _NOTHING
+        self._set_apart = 0  # bytes that it takes, as the protocol was told
+        self._waits = False
+        self._queued = False
+        self._incoming = ssl.MemoryBIO()
+        self._outgoing = ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
+        self._tcp: asyncio.Transport
+        self._connected = False  # the protocol has heard of the connection
+        self._open = False  # connected, and not closing
+        self._reading = True
+        self._writable = True
+        self._ended = False  # nothing more is to be read
+        self._hung_up = False  # nothing more arrives
+        self._cut = True  # OpenSSL may have the beginning of a record
+        self._has_told_cut = False
+        self._error: Exception | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+
+    async def shake_hands(self, connection: socket.socket, timeout: float) -> Exception | None:
+        """Begin, on an accepted connection; returns why that failed if it did, see `accept`."""
+        protocol = cast(asyncio.Protocol, self)
+        await self._loop.connect_accepted_socket(lambda: protocol, connection)
+        try:
+            return await asyncio.wait_for(self._handshake, timeout)
+        except asyncio.TimeoutError:
+            self.abort()
+            return asyncio.TimeoutError(f"no handshake within {timeout:g} s")
+        except BaseException:
+            self.abort()
+            raise
+
+    # --- the protocol of the TCP connection ----------------------------------------------------
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        if self._connected and self._protocol is not _NOBODY:
+            cast(Faulty, self._protocol).fault(entry, error)
+            return
+        self._entries.faults.caught(entry, error)
+        if not self._handshake.done():
+            self._handshake.set_result(ConnectionAbortedError("a fault in the appliance"))
+        if hasattr(self, "_tcp"):  # else `contained_made` cuts it
+            self.abort()
+
+    @contained_made("tls.made")
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The TCP connection is there; in TLS the client speaks first."""
+        self._tcp = cast(asyncio.Transport, transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Hand on what a chunk from the network says."""
+        try:
+            if not self._open:
+                if not self._connected:
+                    self._handshake_received(data)
+            elif self._waits or self._turns.has_to_wait(
+                cast(Charged, self._protocol), is_little=len(data) <= LITTLE
+            ):
+                self._rest = memoryview(bytes(self._rest) + data if self._rest else data)
+                self._count_rest()
+                self._wait()
+            else:
+                self._take(data)
+        except Exception as error:
+            self.fault("tls.chunk", error)
+
+    def _take(self, data: Data) -> None:
+        """Hand on what the records in there say, and in those that OpenSSL has."""
+        parts: list[bytes] = []
+        if len(data) <= PIECE:
+            self._incoming.write(data)
+            self._read(parts)
+        else:
+            view = memoryview(data)
+            while view and not (self._waits or self._ended):
+                self._incoming.write(view[:PIECE])
+                view = view[PIECE:]
+                self._read(parts)
+            self._rest = view or _NOTHING  # an empty part would keep the whole
+        if self._rest or self._set_apart:
+            self._count_rest()
+        if len(parts) > 1:
+            self._turns.count(RECORD_EFFORT * len(parts), cast(Charged, self._protocol))
+        if parts:
+            self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
+        if self._cut or self._has_told_cut:  # each time: what was told is over with what came
+            self._has_told_cut = self._cut
+            cast(Charged, self._protocol).has_part(self._cut)
+        if self._waits and not self._ended:
+            self._wait()
+        elif self._ended or self._outgoing.pending:
+            self._react()
+
+    def _read(self, parts: list[bytes]) -> None:
+        """Append the plaintext of complete records; `_ended` when none can follow them, `_waits`
+        when these are enough for one turn."""
+        try:
+            # Room for no more than there can be: OpenSSL's caller has it set apart beforehand.
+            size = RECORD_SIZE if self._cut else self._incoming.pending
+            while part := self._tls.read(size):
+                parts.append(part)
+                if not self._incoming.pending:  # not to be told so by an exception
+                    self._cut = False
+                    return
+                if len(parts) >= RECORDS_A_TURN:
+                    self._waits = True
+                    return
+            self._ended = True  # by a close_notify
+        except ssl.SSLWantReadError:
+            self._cut = True
+        except ssl.SSLError as error:
+            self._ended = True
+            self._error = error.with_traceback(None)
+
+    def _count_rest(self) -> None:
+        """Tell the protocol what memory is taken by what OpenSSL was not given: a whole chunk."""
+        size = len(cast(bytes, self._rest.obj))
+        if size != self._set_apart:
+            self._set_apart = size
+            cast(Charged, self._protocol).set_apart(size)
+
+    def _wait(self) -> None:
+        """Read nothing more until the others have had their turn."""
+        self._waits = True
+        if not self._open:
+            return
+        self._tcp.pause_reading()
+        cast(Charged, self._protocol).is_not_read()
+        if self._reading and not self._queued:
+            self._queued = True
+            self._turns.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._queued = False
+        if not (self._open and self._reading):
+            return
+        rest, self._rest = self._rest, _NOTHING
+        self._waits = False
+        self._take(rest)
+        if self._waits or not self._open:
+            return
+        if self._hung_up:
+            self._ended = True
+            self._react()
+        elif self._reading:
+            cast(Charged, self._protocol).is_read()
+            self._tcp.resume_reading()
+
+    def _react(self) -> None:
+        """Send what reading has caused, such as an alert, and close a connection that has ended."""
+        if not self._open:
+            return
+        if not self._writable and self._outgoing.pending:
+            # Whoever makes OpenSSL answer again and again must read the answers.
+            self.abort()
+            return
+        if not self._ended:
+            self._flush()
+            return
+        if self._error is None:
+            if not self._reading:  # what was said before it is still worked on
+                return
+            self._protocol.eof_received()
+        self.close()
+
+    def _handshake_received(self, data: bytes) -> None:
+        for start in range(0, len(data), PIECE):
+            self._incoming.write(data[start : start + PIECE])
+            try:
+                self._tls.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLError as error:
+                self._flush()  # the alert that tells the client
+                self._connection = _copy(self._tcp)
+                self._tcp.close()
+                if not self._handshake.done():
+                    self._handshake.set_result(error.with_traceback(None))
+                return
+            self._flush()
+            self._connected = self._open = True
+            if not self._handshake.done():
+                self._handshake.set_result(None)
+            self._protocol.connection_made(cast(asyncio.Transport, self))
+            rest = data[start + PIECE :]
+            if rest or self._incoming.pending:
+                self.data_received(rest)
+            return
+        self._flush()
+
+    @contained("tls.eof")
+    def eof_received(self) -> bool:
+        """The client has closed the TCP connection; some do so without close_notify.
+
+        While there is more to read the connection stays as it is, which asyncio is told by True.
+        """
+        self._hung_up = True
+        if self._waits and self._open:
+            return True
+        self._ended = True
+        self._react()
+        return False
+
+    @contained("tls.lost")
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The TCP connection is gone."""
+        self._open = False
+        if self._deadline is not None:
+            self._deadline.cancel()
+        if not self._handshake.done():
+            error = ConnectionResetError("it hung up before the end of the handshake")
+            self._handshake.set_result(exc or error)
+        if self._connection is not None:
+            self._part(self._connection)
+        protocol, self._protocol = self._protocol, _NOBODY
+        if self._connected:
+            protocol.connection_lost(exc or self._error)
+
+    @contained("tls.pause")
+    def pause_writing(self) -> None:
+        """The client reads slower than it is written to."""
+        self._writable = False
+        self._protocol.pause_writing()
+
+    @contained("tls.resume")
+    def resume_writing(self) -> None:
+        """The client has caught up."""
+        self._writable = True
+        self._protocol.resume_writing()
+
+    # --- the transport of the client's protocol ------------------------------------------------
+
+    def write(self, data: Data) -> None:
+        """Write, without waiting for a record to become full; nothing once it is closing."""
+        if not self._open:
+            return
+        try:
+            if len(data) <= PIECE:
+                self._tls.write(data)
+                self._tcp.write(self._outgoing.read())
+            else:
+                view, sealed = memoryview(data), []
+                for start in range(0, len(view), PIECE):
+                    self._tls.write(view[start : start + PIECE])
+                    sealed.append(self._outgoing.read())
+                self._tcp.write(b"".join(sealed))
+        except ssl.SSLError as error:
+            # It must not reach the one whose message this is.
+            self._error = error.with_traceback(None)
+            self.abort()
+
+    def writelines(self, list_of_data: Iterable[Data]) -> None:
+        """Write them, one behind the other."""
+        self.write(b"".join(list_of_data))
+
+    def _flush(self) -> None:
+        if self._outgoing.pending:
+            self._tcp.write(self._outgoing.read())
+
+    def close(self) -> None:
+        """Write out what waits and a close_notify, then close.
+
+        The client's close_notify is not waited for (RFC 8446, section 6.1).
+        """
+        if self._tcp.is_closing():
+            return
+        self._open = False
+        self._deadline = self._entries.later("tls.cut", CLOSE_TIMEOUT, self._tcp.abort)
+        with contextlib.suppress(ssl.SSLError):  # it asks for the client's close_notify as well
+            self._tls.unwrap()
+        self._flush()
+        self._tcp.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._open = False
+        self._tcp.abort()
+
+    def is_closing(self) -> bool:
+        """Whether the connection is closing or closed."""
+        return self._tcp.is_closing()
+
+    def pause_reading(self) -> None:
+        """Hand on nothing more."""
+        self._reading = False
+        self._tcp.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Hand on what arrives, be it the end."""
+        self._reading = True
+        if self._waits and not self._ended:
+            self._wait()
+            return
+        if not self._hung_up:
+            self._tcp.resume_reading()
+        if self._ended:
+            self._entries.soon("tls.react", self._react, failed=self.abort)
+
+    def is_reading(self) -> bool:
+        """Whether what arrives is handed on."""
+        return self._tcp.is_reading()
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """From how many bytes on, encrypted, the protocol is told to pause, and to resume."""
+        self._tcp.set_write_buffer_limits(high, low)
+
+    def get_write_buffer_limits(self) -> tuple[int, int]:
+        """The two limits, the low one first."""
+        return self._tcp.get_write_buffer_limits()
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes, encrypted, that the network has not taken yet."""
+        return self._tcp.get_write_buffer_size()
+
+    def can_write_eof(self) -> bool:
+        """No: TLS closes in both directions."""
+        return False
+
+    def get_extra_info(self, name: str, default: object = None) -> object:
+        """As of the TCP connection, and what asyncio's TLS transports know."""
+        if name in _TLS_INFO:
+            return _TLS_INFO[name](self._tls)
+        if name == "has_unread":  # what has come and was not handed on, be it a part of a record
+            return self._waits or self._cut or len(self._rest) > 0
+        return self._tcp.get_extra_info(name, default)
+
+    def get_protocol(self) -> asyncio.BaseProtocol:
+        """Who is told what happens here."""
+        return self._protocol
+
+    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
+        """Tell another one what happens from now on."""
+        self._protocol = cast(asyncio.Protocol, protocol)
+
+
+def _copy(transport: asyncio.Transport) -> socket.socket | None:
+    """The socket under a transport once more, to be closed after it; None when there is no room."""
+    with contextlib.suppress(OSError):
+        connection = socket.socket(fileno=os.dup(transport.get_extra_info("socket").fileno()))
+        connection.setblocking(False)
+        return connection
+    return None
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong in a handshake, in words for the person who reads the log."""
+    said = getattr(error, "reason", None) or str(error) or type(error).__name__
+    text = str(said).replace("_", " ").lower()
+    if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
+        return f"the client does not trust our certificate; does it have ca.crt? ({text})"
+    if "http request" in text or "wrong version number" in text:
+        return f"what it sent is not TLS; is it meant for the plain listener? ({text})"
+    if "certificate verify failed" in text:
+        why = getattr(error, "verify_message", "")
+        where = "crl" if "revoked" in why else "ca"
+        return f"the client's certificate is not accepted: {why or text} (broker.tls.{where})"
+    if "peer did not return a certificate" in text:
+        return f"it has no client certificate, and one is required ({text})"
+    return text
+
+
+def name_in(certificate: Mapping[str, Any] | None) -> str:
+    """The common name of a certificate's subject, or else its first alternative name."""
+    if not certificate:
+        return ""
+    for part in certificate.get("subject", ()):
+        for key, value in part:
+            if key == "commonName":
+                return str(value)
+    return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")

@@ -1,0 +1,419 @@
+"""MQTT over WebSocket (section 6 of both versions): RFC 6455 between a transport and a protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+from typing import Any, Protocol, cast
+
+from websockets.exceptions import NegotiationError, PayloadTooBig
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request, Response
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+from websockets.typing import Subprotocol
+
+from appliance.broker.accounts import Account
+from appliance.net.callbacks import contained, contained_made
+from appliance.net.turns import Charged, Turns
+
+#: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
+PATH = "/mqtt"
+SUBPROTOCOLS = ("mqtt", "mqttv3.1")
+
+#: The largest head of an HTTP request, in bytes: a browser's, with all the cookies it may have.
+HEAD_LIMIT = 16 * 1024
+
+#: What the names of the headers begin with that a WebSocket is asked for with.
+_OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
+
+#: Bytes that these may hold in all: the library takes a microsecond for each, and more.
+OWN_HEADERS_LIMIT = 1024
+
+#: The effort of a request for a WebSocket, see `Counters.effort`: it may have a hundred headers.
+HEAD_EFFORT = 100
+
+#: Bytes of frames that are little, and that are taken apart in one go: at worst, as frames may be
+#: empty, two milliseconds' work. And the effort of a frame, where they are many.
+PORTION = 2048
+FRAME_EFFORT = 3
+
+#: Frames of one connection in its turn.
+FRAMES_A_TURN = 256
+
+_NOTHING = memoryview(b"")
+
+# The library tells of every connection; what is of interest is told here, with the address.
+_library_log = logging.getLogger(f"{__name__}.frames")
+_library_log.setLevel(logging.ERROR)
+
+
+class Upper(Charged, Protocol):
+    """What can be above a WebSocket: an `asyncio.Protocol` that answers for the connection."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """As asyncio tells it."""
+
+    def data_received(self, data: bytes) -> None:
+        """As asyncio tells it."""
+
+    def eof_received(self) -> bool | None:
+        """As asyncio tells it."""
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """As asyncio tells it."""
+
+    def pause_writing(self) -> None:
+        """As asyncio tells it."""
+
+    def resume_writing(self) -> None:
+        """As asyncio tells it."""
+
+    def frame_limit(self) -> int:
+        """How large a frame may be that is received now, in bytes."""
+
+    def keep(self, size: int) -> None:
+        """So many bytes of a frame are kept until it is complete."""
+
+    def complain(self, what: str, why: str) -> None:
+        """Tell the log what was refused or ended."""
+
+    def close(self) -> None:
+        """Close the connection: what is below was told why."""
+
+    def abort(self) -> None:
+        """Close it at once."""
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """Count what escaped while the connection was served, and end it; never raises."""
+
+
+class WebSocket(asyncio.Transport, asyncio.Protocol):
+    """A protocol to the transport below, and a transport to the `protocol` above.
+
+    What is above reads and writes bytes, and its flow control is that of the transport below. It
+    receives a message in the fragments that it comes in, and none while it has paused reading.
+
+    Whether a page of another origin opened the connection makes no difference: no browser adds a
+    password to it by itself.
+    """
+
+    def __init__(self, protocol: Upper, turns: Turns) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self._turns = turns
+        self._queued = False
+        self._frames_left = FRAMES_A_TURN
+        self._frames = _Frames(logger=_library_log)
+        #: The HTTP request, until it is complete.
+        self._head = bytearray()
+        #: Received, and not yet taken apart.
+        self._held = _NOTHING
+        #: Bytes that TLS below has kept, and that are kept here beside them.
+        self._below = 0
+        self._set_apart = 0
+        self._reading = True
+        self._writing = True
+        #: The answer to the last ping, while it cannot be written.
+        self._pong = b""
+
+    # --- towards the transport -----------------------------------------------------------------
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection, as something that nobody expected escaped while it was served."""
+        self._protocol.fault(entry, error)
+
+    @contained_made("websocket.made")
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The connection is there; what is above may close it, and read when it is upgraded."""
+        self._transport = cast(asyncio.Transport, transport)
+        self._protocol.connection_made(self)
+
+    @contained("websocket.chunk")
+    def data_received(self, data: bytes) -> None:
+        """Hand on what the frames hold, whole or in part."""
+        self._held = memoryview(bytes(self._held) + data if self._held else data)
+        is_little = len(self._held) <= PORTION
+        if self._queued or self._turns.has_to_wait(self._protocol, is_little=is_little):
+            self._take_later()
+        else:
+            self._take()
+        self._count_held()
+
+    def _count_held(self) -> None:
+        """Tell what is above what memory is taken by what is not taken apart: a whole chunk."""
+        size = len(cast(bytes, self._held.obj)) + len(self._head)
+        if size != self._set_apart:
+            self._set_apart = size
+            self._protocol.set_apart(self._below + size)
+
+    @property
+    def account(self) -> Account:
+        """Whose user is charged for what TLS does below."""
+        return self._protocol.account
+
+    def set_apart(self, size: int) -> None:
+        """TLS below keeps so many bytes."""
+        self._below = size
+        self._protocol.set_apart(size + self._set_apart)
+
+    def is_not_read(self) -> None:
+        """What has come waits in TLS."""
+        self._protocol.is_not_read()
+
+    def is_read(self) -> None:
+        """It waits there no longer."""
+        self._protocol.is_read()
+
+    def has_part(self, part: bool) -> None:
+        """Whether TLS keeps the beginning of a record."""
+        self._protocol.has_part(part)
+
+    def _take(self) -> None:
+        """Take apart what is there, until others have their turn; reading is paused then."""
+        self._frames_left = FRAMES_A_TURN
+        while self._held and self._reading and not self._transport.is_closing():
+            data = bytes(self._held[:PORTION])
+            self._held = self._held[PORTION:] or _NOTHING  # an empty part would keep the whole
+            if self._frames.state is State.CONNECTING:
+                data = self._receive_head(data)
+            if data:
+                self._receive_frames(data)
+            if self._held and self._frames_left <= 0:
+                self._take_later()
+                break
+
+    def _take_later(self) -> None:
+        """Let the others have their turn first."""
+        self._transport.pause_reading()
+        self._protocol.is_not_read()
+        if not self._queued:
+            self._queued = True
+            self._turns.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """The others have had their turn."""
+        self._queued = False
+        self._take()
+        self._count_held()
+        if not self._reading or self._transport.is_closing():
+            return
+        if self._frames.close_rcvd is not None:
+            self._transport.close()
+        elif not (self._held or self._queued):
+            self._protocol.is_read()
+            self._transport.resume_reading()
+
+    def _receive_head(self, data: bytes) -> bytes:
+        """Answer the HTTP request once it is complete; returns what came behind it."""
+        head = self._head
+        head += data
+        end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
+        if not head[:1].isupper():
+            self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
+        elif end > 3:
+            self._turns.count(HEAD_EFFORT, self._protocol)
+            # The library would read frames before the answer to the request, so it gets the two
+            # one after the other.
+            self._frames.receive_data(bytes(head[:end]))
+            behind = bytes(head[end:])
+            head.clear()
+            if self._upgrade():
+                return behind
+        elif len(head) > HEAD_LIMIT:
+            self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
+        return b""
+
+    def _upgrade(self) -> bool:
+        frames = self._frames
+        events = frames.events_received()
+        if not events:
+            error = frames.handshake_exc and frames.handshake_exc.__cause__
+            self._refuse(400, f"not a WebSocket request: {error}")
+            return False
+        request = cast(Request, events[0])
+        if request.path.partition("?")[0] != PATH:
+            self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
+            return False
+        size = 0
+        for name, value in request.headers.raw_items():
+            if not name.lower().startswith(_OWN_HEADERS):
+                continue
+            # What is not ASCII is for other headers, and the library would stumble over it.
+            if not value.isascii():
+                self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
+                return False
+            size += len(value)
+            if size > OWN_HEADERS_LIMIT:
+                what = f"{name} and the like hold more than {OWN_HEADERS_LIMIT} bytes"
+                self._refuse(400, f"not a WebSocket request: {what}")
+                return False
+        response = frames.accept(request)
+        if response.status_code != 101:
+            self._send_refusal(response, str(frames.handshake_exc))
+            return False
+        frames.send_response(response)
+        self._send(frames.data_to_send())
+        return True
+
+    def _refuse(self, status: int | None, reason: str, path: str | None = None) -> None:
+        response = None if status is None else self._frames.reject(status, f"{reason}\n")
+        self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
+
+    def _send_refusal(self, response: Response | None, reason: str) -> None:
+        self._protocol.complain("no WebSocket connection", reason)
+        if response is not None:
+            self._transport.write(response.serialize())
+        self._protocol.close()
+
+    def _receive_frames(self, data: bytes) -> None:
+        frames = self._frames
+        frames.max_size = self._protocol.frame_limit()
+        frames.receive_data(data)
+        payload: list[bytes] = []
+        is_text = False
+        events = frames.events_received()
+        self._frames_left -= len(events)
+        if len(events) > 1:
+            self._turns.count(FRAME_EFFORT * len(events), self._protocol)
+        for frame in events:
+            assert not isinstance(frame, Request | Response)
+            if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]
+                is_text = True
+                break
+            if frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
+                payload.append(cast(bytes, frame.data))
+        if payload:  # [MQTT-6.0.0-2]
+            self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
+        self._answer(frames.data_to_send())
+        kept = len(frames.reader.buffer)
+        if kept and events:  # of the next one
+            self._protocol.keep(0)
+        self._protocol.keep(kept)
+        error = frames.parser_exc
+        if is_text:
+            self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
+        elif isinstance(error, PayloadTooBig):
+            self._fail(CloseCode.MESSAGE_TOO_BIG, f"a frame that is too large ({error})")
+        elif error is not None:
+            self._fail(CloseCode.PROTOCOL_ERROR, str(error))
+        elif frames.close_rcvd is not None and self._reading:
+            # Else what is above has not read all that came before: a CONNECT, it may be.
+            self._transport.close()
+
+    def _answer(self, writes: list[bytes]) -> None:
+        """Send the pongs and the close frame that the library has ready."""
+        if self._writing or self._frames.state is not State.OPEN:
+            self._send(writes)
+        elif writes:
+            # Who pings on and does not read is owed the last answer only (RFC 6455, 5.5.3).
+            self._pong = writes[-1]
+
+    def _fail(self, code: CloseCode, reason: str) -> None:
+        self._protocol.complain("not the WebSocket protocol", reason)
+        if self._frames.state is State.OPEN:
+            self._frames.send_close(code, reason)
+            self._send(self._frames.data_to_send())
+        self._protocol.close()
+
+    def _send(self, writes: list[bytes]) -> None:
+        if any(writes):
+            self._transport.write(writes[0] if len(writes) == 1 else b"".join(writes))
+
+    @contained("websocket.pause")
+    def pause_writing(self) -> None:
+        """The other side reads slower than it is written to."""
+        self._writing = False
+        self._protocol.pause_writing()
+
+    @contained("websocket.resume")
+    def resume_writing(self) -> None:
+        """It has caught up."""
+        self._writing = True
+        pong, self._pong = self._pong, b""
+        if pong and self._frames.state is State.OPEN:
+            self._transport.write(pong)
+        self._protocol.resume_writing()
+
+    @contained("websocket.eof")
+    def eof_received(self) -> bool | None:
+        """The other side will send no more."""
+        return self._protocol.eof_received()
+
+    @contained("websocket.lost")
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection ended, whoever ended it."""
+        self._protocol.connection_lost(exc)
+
+    # --- towards the protocol ------------------------------------------------------------------
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Send a binary frame; what comes after the other side's close frame is dropped."""
+        if self._frames.state is State.OPEN:
+            self._frames.send_binary(data)  # type: ignore[arg-type]
+            self._send(self._frames.data_to_send())
+
+    def close(self) -> None:
+        """Send a close frame behind what was written, and close."""
+        if self._frames.state is State.OPEN and not self._transport.is_closing():
+            self._frames.send_close(CloseCode.NORMAL_CLOSURE)
+            self._send(self._frames.data_to_send())
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._transport.abort()
+
+    def is_closing(self) -> bool:
+        """Whether it is closed, or about to be."""
+        return self._transport.is_closing()
+
+    def pause_reading(self) -> None:
+        """Take nothing apart until `resume_reading`."""
+        self._reading = False
+        self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Go on with what was received meanwhile."""
+        self._reading = True
+        if self._held or self._frames.close_rcvd is not None:
+            self._take_later()
+        else:
+            self._transport.resume_reading()
+
+    def is_reading(self) -> bool:
+        """Whether reading is not paused."""
+        return self._reading
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """Those of the transport below."""
+        self._transport.set_write_buffer_limits(high, low)
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes that wait in the transport below."""
+        return self._transport.get_write_buffer_size()
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """What the transport below knows; `has_unread`: whether any of the two keeps what has come
+        and was not handed on, be it a part of a frame."""
+        if name == "has_unread" and (self._held or self._frames.reader.buffer):
+            return True
+        return self._transport.get_extra_info(name, default)
+
+
+class _Frames(ServerProtocol):
+    """The library's side of a connection, without I/O."""
+
+    def select_subprotocol(self, subprotocols: Sequence[Subprotocol]) -> Subprotocol:
+        """The first one known of what the client offers, in its order [MQTT-6.0.0-3]."""
+        for subprotocol in subprotocols:
+            if subprotocol in SUBPROTOCOLS:
+                return subprotocol
+        raise NegotiationError(f"offer the subprotocol {' or '.join(SUBPROTOCOLS)}")
+
+    def recv_frame(self, frame: Frame) -> None:
+        """Take a frame in; the limit of sizes is for a frame, as no message is put together."""
+        super().recv_frame(frame)
+        if self.cur_size:
+            self.cur_size = 0

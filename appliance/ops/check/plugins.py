@@ -1,0 +1,18 @@
+"""Whether a plugin takes the settings that it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from appliance.ops.check.finding import Finding
+from appliance.plugins import PluginSettingsError, check_plugin_settings
+
+
+def plugin_settings(path: str, settings: Mapping[str, Any]) -> Finding:
+    """What there is to say of a plugin whose module is there."""
+    try:
+        check_plugin_settings(path, settings)
+    except PluginSettingsError as error:
+        return Finding("error", f"plugin {path}", str(error))
+    return Finding("ok", f"plugin {path}", "found, and takes its settings")

@@ -1,0 +1,71 @@
+"""What the rules say that nobody can have meant, and who may command what is bridged to ROS."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from appliance.access import Acl
+from appliance.access.rules import Permission, Rule
+from appliance.broker.ports import Action, Identity
+from appliance.config import Settings
+from appliance.ops.check.finding import Finding
+
+_PLACEHOLDER = re.compile(r"\{[^/]*\}|%[A-Za-z]")
+
+#: As many names as anybody reads.
+_SHOWN = 5
+
+
+def rights(settings: Settings, acl: Acl, users: list[str] | None) -> Iterator[Finding]:
+    """What there is to say of the rules; `users` is None where the users file cannot be read."""
+    for rule in acl.rules:
+        text = _unmeant(rule)
+        if text:
+            yield Finding("warning", f"{rule.file}:{rule.line}", text)
+    broker = settings.broker
+    # Plugins and certificates may know users of their own, and rules for them.
+    if users and not broker.plugins and broker.tls.username_from == "none":
+        for route in settings.bridge.topics:
+            if not (route.is_exclusion or route.is_pattern) and route.to != "mqtt":
+                yield _writers(acl, users, route.names[0], route.topic(settings.robot), settings)
+
+
+def _unmeant(rule: Rule) -> str:
+    for level in rule.filter.split("/"):
+        if rule.pattern and level in ("%c", "%u"):
+            continue
+        found = _PLACEHOLDER.search(level)
+        if found is None:
+            continue
+        if found[0].startswith("{"):
+            return f"{found[0]!r} stands for nothing, only {{robot}} does; did you mean that?"
+        if found[0] in ("%c", "%u"):
+            return f"{found[0]} stands for a name in `pattern` lines only, not in `topic` lines"
+        if rule.pattern:
+            return f"{found[0]!r} stands for nothing; %c is the client id, %u the user name"
+    return ""
+
+
+def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Settings) -> Finding:
+    may = [name for name in users if acl.decide(Identity(name, name), Action.PUBLISH, topic)]
+    others = [name for name in users if name not in may]
+    subject = f"{ros} ← {topic}"
+    line = f"topic {Permission.WRITE.name.lower()} {_written(topic, settings.robot)}"
+    who = _named(may) if may else "no user"
+    text = f"{who} may send to it"
+    if others:
+        text += (
+            f"{f'; {_named(others)} may not' if may else ''}. To let {others[0]} send to it, add "
+        )
+        text += f"to {settings.broker.acl.name} below the line `user {others[0]}`: {line}"
+    return Finding("ok" if may else "warning", subject, text)
+
+
+def _written(topic: str, robot: str) -> str:
+    """As a line of the file has it, in which the robot's name need not stand."""
+    return "{robot}" + topic.removeprefix(robot) if topic.startswith(f"{robot}/") else topic
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")

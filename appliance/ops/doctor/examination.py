@@ -1,0 +1,73 @@
+"""All that `appliance doctor` looks at, in its order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from appliance import config
+from appliance.config import ConfigError, Settings
+from appliance.ops import check
+from appliance.ops.control import ControlError, NotRunningError, ask
+from appliance.ops.doctor.computer import clock, disk, files, memory
+from appliance.ops.doctor.finding import Finding, Level
+from appliance.ops.doctor.ports import ports
+from appliance.ops.doctor.ros import ros
+from appliance.ops.doctor.secrets import certificates, permissions
+from appliance.ros.ros2.fastdds import LOST_IN_ROS
+
+#: Seconds that the running appliance has to answer.
+PATIENCE = 5.0
+
+#: Says what it finds, given the settings and what the running appliance says of itself.
+Part: TypeAlias = Callable[[Settings, "dict[str, Any] | None"], Iterator[Finding]]
+
+
+def examine(path: Path | None) -> Iterator[Finding]:
+    """Look at everything, and change nothing; the configuration may be missing or broken.
+
+    What takes longest comes last, so that each finding can be told as it is made.
+    """
+    try:
+        settings = config.load(path)
+    except ConfigError as error:
+        settings = None
+        for problem in error.problems:
+            yield Finding("problem", "configuration", str(problem))
+        text = "what follows is with the defaults, and without the files that it would name"
+        yield Finding("warning", "configuration", text)
+    known = settings or config.load_control(path)
+    running: dict[str, Any] | None = None
+    try:
+        running = ask(known.control, "status", PATIENCE)
+    except NotRunningError:
+        yield Finding("ok", "appliance", "not running")
+    except ControlError as error:
+        yield Finding("problem", "appliance", str(error), "its log says more")
+    if running is not None:
+        yield from _running(running)
+    if settings is not None:
+        for found in check.check(settings):
+            level: Level = "problem" if found.level == "error" else found.level
+            yield Finding(level, found.subject, found.text)
+    parts: list[Part] = [ports, clock, disk, memory, files]
+    if settings is not None:
+        parts[2:2] = [certificates, permissions]
+    for part in (*parts, ros):
+        try:
+            yield from part(known, running)
+        except Exception as error:
+            # What a computer is like nobody knows: the other parts have their say all the same.
+            text = f"could not be looked at: {type(error).__name__}: {error}"
+            yield Finding("warning", part.__name__, text)
+
+
+def _running(told: dict[str, Any]) -> Iterator[Finding]:
+    text = f"{told['version']} is running, pid {told['pid']}, {told['clients']} clients"
+    yield Finding("ok", "appliance", text)
+    for warning in told["warnings"]:
+        yield Finding("warning", "appliance", warning)
+    for sick in told["routes"]["sick"]:
+        advice = LOST_IN_ROS if sick["lost"] else ""
+        yield Finding("warning", f"route {sick['route']}", sick["problem"], advice)

@@ -1,0 +1,251 @@
+"""Topics: what the ACL file and all of amqtt's topic plugins allow."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, Final
+
+from amqtt.broker import BrokerContext
+from amqtt.contexts import Action as AmqttAction
+from amqtt.plugins.base import BaseTopicPlugin
+from amqtt.plugins.manager import PluginManager
+from amqtt.session import Session as AmqttSession
+
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Access, Action, Decision, Identity, Question
+from appliance.net.callbacks import Entries
+from appliance.plugins.adapters import Sessions, Unclaimed
+from appliance.plugins.guard import Guard, name, redacted
+from appliance.plugins.logins import Answers
+from appliance.plugins.threads import Threads, blocks
+
+log = logging.getLogger(__name__)
+
+#: Seconds for which an older verdict holds while they are asked.
+VERDICT_USE = 600.0
+#: Questions to such plugins at one time, in all and of one client.
+QUESTIONS = 64
+CLIENT_QUESTIONS = 8
+#: And of one user's clients together.
+USER_QUESTIONS = 16
+#: Seconds between two looks at whether those who could not ask for want of room can now.
+LINE_INTERVAL = 0.25
+
+#: The answer of a plugin that has none without waiting.
+_WAITS: Final = object()
+
+
+class PluginAccess:
+    """The broker's `Access`: what the files allow and no topic plugin refuses.
+
+    The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait for
+    anything (rules in the configuration, a token) are run on the spot. From the first time that
+    one has to wait (HTTP, SQL, LDAP), all are asked in the background: a SUBSCRIBE or PUBLISH that
+    is asked about for the first time, and what its client sends behind it, waits for the answer, up
+    to `patience`; then it is refused, and the answer holds for the next try. Later one
+    that is older than `answers` says, or from before the files were read again, holds while they
+    are asked anew, for 10 minutes at most.
+
+    What already waits for a client is checked again when such an answer turns to no, or when the
+    files are read again.
+    """
+
+    def __init__(
+        self,
+        files: Access,
+        broker: Broker,
+        plugins: PluginManager[BrokerContext],
+        sessions: Sessions,
+        guard: Guard,
+        threads: Threads,
+        answers: Answers,
+    ) -> None:
+        self.answers = answers
+        self._threads = threads
+        self._files = files
+        self._broker = broker
+        self._plugins = plugins
+        self._sessions = sessions
+        self._guard = guard
+        self._epoch = 0
+        self._waits = False
+        self._verdicts: OrderedDict[Question, tuple[Decision, float, int]] = OrderedDict()
+        self._asked: dict[Question, asyncio.Task[None]] = {}
+        #: Who waits for the answer to each of them, and who for room to ask, in their order.
+        self._waiting: dict[Question, dict[Callable[[], None], None]] = {}
+        self._line: dict[Callable[[], None], None] = {}
+        self._line_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def epoch(self) -> int:
+        """Grows with the files' epoch, and when plugins are to be asked again."""
+        return self._files.epoch + self._epoch
+
+    @epoch.setter
+    def epoch(self, epoch: int) -> None:
+        self._epoch = epoch - self._files.epoch
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        """What the files allow and no plugin refuses."""
+        if isinstance(identity, Unclaimed):
+            return Decision(True, "a plugin subscribed it; checked again when the client comes")
+        decision = self._files.decide(identity, action, topic)
+        if not decision or not self._plugins._topic_plugins:
+            return decision
+        if not self._waits:
+            answered, refusing = self._ask_now(identity, action, topic)
+            if answered:
+                return Decision(False, f"refused by {refusing}") if refusing else decision
+        return self._verdict((identity, action, topic))
+
+    @property
+    def patience(self) -> float:
+        """Seconds that a packet waits for an answer."""
+        return self._guard.timeout
+
+    def waits(self, question: Question, wake: Callable[[], None]) -> bool:
+        """Whether there is no answer yet; `wake` is then called when there may be one."""
+        if not self.decide(*question).pending:
+            return False
+        if question in self._asked:
+            self._waiting.setdefault(question, {})[wake] = None
+        else:
+            self._line[wake] = None
+            if self._line_timer is None:
+                entries = Entries(asyncio.get_running_loop(), self._broker.faults)
+                self._line_timer = entries.later(
+                    "plugins.line", LINE_INTERVAL, self._wake_line, failed=self._wake_line
+                )
+        return True
+
+    def _wake_line(self) -> None:
+        self._line_timer = None
+        line, self._line = self._line, {}
+        for wake in line:
+            self._broker.faults.run("plugins.wake", wake, otherwise=None)
+
+    def changed(self) -> None:
+        """Let what was decided be decided again."""
+        self._epoch += 1
+        self._broker.router.changed()
+
+    def close(self) -> None:
+        """Ask no more."""
+        for asking in self._asked.values():
+            asking.cancel()
+        self._waiting.clear()
+        self._line.clear()
+        if self._line_timer is not None:
+            self._line_timer.cancel()
+
+    def _ask_now(self, identity: Identity, action: Action, topic: str) -> tuple[bool, str]:
+        """Whether the plugins could answer on the spot, and which one refuses."""
+        session = self._sessions.of_identity(identity)
+        for plugin in self._plugins._topic_plugins:
+            try:
+                answer = _WAITS if blocks(plugin) else _answer_now(plugin, session, action, topic)
+            except Exception:
+                # Whatever it was, the lack of a task perhaps: it is asked again in one, and what
+                # it raises there is told.
+                return False, ""
+            if answer is _WAITS:
+                self._waits = True
+                log.warning(
+                    "%s has to wait before it can say whether a topic is allowed: what is asked "
+                    "for the first time waits with it, for up to %g s",
+                    name(plugin),
+                    self.patience,
+                )
+                return False, ""
+            if not answer:  # As in amqtt, None is a no.
+                return True, name(plugin)
+        return True, ""
+
+    def _verdict(self, question: Question) -> Decision:
+        """What the plugins last said; they are asked when that is long ago."""
+        decision, said_at, epoch = self._verdicts.get(question, (None, 0.0, 0))
+        age = asyncio.get_running_loop().time() - said_at
+        is_old = (
+            decision is None
+            or age > self.answers.of_topic(allowed=decision.allowed)
+            or epoch != self._files.epoch
+        )
+        if is_old and question not in self._asked:
+            if not self._has_room(question[0]):
+                return Decision(False, "the topic plugins have too many questions to answer", True)
+            self._asked[question] = asyncio.ensure_future(self._ask(question))
+        if decision is None or age > VERDICT_USE:
+            return Decision(False, "the topic plugins were asked; the next try is answered", True)
+        self._verdicts.move_to_end(question)
+        return decision
+
+    def _has_room(self, identity: Identity) -> bool:
+        """Whether there may be one more question about this client."""
+        if len(self._asked) >= QUESTIONS:
+            return False
+        clients = [asked[0] for asked in self._asked if asked[0].username == identity.username]
+        return len(clients) < USER_QUESTIONS and clients.count(identity) < CLIENT_QUESTIONS
+
+    async def _ask(self, question: Question) -> None:
+        """Ask all topic plugins and keep what they say."""
+        identity, action, topic = question
+        session = self._sessions.of_identity(identity)
+        try:
+            answers = await self._guard.within(self._ask_all(session, action, topic))
+        except asyncio.TimeoutError:
+            reason = f"the topic plugins said nothing within {self._guard.timeout:g} s"
+            decision = Decision(False, reason)
+        except Exception as error:  # a plugin may raise anything
+            self._guard.tell("an amqtt topic plugin", error)
+            reason = redacted(repr(error), self._guard.secrets)
+            decision = Decision(False, f"a topic plugin failed: {reason}")
+        else:
+            refusing = ", ".join(name(plugin) for plugin, yes in answers.items() if not yes)
+            reason = f"refused by {refusing}" if refusing else "allowed by the topic plugins"
+            decision = Decision(not refusing, reason)
+        finally:
+            del self._asked[question]
+        try:
+            self._keep(question, decision)
+        finally:
+            for wake in self._waiting.pop(question, {}):
+                self._broker.faults.run("plugins.wake", wake, otherwise=None)
+
+    async def _ask_all(
+        self, session: AmqttSession, action: Action, topic: str
+    ) -> dict[BaseTopicPlugin, object]:
+        arguments = {"session": session, "topic": topic, "action": AmqttAction(action.value)}
+        plugins: list[Any] = list(self._plugins._topic_plugins)
+        asked = (self._threads.call(plugin, "topic_filtering", arguments) for plugin in plugins)
+        return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
+
+    def _keep(self, question: Question, decision: Decision) -> None:
+        before, _, _ = self._verdicts.pop(question, (None, 0.0, 0))
+        now = asyncio.get_running_loop().time()
+        self._verdicts[question] = decision, now, self._files.epoch
+        if len(self._verdicts) > self.answers.size:
+            self._verdicts.popitem(last=False)
+        was_allowed = before is not None and before.allowed
+        if was_allowed and not decision.allowed:
+            self._epoch += 1
+            self._broker.rules_changed()
+        elif decision.allowed and not was_allowed:
+            self.changed()
+
+
+def _answer_now(
+    plugin: BaseTopicPlugin, session: AmqttSession, action: Action, topic: str
+) -> object:
+    """The plugin's answer, or _WAITS when it has none without waiting."""
+    asked = plugin.topic_filtering(session=session, topic=topic, action=AmqttAction(action.value))
+    try:
+        asked.send(None)
+    except StopIteration as answer:
+        return answer.value
+    with contextlib.suppress(RuntimeError):  # it goes on waiting while it is cleaning up
+        asked.close()
+    return _WAITS

@@ -1,0 +1,207 @@
+"""amqtt's events, fired for what happens in the broker."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from functools import partial
+from typing import Any, cast
+
+from amqtt.broker import BrokerContext
+from amqtt.events import BrokerEvents, Events, MQTTEvents
+from amqtt.mqtt.connect import ConnectPacket, ConnectPayload, ConnectVariableHeader
+from amqtt.plugins.manager import PluginManager
+from amqtt.session import IncomingApplicationMessage
+
+from appliance.broker.message import Message
+from appliance.broker.ports import Identity
+from appliance.broker.session import Session
+from appliance.mqtt.codec import V31
+from appliance.mqtt.packets import Connect
+from appliance.plugins.adapters import Sessions, retained_message
+from appliance.plugins.guard import Guard
+
+log = logging.getLogger(__name__)
+
+#: Events, and bytes of payload in them, that wait for plugins.
+EVENTS = 10_000
+EVENT_BYTES = 64 * 1024 * 1024
+
+#: Seconds between two lines in the log about events that were too many.
+LOST_LOG_INTERVAL = 60.0
+
+_LIFE_CYCLE = frozenset(
+    {
+        BrokerEvents.PRE_START,
+        BrokerEvents.POST_START,
+        BrokerEvents.PRE_SHUTDOWN,
+        BrokerEvents.POST_SHUTDOWN,
+    }
+)
+_MESSAGES = frozenset(
+    {BrokerEvents.MESSAGE_RECEIVED, BrokerEvents.MESSAGE_BROADCAST, MQTTEvents.PACKET_RECEIVED}
+)
+
+
+class PluginEvents:
+    """The broker's `Observer`: fires amqtt's events, those that a plugin has a handler for."""
+
+    def __init__(
+        self, plugins: PluginManager[BrokerContext], sessions: Sessions, guard: Guard
+    ) -> None:
+        self._plugins = plugins
+        self._sessions = sessions
+        self._guard = guard
+        self._wanted = frozenset(plugins._event_plugin_callbacks)
+        self._wants_messages = not self._wanted.isdisjoint(_MESSAGES)
+        self._pending = 0
+        self._pending_bytes = 0
+        self._lost = 0
+        self._told_lost_at = float("-inf")
+        #: What is being published, and by whom.
+        self._published: tuple[Message, Session] | None = None
+
+    @property
+    def about_clients(self) -> bool:
+        """Whether some plugin wants more than the four events of the life cycle."""
+        return not self._wanted <= _LIFE_CYCLE
+
+    async def life_cycle(self, event: BrokerEvents) -> None:
+        """Fire the event and wait until the plugins are done with it, or take too long."""
+        tasks = self._fire(event, 0, {})
+        if tasks:
+            _, late = await asyncio.wait(tasks, timeout=self._guard.timeout)
+            if late:
+                log.warning(
+                    "amqtt plugins still work on %s after %g s", event.value, self._guard.timeout
+                )
+
+    def connect_received(self, connect: Connect) -> None:
+        """A CONNECT came, from whom is not known yet."""
+        if MQTTEvents.PACKET_RECEIVED not in self._wanted:
+            return
+        will = connect.will
+        protocol = "MQIsdp" if connect.version == V31 else "MQTT"
+        header = ConnectVariableHeader(0, connect.keep_alive, protocol, connect.version)
+        header.clean_session_flag = connect.clean_start
+        header.username_flag = connect.username is not None
+        payload = ConnectPayload(connect.client_id, username=connect.username)
+        if will is not None:
+            header.will_flag, header.will_qos, header.will_retain_flag = True, will.qos, will.retain
+            payload.will_topic, payload.will_message = will.topic, will.payload
+        packet = ConnectPacket(variable_header=header, payload=payload)
+        self._tell(MQTTEvents.PACKET_RECEIVED, packet=packet)
+
+    def connected(self, session: Session) -> None:
+        """A client is there."""
+        shown = self._sessions.of(session)
+        self._tell(BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=shown)
+
+    def disconnected(self, session: Session) -> None:
+        """A client is gone."""
+        shown = self._sessions.of(session)
+        self._tell(
+            BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=shown
+        )
+
+    def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
+        """A client subscribed."""
+        if session.identity is not None:
+            self._tell(
+                BrokerEvents.CLIENT_SUBSCRIBED,
+                client_id=session.client_id,
+                topic=topic_filter,
+                qos=int(qos),
+            )
+
+    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+        """A client unsubscribed."""
+        if session.identity is not None:
+            self._tell(
+                BrokerEvents.CLIENT_UNSUBSCRIBED, client_id=session.client_id, topic=topic_filter
+            )
+
+    def published(self, session: Session, message: Message) -> None:
+        """A client's message is about to be delivered."""
+        if session.identity is None:
+            return
+        if message.retain:
+            self._published = message, session
+        if self._wants_messages:
+            self._tell_message(session, message, allowed=True)
+
+    def refused(self, session: Session, message: Message) -> None:
+        """A client's message goes nowhere, as it is not allowed; amqtt tells that it came."""
+        if session.identity is not None and self._wants_messages:
+            self._tell_message(session, message, allowed=False)
+
+    def retained(self, message: Message) -> None:
+        """A message was retained, or, being empty, deleted."""
+        published, self._published = self._published, None
+        if BrokerEvents.RETAINED_MESSAGE not in self._wanted or message.topic.startswith("$SYS/"):
+            return
+        source = None
+        if published is not None and published[0] is message:
+            source = self._sessions.of_identity(cast(Identity, published[1].identity))
+        self._tell(
+            BrokerEvents.RETAINED_MESSAGE,
+            len(message.payload),
+            client_id=None,
+            retained_message=retained_message(source, message),
+        )
+
+    def _tell_message(self, session: Session, message: Message, *, allowed: bool) -> None:
+        size = len(message.payload)
+        received = IncomingApplicationMessage(
+            None, message.topic, message.qos, message.payload, message.retain
+        )
+        received.publish_packet = received.build_publish_packet()
+        if MQTTEvents.PACKET_RECEIVED in self._wanted:
+            self._tell(
+                MQTTEvents.PACKET_RECEIVED,
+                size,
+                packet=received.publish_packet,
+                session=self._sessions.of_identity(cast(Identity, session.identity)),
+            )
+        client_id = session.client_id
+        self._tell(BrokerEvents.MESSAGE_RECEIVED, size, client_id=client_id, message=received)
+        if allowed:
+            self._tell(BrokerEvents.MESSAGE_BROADCAST, size, client_id=client_id, message=received)
+
+    def _tell(self, event: Events, size: int = 0, **arguments: object) -> None:
+        """Fire the event unless as many are waiting as may; `size` is in bytes of payload."""
+        if event not in self._wanted:
+            return
+        if self._pending < EVENTS and self._pending_bytes + size <= EVENT_BYTES:
+            self._fire(event, size, arguments)
+            return
+        self._lost += 1
+        now = asyncio.get_running_loop().time()
+        if now - self._told_lost_at >= LOST_LOG_INTERVAL:
+            self._told_lost_at = now
+            log.warning("amqtt plugins are too slow: %d events were not told to them", self._lost)
+
+    def _fire(
+        self, event: Events, size: int, arguments: dict[str, Any]
+    ) -> list[asyncio.Future[Any]]:
+        """Let amqtt start the event's handlers; returns what they run in."""
+        fired = self._plugins._fired_events
+        before = len(fired)
+        # It is a coroutine only by its name, as long as it is not to wait for the handlers.
+        with contextlib.suppress(StopIteration):
+            self._plugins.fire_event(event, **arguments).send(None)
+        tasks = fired[before:]
+        for task in tasks:
+            self._pending += 1
+            self._pending_bytes += size
+            task.add_done_callback(partial(self._done, event, size))
+        return tasks
+
+    def _done(self, event: Events, size: int, task: asyncio.Future[Any]) -> None:
+        self._pending -= 1
+        self._pending_bytes -= size
+        if not task.cancelled():
+            error = task.exception()
+            if error is not None:
+                self._guard.tell(f"an amqtt plugin's handler of {event.value}", error)

@@ -1,0 +1,215 @@
+"""Logins that amqtt's plugins decide: in a bounded time, so many at once, none of them twice."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, TypeAlias
+
+from amqtt.broker import BrokerContext
+from amqtt.plugins.authentication import AnonymousAuthPlugin
+from amqtt.plugins.manager import PluginManager
+from amqtt.session import Session as AmqttSession
+
+from appliance.broker.ports import Identity, Refusal
+from appliance.mqtt.reason import ReasonCode
+from appliance.plugins.guard import Guard, name, redacted
+from appliance.plugins.threads import Threads
+
+#: Logins that plugins are asked about at one time; others wait, as long as they may.
+LOGINS: Final = 64
+
+#: The line of guesses that they wait in, if they have to.
+LINE: Final = "plugins"
+
+_STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
+_COME_AGAIN: Final = Refusal(
+    ReasonCode.SERVER_BUSY,
+    "too many logins from its address were wrong, it has to come again "
+    "(broker.limits.failed_logins)",
+)
+
+
+class Guesses(Protocol):
+    """How long a login has to wait because others were wrong."""
+
+    def turn(self, address: str, line: str = "", patience: float = ...) -> float | None:
+        """Seconds until the next one from this address is due; None when that is too long."""
+
+    def hold_up(self, username: str) -> float:
+        """Seconds because of wrong ones for the same user."""
+
+    def failed(self, address: str, username: str) -> None:
+        """One was wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """How long a yes and a no of plugins hold, in seconds, and how many are kept of each kind.
+
+    Topics are judged while messages wait: of them an answer holds a second at least.
+    """
+
+    keep: float = 10.0
+    keep_refusals: float = 2.0
+    size: int = 4096
+
+    def of_topic(self, *, allowed: bool) -> float:
+        """Seconds after which plugins are asked again about a topic."""
+        return max(1.0, self.keep if allowed else self.keep_refusals)
+
+
+#: What came of a login: who it is or why not, and what plugins noted in their session.
+_Outcome: TypeAlias = "tuple[Identity | Refusal, dict[str, Any], bool | None]"
+
+
+class PluginLogins:
+    """Asks the plugins that authenticate, and remembers what they said for a short time.
+
+    Nothing is remembered across a change of the rules: `epoch` tells it. Plugins that say nothing
+    in time, or fail, are asked again the next time.
+    """
+
+    def __init__(
+        self,
+        plugins: PluginManager[BrokerContext],
+        guard: Guard,
+        threads: Threads,
+        guesses: Guesses,
+        epoch: Callable[[], int],
+        answers: Answers,
+        patience: float,
+    ) -> None:
+        self._plugins = plugins
+        self._guard = guard
+        self._threads = threads
+        self._guesses = guesses
+        self._epoch = epoch
+        self._answers = answers
+        self._patience = patience
+        self._key = secrets.token_bytes(32)
+        self._known: OrderedDict[bytes, tuple[_Outcome, float, int]] = OrderedDict()
+        self._asking: dict[tuple[bytes, int], asyncio.Task[_Outcome]] = {}
+        self._free = asyncio.Semaphore(LOGINS)
+
+    async def ask(self, login: AmqttSession, address: str) -> Identity | Refusal:
+        """Who it is, or why it does not come in; what plugins noted is in `login` then.
+
+        0x88 Server unavailable when they did not answer in time or failed, 0x89 Server busy when
+        too many from its address were wrong.
+        """
+        key = self._digest(login)
+        epoch = self._epoch()
+        outcome = self._remembered(key, epoch)
+        if outcome is None:
+            asking = self._asking.get((key, epoch))
+            if asking is None:
+                asking = asyncio.ensure_future(self._ask_in_turn(login, address, key, epoch))
+                self._asking[key, epoch] = asking
+                asking.add_done_callback(lambda _: self._asking.pop((key, epoch), None))
+            # One that leaves does not cancel it for others who sent the same.
+            await asyncio.wait([asking])
+            if asking.cancelled():
+                return _STOPPING
+            outcome = asking.result()
+        who, attributes, is_anonymous = outcome
+        login.attributes = dict(attributes)
+        login.is_anonymous = bool(is_anonymous)
+        return who
+
+    def close(self) -> None:
+        """Ask no more."""
+        for asking in list(self._asking.values()):
+            asking.cancel()
+
+    async def _ask_in_turn(
+        self, login: AmqttSession, address: str, key: bytes, epoch: int
+    ) -> _Outcome:
+        turn = self._guesses.turn(address, LINE, self._patience)
+        if turn is None:
+            return _COME_AGAIN, {}, None
+        username = login.username or ""
+        delay = max(turn, self._guesses.hold_up(username))
+        if delay:
+            await asyncio.sleep(delay)
+        who = await self._ask(login)
+        outcome = who, login.attributes, login.is_anonymous
+        if isinstance(who, Identity):
+            self._remember(key, outcome, self._answers.keep, epoch)
+        elif who.code == ReasonCode.NOT_AUTHORIZED:
+            self._guesses.failed(address, username)
+            self._remember(key, outcome, self._answers.keep_refusals, epoch)
+        return outcome
+
+    async def _ask(self, login: AmqttSession) -> Identity | Refusal:
+        names = ", ".join(map(name, self._plugins._auth_plugins))
+        try:
+            answers, vouched = await self._guard.within(self._ask_all(login))
+        except asyncio.TimeoutError:
+            reason = f"{names} said nothing within {self._guard.timeout:g} s"
+            return Refusal(ReasonCode.SERVER_UNAVAILABLE, reason)
+        except Exception as error:  # a plugin may raise anything
+            password = [login.password] if login.password else []
+            self._guard.tell(f"authentication by {names}", error, password)
+            reason = redacted(repr(error), [*password, *self._guard.secrets])
+            return Refusal(ReasonCode.SERVER_UNAVAILABLE, f"{names} failed: {reason}")
+        answered = {plugin: yes for plugin, yes in answers.items() if yes is not None}
+        if not answered:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"{names} do not know the client")
+        refusing = ", ".join(name(plugin) for plugin, yes in answered.items() if not yes)
+        if refusing:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, f"refused by {refusing}")
+        return Identity(login.username if vouched else None, login.client_id or "")
+
+    async def _ask_all(self, login: AmqttSession) -> tuple[dict[Any, Any], bool]:
+        """What each plugin says, and whether one vouches for the user name."""
+        # In two parts: who vouches is not to be seen from mixed answers.
+        plugins: list[Any] = list(self._plugins._auth_plugins)
+        demanding = [plugin for plugin in plugins if not isinstance(plugin, AnonymousAuthPlugin)]
+        undemanding = [plugin for plugin in plugins if plugin not in demanding]
+        async with self._free:
+            answers = await self._ask_each(demanding, login)
+            vouched = not login.is_anonymous and any(answers.values())
+            answers |= await self._ask_each(undemanding, login)
+        return answers, vouched
+
+    async def _ask_each(self, plugins: Iterable[Any], login: AmqttSession) -> dict[Any, Any]:
+        plugins = list(plugins)
+        asked = (
+            self._threads.call(plugin, "authenticate", {"session": login}) for plugin in plugins
+        )
+        return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
+
+    # --- what they said ------------------------------------------------------------------------
+
+    def _remembered(self, key: bytes, epoch: int) -> _Outcome | None:
+        outcome, until, then = self._known.get(key, (None, 0.0, 0))
+        if then != epoch or asyncio.get_running_loop().time() >= until:
+            return None
+        return outcome
+
+    def _remember(self, key: bytes, outcome: _Outcome, seconds: float, epoch: int) -> None:
+        if not seconds or epoch != self._epoch():
+            return
+        self._known.pop(key, None)
+        self._known[key] = outcome, asyncio.get_running_loop().time() + seconds, epoch
+        if len(self._known) > self._answers.size:
+            self._known.popitem(last=False)
+
+    def _digest(self, login: AmqttSession) -> bytes:
+        """What makes two logins the same: all that plugins judge by, and the password not kept."""
+        tls = login.ssl_object
+        certificate = tls.getpeercert(binary_form=True) if tls is not None else None
+        parts = [
+            login.client_id,
+            login.username,
+            login.password,
+            login.remote_address,
+            hashlib.sha256(certificate).hexdigest() if certificate else None,
+        ]
+        return hmac.digest(self._key, repr(parts).encode("utf-8", "surrogatepass"), "sha256")

@@ -1,0 +1,144 @@
+"""What an action's messages are on MQTT: goals, feedback, results, status, and what to cancel.
+
+In JSON and CBOR a goal's id is 32 hex digits and its status a word. In ROS's own bytes they are
+what ROS 2 has for them, on ROS 1 packed as there (ros1_actions.py): the answers, and what `_cancel`
+takes, are `action_msgs/msg/GoalInfo` and `action_msgs/srv/CancelGoal_Response`, a result is the
+whole response of `get_result`, and the status is `action_msgs/msg/GoalStatusArray`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from typing import Any
+
+from appliance.ros.calls.dispatcher import Answer, CallError
+from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.definitions import Wire
+from appliance.ros.payload.payloads import RAW, CallEncoding, dumps, loads
+
+CANCEL = "action_msgs/srv/CancelGoal"
+GOAL_INFO = "action_msgs/msg/GoalInfo"
+STATUS = "action_msgs/msg/GoalStatusArray"
+
+#: Stands for all goals.
+ALL = bytes(16)
+
+#: By the numbers of action_msgs/msg/GoalStatus.
+STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
+
+#: Of these, those of a goal that goes on.
+_GOING_ON = (1, 2)
+
+_WHICH = (
+    'say which goal: {"goal_id": "…"}, the 32 hex digits of its id; {"stamp": {"sec": …, '
+    '"nanosec": …}} for all that were accepted until then; or {"all": true}'
+)
+
+
+# An id's 16 bytes come first, and are twice the largest alignment: what follows them is aligned as
+# it is by itself.
+
+
+def with_id(goal: bytes, id_: bytes, wire: Wire) -> bytes:
+    """The serialized request of `send_goal`."""
+    start = len(wire.header)
+    return goal[:start] + id_ + goal[start:]
+
+
+def split_id(cdr: bytes, wire: Wire) -> tuple[bytes, bytes]:
+    """The goal's id and the serialized feedback, of a message with both."""
+    start = len(wire.header)
+    return cdr[start : start + 16], cdr[:start] + cdr[start + 16 :]
+
+
+def id_of(uuid: dict[str, str]) -> bytes:
+    """The bytes of a `unique_identifier_msgs/msg/UUID`, as converters give it."""
+    return base64.b64decode(uuid["uuid"])
+
+
+def accepted(
+    converters: Converters, id_: bytes, stamp: dict[str, int], encoding: CallEncoding
+) -> Answer:
+    """The answer to a goal that was accepted."""
+    if encoding in RAW:
+        info = {"goal_id": {"uuid": id_}, "stamp": stamp}
+        return Answer(converters.get(GOAL_INFO).from_dict(info), encoding, GOAL_INFO)
+    return Answer(dumps({"goal_id": id_.hex(), "stamp": stamp}, encoding), encoding)
+
+
+def status_of(result: bytes, wire: Wire) -> str:
+    """The status in a response of `get_result`."""
+    start = len(wire.header)
+    return _state(result[start] if len(result) > start else 0)
+
+
+def result(converters: Converters, action: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of a response of `get_result`. Raises ConversionError."""
+    if encoding in RAW:
+        return cdr
+    converter = converters.get(f"{action}_GetResult_Response")
+    said = converter.to_cbor_value(cdr) if encoding == "cbor" else converter.to_dict(cdr)
+    status = status_of(cdr, converter.description.wire)
+    return dumps({"status": status, "result": said["result"]}, encoding)
+
+
+def statuses(converters: Converters, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of what a server says of its goals. Raises ConversionError."""
+    if encoding in RAW:
+        return cdr
+    goals: list[dict[str, Any]] = [
+        {
+            "goal_id": id_of(one["goal_info"]["goal_id"]).hex(),
+            "status": _state(one["status"]),
+            "stamp": one["goal_info"]["stamp"],
+        }
+        for one in converters.get(STATUS).to_dict(cdr)["status_list"]
+    ]
+    return dumps(goals, encoding)
+
+
+def going_on(converters: Converters, cdr: bytes) -> list[bytes]:
+    """The ids of the goals that go on, of what a server says. Raises ConversionError."""
+    return [
+        id_of(one["goal_info"]["goal_id"])
+        for one in converters.get(STATUS).to_dict(cdr)["status_list"]
+        if one["status"] in _GOING_ON
+    ]
+
+
+def which(
+    converters: Converters, payload: bytes, encoding: CallEncoding
+) -> tuple[bytes, dict[str, int]]:
+    """The goals that a call of `_cancel` means, in ROS's words: the id of one; or ALL, of those
+    that were accepted up to a time, and for the time 0 of all there are. Raises CallError.
+
+    With an id and a time ROS cancels that goal and all before it. Here it is that goal alone: who
+    sends back what its goal was answered with means no other.
+    """
+    info = converters.get(GOAL_INFO)
+    try:
+        if encoding in RAW:
+            said = info.to_dict(payload)
+            id_: object = id_of(said["goal_id"])
+        else:
+            value = loads(payload, encoding)
+            if value == {"all": True}:
+                value = {"stamp": {}}
+            if not isinstance(value, dict) or not value or value.keys() - {"goal_id", "stamp"}:
+                raise CallError("bad_request", _WHICH)
+            id_ = value.get("goal_id", ALL)
+            if isinstance(id_, str):
+                id_ = binascii.unhexlify(id_.replace("-", ""))
+            said = info.to_dict(info.from_dict({"stamp": value.get("stamp", {})}))
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
+    except ValueError:
+        raise CallError("bad_request", f"goal_id: {_WHICH}") from None
+    if not isinstance(id_, bytes) or len(id_) != len(ALL):
+        raise CallError("bad_request", f"goal_id: {_WHICH}")
+    return id_, said["stamp"] if id_ == ALL else {}
+
+
+def _state(number: int) -> str:
+    return STATES[number] if 0 <= number < len(STATES) else "unknown"

@@ -1,0 +1,400 @@
+"""Parameters of other nodes: their values as retained topics, and calls that set them.
+
+`r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
+`/parameter_events`; byte arrays are base64, or bytes where the encoding is `cbor`.
+`…/_param/speed/set` sets it, `…/_param/_set` several of the node at once or none of them:
+`{"speed": 0.5, "mode": "slow"}`. The type is the one that the node has declared, so that `1` will
+do for a double. When the node goes, so do its values.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pybase64
+
+from appliance.net.callbacks import Entries
+from appliance.ros.calls.dispatcher import Call, CallError, Switchboard
+from appliance.ros.calls.parameter_topics import Holder, ParameterTopics, shorten, to_bytes, unlike
+from appliance.ros.calls.requests import Requests
+from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
+from appliance.ros.patterns import is_plain
+from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
+from appliance.ros.payload.definitions import UnknownTypeError
+from appliance.ros.payload.payloads import CallEncoding, dumps
+from appliance.ros.skipped import Skip
+
+log = logging.getLogger(__name__)
+
+EVENTS = "/parameter_events"
+EVENT = "rcl_interfaces/msg/ParameterEvent"
+GET = "/get_parameters"
+
+#: Events that wait for the loop's thread; with more, all nodes are read anew.
+WAITING_EVENTS = 1000
+
+#: Seconds until a node is asked again that did not tell its parameters.
+RETRY = 2.0
+
+#: The longest that a node may take to tell them, in seconds.
+PATIENCE = 5.0
+
+#: Parameters that are asked for at a time.
+CHUNK = 200
+
+#: By the numbers of rcl_interfaces/msg/ParameterType: the field of a value, and its name.
+_FIELDS = (
+    ("", "not set"),
+    ("bool_value", "a bool"),
+    ("integer_value", "an integer"),
+    ("double_value", "a double"),
+    ("string_value", "a string"),
+    ("byte_array_value", "an array of bytes"),
+    ("bool_array_value", "an array of bools"),
+    ("integer_array_value", "an array of integers"),
+    ("double_array_value", "an array of doubles"),
+    ("string_array_value", "an array of strings"),
+)
+_NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING, _BYTES = range(6)
+_BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
+
+
+@dataclass(eq=False, slots=True)
+class _Node(Holder):
+    """A node, and how its values are read."""
+
+    is_loading: bool = False
+    is_stale: bool = True
+    is_gone: bool = False
+    #: Why its parameters cannot be read.
+    problem: str | None = None
+
+
+class ParameterRoutes(ParameterTopics[_Node]):
+    """The routes of parameters; for the loop's thread, where it does not say otherwise."""
+
+    type_name = "rcl_interfaces/msg/ParameterValue"
+
+    def __init__(
+        self,
+        board: Switchboard,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        entries: Entries,
+        post: Callable[..., None],
+    ) -> None:
+        super().__init__(board)
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._entries = entries
+        self._post = post
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._is_stopped = False
+        # Both threads'.
+        self._events: deque[bytes] = deque()
+        self._is_awake = False
+        # The ROS thread's.
+        self._subscription: RosSubscription | None = None
+        self._is_refused = False
+        #: How many nodes there are of each name.
+        self._nodes: Counter[str] = Counter()
+
+    def _look_again(self) -> None:
+        self.follow()
+
+    def follow(self) -> None:
+        """Show the nodes that are on the bus now."""
+        there = {
+            service.removesuffix(GET)
+            for service, types in self._requests.services.items()
+            if service.endswith(GET) and "rcl_interfaces/srv/GetParameters" in types
+        }
+        for node in list(self._holders.values()):
+            if node.name not in there:
+                self._leave(node)
+        for name in sorted(there - self._holders.keys() - {self._node.name}):
+            found = self._find(name, _Node)
+            if found is not None:
+                self._join(found)
+                self._load(found)
+
+    def _came_anew(self, names: Iterable[str]) -> None:
+        for name in names:
+            node = self._holders.get(name)
+            if node is not None:
+                self._load(node)
+
+    def _leave(self, node: _Node) -> None:
+        node.is_gone = True
+        super()._leave(node)
+
+    def skips(self) -> list[Skip]:
+        """The nodes that routes name and are not there, or do not tell their parameters."""
+        if self._is_stopped:
+            return []
+        skips = [
+            Skip(node.name, "parameters", "", "problem", node.problem)
+            for node in self._holders.values()
+            if node.problem is not None
+        ]
+        named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
+        return skips + [
+            Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
+            for node in sorted(named - self._holders.keys())
+            if is_plain(node)
+        ]
+
+    async def stop(self) -> None:
+        """The bus has been left: no value is true any more."""
+        self._is_stopped = True
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._leave_all()
+
+    # Values
+
+    async def _ask(self, node: _Node, verb: str, kind: str, fields: object) -> dict[str, Any]:
+        return await self._ask_for(node, verb, kind, self._write(kind, fields))
+
+    def _write(self, kind: str, fields: object) -> bytes:
+        try:
+            return self._converters.get(f"rcl_interfaces/srv/{kind}_Request").from_dict(fields)
+        except UnknownTypeError as error:
+            raise CallError("unknown_type", str(error)) from None
+
+    async def _ask_for(self, node: _Node, verb: str, kind: str, request: bytes) -> dict[str, Any]:
+        type_name = f"rcl_interfaces/srv/{kind}"
+        response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
+        try:
+            return self._converters.get(f"{type_name}_Response").to_dict(response)
+        except UnknownTypeError as error:
+            raise CallError("unknown_type", str(error)) from None
+
+    def _load(self, node: _Node) -> None:
+        """Read a node's parameters, in the background, until nothing has changed meanwhile."""
+        node.is_stale = True
+        if not node.is_loading and not self._is_stopped:
+            node.is_loading = True
+            self._begin(self._read(node))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = self._entries.task("parameters.read", work)
+        self._tasks.add(task)
+        self._entries.when_done("parameters.end", task, self._tasks.discard, task)
+
+    async def _read(self, node: _Node) -> None:
+        try:
+            await self._read_all(node)
+        finally:
+            node.is_loading = False
+
+    async def _read_all(self, node: _Node) -> None:
+        has_failed = False
+        while node.is_stale and not node.is_gone:
+            node.is_stale = False
+            try:
+                values = await asyncio.wait_for(self._get_all(node), PATIENCE)
+            except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
+                    return
+                why = str(error) or "no answer"
+                node.problem = f"its parameters cannot be read: {why}"
+                if not has_failed:
+                    log.warning("the parameters of %s cannot be read: %s", node.name, why)
+                has_failed = node.is_stale = True
+                await asyncio.sleep(RETRY)
+                continue
+            node.problem = None
+            if not node.is_stale and not node.is_gone:
+                for name in node.shown.keys() - values.keys():
+                    self._show(node, name, None)
+                for name, value in values.items():
+                    self._show(node, name, value)
+                log.info("%d parameters of %s are at %s", len(values), node.name, node.base)
+
+    async def _get_all(self, node: _Node) -> dict[str, Any]:
+        listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
+        names = [name for name in listed["result"]["names"] if node.wants(name)]
+        values: dict[str, Any] = {}
+        for start in range(0, len(names), CHUNK):
+            chunk = names[start : start + CHUNK]
+            got = await self._get(node, chunk)
+            if len(got) != len(chunk):
+                # One that the node cannot give leaves all of them out.
+                single = [await self._get(node, [name]) for name in chunk]
+                chunk = [name for name, one in zip(chunk, single, strict=True) if len(one) == 1]
+                got = [one[0] for one in single if len(one) == 1]
+            values.update(zip(chunk, got, strict=True))
+        return values
+
+    async def _get(self, node: _Node, names: list[str]) -> list[Any]:
+        said = await self._ask(node, "get_parameters", "GetParameters", {"names": names})
+        values: list[Any] = said["values"]
+        return values
+
+    def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
+        """Publish a parameter as it is now; None for one that is no more."""
+        if node.wants(name):
+            payload = b"" if value is None else _to_payload(value, node.route.encoding)
+            self._publish(node, name, payload)
+
+    def _sleep(self) -> None:
+        self._is_awake = False
+
+    def _take_events(self) -> None:
+        self._is_awake = False
+        events = self._events
+        if len(events) >= WAITING_EVENTS:
+            events.clear()
+            for node in self._holders.values():
+                self._load(node)
+            return
+        while events:
+            try:
+                said = self._converters.get(EVENT).to_dict(events.popleft())
+            except (ConversionError, UnknownTypeError) as error:
+                log.warning("%s: a message cannot be read: %s", EVENTS, error)
+                continue
+            known = self._holders.get(said["node"])
+            if known is None:
+                continue
+            if known.is_loading:
+                known.is_stale = True  # what is being read may be older, or newer
+                continue
+            for one in (*said["new_parameters"], *said["changed_parameters"]):
+                self._show(known, one["name"], one["value"])
+            for one in said["deleted_parameters"]:
+                self._show(known, one["name"], None)
+
+    # Setting
+
+    async def _set(self, node: _Node, values: dict[str, Any], call: Call, at_once: bool) -> str:
+        names = list(values)
+        said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
+        descriptors = {one["name"]: one for one in said["descriptors"]}
+        verb, kind = "set_parameters", "SetParameters"
+        if at_once:
+            verb, kind = "set_parameters_atomically", "SetParametersAtomically"
+
+        def write() -> bytes:
+            parameters = [
+                {"name": name, "value": to_value(name, value, descriptors.get(name, {}))}
+                for name, value in values.items()
+            ]
+            return self._write(kind, {"parameters": parameters})
+
+        try:
+            request = await self._board.convert(call.caller, len(call.payload), write)
+            said = await self._ask_for(node, verb, kind, request)
+        except TooLargeError as error:
+            raise CallError("too_large", str(error)) from None
+        except ConversionError as error:
+            raise CallError("bad_request", f"{', '.join(names)}: {error.problem}") from None
+        result = said["result"] if at_once else (said["results"] or [{}])[0]
+        if not result.get("successful"):
+            reason = result.get("reason") or "it gives no reason"
+            raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
+        return str(result["reason"])
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Follow the changes of all nodes' parameters while there are routes."""
+        if self._routes and self._subscription is None and not self._is_refused:
+            try:
+                self._subscription = self._node.subscribe_raw(
+                    EVENTS, EVENT, QosProfile(depth=1000), self._on_event
+                )
+            except (BusError, UnknownTypeError) as error:
+                self._is_refused = True
+                self._post(log.error, "%s is not followed: %s", EVENTS, error)
+        elif not self._routes and self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None
+        if self._routes:
+            self._look_for_restarts()
+
+    def _look_for_restarts(self) -> None:
+        """A node that was killed stays on the graph for a while, next to the one that takes its
+        place and has values of its own."""
+        before, self._nodes = self._nodes, Counter(self._node.nodes())
+        anew = [name for name, count in self._nodes.items() if count > before.get(name, count)]
+        if anew:
+            self._post(self._came_anew, anew)
+
+    def _on_event(self, cdr: bytes) -> None:
+        if len(self._events) < WAITING_EVENTS:
+            self._events.append(cdr)
+        if not self._is_awake:
+            self._is_awake = True
+            self._post(self._take_events, failed=self._sleep)
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the subscription."""
+        self._subscription = None
+        self._is_refused = False
+        self._nodes.clear()
+
+
+def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
+    """The payload of a ParameterValue; empty when the parameter is not set."""
+    kind = value["type"]
+    if not 0 < kind < len(_FIELDS):
+        return b""
+    plain = value[_FIELDS[kind][0]]
+    if encoding == "cbor" and kind == _BYTES:
+        plain = pybase64.b64decode(plain)
+    return dumps(plain, encoding)
+
+
+def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
+    """The ParameterValue of a JSON value, of the type that the node has declared.
+
+    A parameter that may have any type, or that is not declared, takes its type from the value.
+    Raises CallError: bad_request, rejected for what is read-only.
+    """
+    if descriptor.get("read_only"):
+        raise CallError("rejected", f"{name} is read-only")
+    kind = descriptor.get("type", _NOT_SET)
+    if kind == _NOT_SET or descriptor.get("dynamic_typing") or kind >= len(_FIELDS):
+        kind = _type_of(name, value)
+    field_name, expected = _FIELDS[kind]
+    if kind == _BYTES:
+        value = to_bytes(name, value)
+    elif kind in (_BOOLS, _INTEGERS, _DOUBLES, _STRINGS):
+        if not isinstance(value, list) or not all(_is(kind - 5, item) for item in value):
+            raise unlike(name, expected, value)
+        value = [float(item) for item in value] if kind == _DOUBLES else value
+    elif not _is(kind, value):
+        raise unlike(name, expected, value)
+    elif kind == _DOUBLE:
+        value = float(value)
+    return {"type": kind, field_name: value}
+
+
+def _is(kind: int, value: Any) -> bool:
+    """Whether a JSON value will do for a parameter of that type, which is not an array."""
+    if kind in (_BOOL, _STRING):
+        return isinstance(value, bool if kind == _BOOL else str)
+    if isinstance(value, bool):
+        return False
+    if kind == _INTEGER:
+        return isinstance(value, int) and -(2**63) <= value < 2**63
+    return isinstance(value, (int, float))
+
+
+def _type_of(name: str, value: Any) -> int:
+    for kind in (_BOOL, _INTEGER, _DOUBLE, _STRING):
+        if _is(kind, value):
+            return kind
+        if isinstance(value, list) and value and all(_is(kind, item) for item in value):
+            return kind + 5
+    raise CallError("bad_request", f"{name}: no parameter can have the value {shorten(value)}")

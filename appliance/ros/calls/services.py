@@ -1,0 +1,560 @@
+"""Services both ways.
+
+`to: ros`: an MQTT client calls a ROS service, at `r2d2/reset/_call`; see calls.py for its answer.
+
+`to: mqtt`: a ROS service that an MQTT client answers. Each request is a message to
+`r2d2/name/_request/{token}`, with `r2d2/name/_response/{token}` as its Response Topic and the token
+as its Correlation Data: a 3.1.1 client takes the token from the topic. The first message there is
+the response; one with the user property `status: error`, or `{"error": …}`, says that there is
+none. ROS has no way to tell its client of a failure: the client gets the route's `on_error`, or
+nothing and runs into its own time limit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import secrets
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+from appliance.broker.message import Message
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Property
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.callbacks import Entries
+from appliance.ros.calls.dispatcher import (
+    REPORT_INTERVAL,
+    WITHOUT_RAW,
+    Answer,
+    Call,
+    CallCounters,
+    CallError,
+    Offer,
+    Switchboard,
+)
+from appliance.ros.calls.requests import Key, Requests
+from appliance.ros.node import BusError, Respond, RosNode, RosService
+from appliance.ros.patterns import assign, compile_pattern, refusals
+from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
+from appliance.ros.payload.definitions import UnknownTypeError
+from appliance.ros.payload.payloads import (
+    CONTENT_TYPE,
+    RAW,
+    CallEncoding,
+    InputLimits,
+    loads,
+    named_encoding,
+)
+from appliance.ros.skipped import Skip, Why
+
+log = logging.getLogger(__name__)
+
+#: What every node offers; they are called only where a route names them.
+_OF_EVERY_NODE = re.compile(
+    r"(rcl_interfaces|type_description_interfaces)/srv/.*|roscpp/srv/(GetLoggers|SetLoggerLevel)"
+)
+
+Post = Callable[..., None]
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSettings:
+    """Services, by names and patterns, that go `to` ROS; or one to MQTT (then `type` is needed).
+
+    What begins with `!` in `names` is left out. A `{ros}` in `mqtt` stands for the ROS name.
+    `timeout` is in seconds. With a `type`, in which `*` is a part of the name, patterns take only
+    services of that type. `encoding` is for what does not name another. `on_error` is the JSON of
+    the response that a ROS client gets when MQTT gave none.
+    """
+
+    names: tuple[str, ...]
+    mqtt: str
+    to: Literal["ros", "mqtt"] = "ros"
+    type: str | None = None
+    timeout: float = 5.0
+    encoding: CallEncoding = "json"
+    on_error: str | None = None
+
+    def base(self, ros: str) -> str:
+        """The MQTT topic above all that belong to this service."""
+        return self.mqtt.replace("{ros}", ros)
+
+
+def to_request(
+    converters: Converters,
+    type_name: str,
+    payload: bytes,
+    encoding: CallEncoding,
+    limits: InputLimits,
+) -> bytes:
+    """The serialized message of a payload; an empty one has every field's default.
+
+    Raises CallError: bad_request, which names the field; too_large, unknown_type.
+    """
+    try:
+        converter = converters.get(type_name)
+        if not payload:
+            return converter.from_dict({})
+        limits.check(payload, encoding)
+        if encoding in RAW:
+            return converter.checked(payload, limits.items)
+        return converter.from_cbor(payload) if encoding == "cbor" else converter.from_json(payload)
+    except TooLargeError as error:
+        raise CallError("too_large", str(error)) from None
+    except ConversionError as error:
+        raise CallError("bad_request", str(error)) from None
+    except UnknownTypeError as error:
+        raise CallError("unknown_type", str(error)) from None
+
+
+def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+    """The payload of a serialized message. Raises ConversionError, UnknownTypeError."""
+    if encoding in RAW:
+        return cdr
+    converter = converters.get(type_name)
+    return converter.to_cbor(cdr) if encoding == "cbor" else converter.to_json(cdr)
+
+
+class ServiceRoutes:
+    """The routes of services; for the loop's thread, where it does not say otherwise."""
+
+    def __init__(
+        self,
+        board: Switchboard,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        entries: Entries,
+        post: Post,
+    ) -> None:
+        self._board = board
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._entries = entries
+        self._post = post
+        self._counters: dict[ServiceSettings, CallCounters] = {}
+        #: What is offered to MQTT, by the service's name; what to ROS, by the route.
+        self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
+        self._provided: dict[ServiceSettings, Provided] = {}
+        #: Services that patterns speak of and do not take.
+        self._refused: list[Skip] = []
+        #: The type that a service last had.
+        self._types: dict[str, str] = {}
+        #: Those of which the log says that they can be called.
+        self._callable: set[str] = set()
+
+    def replace(self, routes: Sequence[ServiceSettings]) -> None:
+        """Have these routes from now on; one that was there before does not notice."""
+        self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
+        wanted = [route for route in self._counters if route.to == "mqtt"]
+        for route, provided in list(self._provided.items()):
+            if route not in wanted:
+                provided.stop()
+                del self._provided[route]
+        for route in wanted:
+            if route not in self._provided:
+                self._provided[route] = Provided(
+                    route,
+                    self._counters[route],
+                    self._board,
+                    self._converters,
+                    self._node,
+                    self._entries,
+                    self._post,
+                )
+        self.follow()
+
+    def follow(self) -> None:
+        """Offer what is on the bus now."""
+        for name, types in self._requests.services.items():
+            if self._types.get(name) not in types:
+                self._types[name] = min(types)
+        wanted = self._wanted()
+        for name, (route, offer) in list(self._offered.items()):
+            if wanted.get(name) != route:
+                self._board.withdraw(offer)
+                del self._offered[name]
+        for name, route in wanted.items():
+            if name not in self._offered:
+                self._offer(name, route)
+        self._tell()
+        self._types = {
+            name: found
+            for name, found in self._types.items()
+            if name in self._requests.services or name in self._offered
+        }
+
+    def _wanted(self) -> dict[str, ServiceSettings]:
+        """The services that MQTT may call, and the route of each."""
+        own = {route.names[0] for route in self._provided}
+        found = {name: types for name, types in self._requests.services.items() if name not in own}
+        routes = [route for route in self._counters if route.to == "ros"]
+
+        def misfit(route: ServiceSettings, name: str) -> tuple[Why, str] | None:
+            return _misfit(route, found[name])
+
+        wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
+        # Those of actions belong to bridge.actions.
+        others = {name: types for name, types in found.items() if "/_action/" not in name}
+        self._refused = refusals(routes, others, wanted, "service", misfit)
+        return wanted
+
+    def _offer(self, name: str, route: ServiceSettings) -> None:
+        topic = f"{route.base(name)}/_call"
+        offer = Offer(
+            topic,
+            name,
+            route.timeout,
+            self._counters[route],
+            partial(self._handle, name, route),
+            route.encoding,
+            (*WITHOUT_RAW, self._node.wire.encoding),
+        )
+        self._offered[name] = route, offer
+        self._board.offer(offer)
+        if name not in self._requests.services:
+            log.info("%s: no node offers it yet; it will be called at %s", name, topic)
+
+    def _tell(self) -> None:
+        """Say which can be called, and which can no more: a route alone offers nothing."""
+        there = {name for name in self._offered if name in self._requests.services}
+        for name in sorted(there - self._callable):
+            log.info("%s can be called at %s", name, self._offered[name][1].topic)
+        for name in sorted(self._callable - there):
+            log.info("%s cannot be called any more", name)
+        self._callable = there
+
+    def _type(self, name: str, route: ServiceSettings) -> str | None:
+        fixed = route.type if route.type is not None and "*" not in route.type else None
+        return fixed or self._types.get(name)
+
+    def _handle(
+        self, name: str, route: ServiceSettings, call: Call
+    ) -> Callable[[], Awaitable[Answer]]:
+        type_name = self._type(name, route)
+        if type_name is None:
+            raise CallError("unavailable", f"there is no {name} on the bus")
+        request = to_request(
+            self._converters,
+            f"{type_name}_Request",
+            call.payload,
+            call.encoding,
+            self._board.limits.input,
+        )
+        return partial(self._ask, name, type_name, request, call)
+
+    async def _ask(self, name: str, type_name: str, request: bytes, call: Call) -> Answer:
+        response = await self._requests.ask(name, type_name, request)
+        response_type = f"{type_name}_Response"
+        payload = await self._board.convert(
+            call.caller,
+            len(response),
+            partial(from_ros, self._converters, response_type, response, call.encoding),
+        )
+        return Answer(payload, call.encoding, response_type)
+
+    def keys(self) -> Iterable[Key]:
+        """The services that a client should be ready for."""
+        for name, (route, _) in self._offered.items():
+            type_name = self._type(name, route)
+            if type_name is not None:
+                yield name, type_name
+
+    def status(self) -> list[tuple[ServiceSettings, CallCounters, list[str]]]:
+        """Each route, what it has counted, and the services that it offers now."""
+        return [
+            (
+                route,
+                counters,
+                [name for name, (of, _) in self._offered.items() if of is route]
+                + (list(route.names) if route in self._provided else []),
+            )
+            for route, counters in self._counters.items()
+        ]
+
+    def bridged(self) -> list[dict[str, str]]:
+        """Entries for `{robot}/_appliance/routes`."""
+        entries = [
+            _entry("service", name, offer.topic, self._type(name, route), route)
+            for name, (route, offer) in self._offered.items()
+            if name in self._requests.services
+        ]
+        return entries + [
+            _entry("provided", name, f"{route.base(name)}/_request", route.type, route)
+            for route in self._provided
+            for name in route.names
+        ]
+
+    def skips(self) -> list[Skip]:
+        """The services that routes speak of and cannot be called, or are not offered."""
+        skips = list(self._refused)
+        for name, (route, _) in self._offered.items():
+            type_name = self._type(name, route) or ""
+            problem = self._requests.problem(name, type_name)
+            if problem is not None:
+                skips.append(Skip(name, "service", type_name, "problem", problem))
+            elif name not in self._requests.services:
+                skips.append(Skip(name, "service", type_name, "absent", "no node offers it"))
+        for provided in self._provided.values():
+            skips += provided.skips()
+        return skips
+
+    def stop(self) -> None:
+        """The bus has been left: nothing is offered any more."""
+        for provided in self._provided.values():
+            provided.stop()
+        self._provided.clear()
+        self._offered.clear()
+        self._refused.clear()
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Offer the services that ROS may call, once there is a bus."""
+        for provided in list(self._provided.values()):
+            provided.look()
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the services."""
+        for provided in list(self._provided.values()):
+            provided.lost()
+
+
+def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[Why, str] | None:
+    """Why a pattern of the route does not take a service of these types; None when it does."""
+    if route.type is not None:
+        if any(map(compile_pattern(route.type).fullmatch, types)):
+            return None
+        return "other_type", f"the route takes {route.type}"
+    takes_all = any("*" in name.rpartition("/")[2] for name in route.names if name[0] != "!")
+    if takes_all and _OF_EVERY_NODE.fullmatch(min(types)):
+        return "of_every_node", "every node has one; patterns take it only where they name it"
+    return None
+
+
+def _entry(
+    direction: str, ros: str, mqtt: str, type_name: str | None, route: ServiceSettings
+) -> dict[str, str]:
+    return {
+        "ros": ros,
+        "mqtt": mqtt,
+        "type": type_name or "",
+        "direction": direction,
+        "encoding": route.encoding,
+    }
+
+
+@dataclass(eq=False, slots=True)
+class _Asked:
+    """A request from ROS that MQTT has not answered yet."""
+
+    respond: Respond
+    timer: asyncio.TimerHandle
+
+
+class Provided:
+    """One ROS service that MQTT clients answer."""
+
+    def __init__(
+        self,
+        route: ServiceSettings,
+        counters: CallCounters,
+        board: Switchboard,
+        converters: Converters,
+        node: RosNode,
+        entries: Entries,
+        post: Post,
+    ) -> None:
+        assert route.type is not None
+        self._route = route
+        self._counters = counters
+        self._board = board
+        self._converters = converters
+        self._node = node
+        self._entries = entries
+        self._post = post
+        (self._ros,) = route.names
+        self._base = route.base(self._ros)
+        self._request_type = f"{route.type}_Request"
+        self._response_type = f"{route.type}_Response"
+        self._asked: dict[str, _Asked] = {}
+        self._report_at = 0.0
+        #: Why ROS does not have it.
+        self._problem: str | None = None
+        self._board.listen(f"{self._base}/_response/+", self._on_response)
+        # The ROS thread's.
+        self._service: RosService | None = None
+        self._is_tried = False
+        self._is_over = False
+
+    # The ROS thread
+
+    def look(self) -> None:
+        """Offer the service as soon as there is a bus."""
+        if self._is_tried or self._is_over:
+            return
+        self._is_tried = True
+        route = self._route
+        assert route.type is not None
+        try:
+            self._service = self._node.create_service(self._ros, route.type, self._on_request)
+        except (BusError, UnknownTypeError) as error:
+            self._post(log.error, "%s is not offered: %s", self._ros, error)
+            self._counters.last_error = self._problem = str(error)
+            return
+        self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
+
+    def skips(self) -> list[Skip]:
+        """Why it is not offered, where it is not; from any thread."""
+        if self._problem is None:
+            return []
+        return [Skip(self._ros, "provided", self._route.type or "", "problem", self._problem)]
+
+    def _on_request(self, cdr: bytes, respond: Respond) -> None:
+        try:
+            payload = from_ros(self._converters, self._request_type, cdr, self._route.encoding)
+        except (ConversionError, UnknownTypeError) as error:
+            self._post(self._fail, respond, f"a request cannot be converted: {error}")
+            return
+        self._post(self._ask, payload, respond)
+
+    def _close(self) -> None:
+        self._is_over = True
+        if self._service is not None:
+            self._service.destroy()
+            self._service = None
+
+    # The loop's thread
+
+    def _ask(self, payload: bytes, respond: Respond) -> None:
+        route = self._route
+        self._counters.calls += 1
+        if len(self._asked) >= self._board.limits.total:
+            count = len(self._asked)
+            self._fail(respond, f"too_many: {count} requests are under way (bridge.limits.calls)")
+            return
+        token = secrets.token_hex(8)
+        message = Message(
+            f"{self._base}/_request/{token}",
+            payload,
+            1,
+            properties={
+                Property.CONTENT_TYPE: CONTENT_TYPE[route.encoding],
+                Property.RESPONSE_TOPIC: f"{self._base}/_response/{token}",
+                Property.CORRELATION_DATA: token.encode(),
+                Property.USER_PROPERTY: [("ros-type", self._request_type)],
+            },
+            expires_at=self._board.now() + route.timeout,
+        )
+        late = f"timeout: no MQTT client answered within {route.timeout:g} s"
+        timer = self._entries.later(
+            "services.timeout", route.timeout, self._give_up, token, late, served=self._ros
+        )
+        self._asked[token] = _Asked(respond, timer)
+        self._counters.under_way += 1
+        if self._board.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
+            self._give_up(
+                token, f"unavailable: no MQTT client subscribes to {self._base}/_request/+"
+            )
+
+    def _on_response(self, origin: Session, message: Message) -> None:
+        asked = self._forget(message.topic.rpartition("/")[2])
+        if asked is None:
+            log.debug("%s: a response to nothing under way", self._ros)
+            return
+        properties = message.properties or {}
+        told = properties.get(Property.USER_PROPERTY)
+        encoding = named_encoding(properties.get(Property.CONTENT_TYPE)) or self._route.encoding
+        if isinstance(told, list) and ("status", "error") in told:
+            self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
+            return
+        # Their number is that of the requests: each has one response.
+        take = partial(self._take_response, asked.respond, message.payload, encoding)
+        self._board.turns.do(origin, len(message.payload), take)
+
+    def _take_response(self, respond: Respond, payload: bytes, encoding: CallEncoding) -> None:
+        limits = self._board.limits.input
+        try:
+            cdr = to_request(self._converters, self._response_type, payload, encoding, limits)
+        except CallError as error:
+            what = f"bad response: {error}"
+            if error.code == "too_large":
+                what = f"too_large: {error}"
+            elif _is_error(payload, encoding):
+                what = f"rejected: {payload[:200]!r}"
+            self._fail(respond, what)
+            return
+        self._counters.answers += 1
+        self._respond(respond, cdr)
+
+    def _forget(self, token: str) -> _Asked | None:
+        asked = self._asked.pop(token, None)
+        if asked is not None:
+            asked.timer.cancel()
+            self._counters.under_way -= 1
+        return asked
+
+    def _give_up(self, token: str, problem: str) -> None:
+        asked = self._forget(token)
+        if asked is not None:
+            self._fail(asked.respond, problem)
+
+    def _fail(self, respond: Respond, problem: str) -> None:
+        """Nobody gave a response: ROS gets the one that the route has for that, if any."""
+        code = problem.partition(":")[0]
+        self._counters.errors[code] += 1
+        self._counters.last_error = problem
+        now = self._entries.time()
+        if now >= self._report_at:
+            self._report_at = now + REPORT_INTERVAL
+            count = sum(self._counters.errors.values())
+            log.warning("a call of %s failed (%d so far): %s", self._ros, count, problem)
+        cdr = None
+        if self._route.on_error is not None:
+            try:
+                cdr = self._converters.get(self._response_type).from_json(
+                    self._route.on_error.encode()
+                )
+            except (ConversionError, UnknownTypeError) as error:
+                log.warning("on_error of %s cannot be used: %s", self._ros, error)
+        self._respond(respond, cdr)
+
+    def _respond(self, respond: Respond, cdr: bytes | None) -> None:
+        def send() -> None:
+            try:
+                respond(cdr)
+            except BusError as error:
+                self._post(log.warning, "%s: no response could be sent: %s", self._ros, error)
+
+        try:
+            self._node.call_soon(send)
+        except BusError:
+            log.debug("%s: the bus has gone", self._ros)
+
+    def stop(self) -> None:
+        """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
+        self._board.ignore(f"{self._base}/_response/+")
+        for token in list(self._asked):
+            self._give_up(token, "stopping: the service is offered no longer")
+        try:
+            self._node.call_soon(self._close)
+        except BusError:
+            self._is_over = True
+
+    def lost(self) -> None:
+        """The bus is gone, and with it the service; on the ROS thread."""
+        self._service = None
+        self._is_tried = False
+
+
+def _is_error(payload: bytes, encoding: CallEncoding) -> bool:
+    try:
+        value = loads(payload, encoding)
+    except ConversionError:
+        return False
+    return isinstance(value, dict) and isinstance(value.get("error"), dict)

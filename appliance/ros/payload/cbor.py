@@ -1,0 +1,130 @@
+"""CBOR (RFC 8949) as this bridge speaks it: JSON's shape, bytes as byte strings, and arrays of
+numbers as typed arrays (RFC 8746), which are CDR's bytes as they stand.
+
+What comes in may have plain arrays as well, and typed arrays of any type and byte order that Python
+knows. Other tags are refused: none is needed, and with references to values that are there already,
+some bytes could stand for gigabytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import cbor2
+
+from appliance.ros.payload.arrays import Numbers, unpack_numbers
+from appliance.ros.payload.cost import DEPTH
+from appliance.ros.payload.definitions import PRIMITIVES
+from appliance.ros.payload.fallback import ConversionError
+
+#: Tags of typed arrays in little endian.
+TAGS = {
+    "uint16": 69,
+    "uint32": 70,
+    "uint64": 71,
+    "int8": 72,
+    "int16": 77,
+    "int32": 78,
+    "int64": 79,
+    "float32": 85,
+    "float64": 86,
+}
+
+#: `struct`'s code of each typed array.
+_CODES = {
+    64: "B",
+    65: ">H",
+    66: ">I",
+    67: ">Q",
+    68: "B",
+    69: "<H",
+    70: "<I",
+    71: "<Q",
+    72: "b",
+    73: ">h",
+    74: ">i",
+    75: ">q",
+    77: "<h",
+    78: "<i",
+    79: "<q",
+    80: ">e",
+    81: ">f",
+    82: ">d",
+    84: "<e",
+    85: "<f",
+    86: "<d",
+}
+
+#: The tags that cbor2 would do something about.
+_KNOWN = (0, 1, 2, 3, 4, 5, 25, 28, 29, 30, 35, 36, 37, 100, 256, 258, 260, 261, 1004, 43000)
+
+#: Those that are on the wire of ROS as they are here.
+_AS_THEY_ARE = {
+    **{tag: PRIMITIVES[name] for name, tag in TAGS.items()},
+    **dict.fromkeys((64, 68), PRIMITIVES["uint8"]),
+}
+
+
+def _encode_numbers(encoder: cbor2.CBOREncoder, value: Any) -> None:
+    assert isinstance(value, Numbers)
+    encoder.encode(cbor2.CBORTag(TAGS[value.primitive.name], value.data))
+
+
+def dumps(value: object) -> bytes:
+    """The CBOR of a value, in which there may be what a reader of `generate_binary` gives."""
+    return cbor2.dumps(value, default=_encode_numbers)
+
+
+def _read_list(tag: cbor2.CBORTag, _: bool) -> list[Any]:
+    code = _CODES.get(tag.tag)
+    if code is None:
+        raise ValueError(f"tag {tag.tag} has no place in a message")
+    if not isinstance(tag.value, bytes):
+        raise ValueError(f"the typed array of tag {tag.tag} is not a byte string")
+    try:
+        return unpack_numbers(code, tag.value)
+    except ValueError:
+        raise ValueError(f"the typed array of tag {tag.tag} ends within a number") from None
+
+
+def _read_numbers(tag: cbor2.CBORTag, is_immutable: bool) -> Numbers | list[Any]:
+    primitive = _AS_THEY_ARE.get(tag.tag)
+    data = tag.value
+    if primitive is None or not isinstance(data, bytes) or len(data) % primitive.size:
+        return _read_list(tag, is_immutable)
+    return Numbers(primitive, data)
+
+
+def _refuse(tag: int) -> Callable[..., object]:
+    def refuse(*_: object) -> object:
+        raise ValueError(f"tag {tag} has no place in a message")
+
+    return refuse
+
+
+_REFUSED = {tag: _refuse(tag) for tag in _KNOWN}
+
+
+def loads(payload: bytes, *, as_numbers: bool = False) -> Any:
+    """The value of CBOR; raises ConversionError when it is none, or more than one.
+
+    Typed arrays are lists; with `as_numbers` those that ROS has like this are `Numbers`, in which
+    nothing is looked at.
+    """
+    file = BytesIO(payload)
+    decoder = cbor2.CBORDecoder(
+        file,
+        tag_hook=_read_numbers if as_numbers else _read_list,
+        semantic_decoders=_REFUSED,
+        max_depth=DEPTH,
+        strict_hashable_types=True,
+    )
+    try:
+        value = decoder.decode()
+    except (cbor2.CBORDecodeError, ValueError, RecursionError) as error:
+        raise ConversionError("", f"not CBOR: {error.__cause__ or error}") from None
+    if file.tell() != len(payload):
+        raise ConversionError("", f"not CBOR: something follows the message at {file.tell()}")
+    return value

@@ -1,0 +1,745 @@
+"""Python source for one message type: `decode` and `encode`, straight between wire and values.
+
+What can be known beforehand is worked out here, once a type: neighbouring numbers are read and
+written by one precompiled `struct.Struct` (a *run*), nested messages are laid flat, and padding is
+part of the run. CDR aligns a number to its size, counted from the end of the four bytes of header.
+While the position modulo 8 is known, a run has one layout; after a string it has up to eight, and
+the position picks one of them. ROS 1 aligns nothing, so that there every run has one layout.
+
+Of a message of which only some fields are wanted, what is passed over is not read at all.
+
+Generated code never takes what careful.py would refuse. It need not take all else: it raises one of
+`MISFIT`, and the caller goes the careful way, which mends or names what was wrong.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from appliance.ros.payload.arrays import WRITERS, binary_readers, readers
+from appliance.ros.payload.cost import weight_of
+from appliance.ros.payload.definitions import (
+    LONGEST_ROW,
+    PRIMITIVES,
+    Array,
+    FieldType,
+    ItemType,
+    Primitive,
+    Selection,
+    Sequence,
+    String,
+    TypeDescription,
+    WideString,
+    Wire,
+)
+
+# What generated code raises when a message is not exactly as expected.
+MISFIT = (
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+    struct.error,
+)
+
+_COUNT = PRIMITIVES["uint32"]
+_PADDING = Primitive("padding", "x", 1)
+
+
+class Generated(NamedTuple):
+    """The functions of a type, and their source. Where `decode_plain` gives lists, `decode` gives
+    numpy arrays, which orjson writes faster and, those of float32, in half the digits."""
+
+    decode: Callable[[bytes], dict[str, Any]]
+    decode_plain: Callable[[bytes], dict[str, Any]]
+    encode: Callable[[Any], bytes]
+    source: str
+
+
+class Checker(NamedTuple):
+    """The function that reads a type for nothing but to see that it can be read, and its source.
+    It gives up with OverBudgetError when that is more work than it may be (see weigh.py)."""
+
+    check: Callable[[bytes, int], object]
+    source: str
+
+
+class OverBudgetError(Exception):
+    """A message is more work than it may be."""
+
+
+class Binary(NamedTuple):
+    """The function that reads a type for encodings that have bytes, and its source. Octets are
+    bytes, and other arrays of numbers `arrays.Numbers`."""
+
+    decode: Callable[[bytes], dict[str, Any]]
+    source: str
+
+
+def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> Binary:
+    """Generates and compiles the reader of a type, or of some of its fields."""
+    decoder = _Decoder(description.wire, wanted, "numbers_{}({})")
+    source = decoder.function(description)
+    namespace = {**decoder.constants, **binary_readers()}
+    exec(compile(source, f"<binary reader of {description.name}>", "exec"), namespace)
+    return Binary(namespace["decode"], source)
+
+
+def generate_checker(description: TypeDescription) -> Checker:
+    """Generates and compiles the function that looks whether a message is one of the type."""
+    decoder = _Decoder(description.wire, None, has_budget=True)
+    source = decoder.function(description)
+    namespace = {**decoder.constants, **binary_readers(), "OverBudgetError": OverBudgetError}
+    exec(compile(source, f"<checker of {description.name}>", "exec"), namespace)
+    return Checker(namespace["decode"], source)
+
+
+def generate(description: TypeDescription, wanted: Selection | None = None) -> Generated:
+    """Generates and compiles the converters of a type; those that decode, of some of its fields."""
+    decoder, encoder = _Decoder(description.wire, wanted), _Encoder(description.wire)
+    source = decoder.function(description) + "\n\n" + encoder.function(description)
+    code = compile(source, f"<converters of {description.name}>", "exec")
+    fast = {**decoder.constants, **readers(with_numpy=True)}
+    plain = {**decoder.constants, **readers(with_numpy=False)}
+    encoding = {**encoder.constants, **WRITERS}
+    for namespace in (fast, plain, encoding):
+        exec(code, namespace)
+    return Generated(fast["decode"], plain["decode"], encoding["encode"], source)
+
+
+# --- where we are ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1).
+
+    Nothing is aligned to more than `most`.
+    """
+
+    modulus: int
+    rest: int
+    most: int
+
+    def align(self, size: int) -> Phase:
+        size = min(size, self.most)
+        if size > self.modulus:
+            return Phase(size, 0, self.most)
+        return self.advance(-self.rest % size)
+
+    def is_aligned(self, size: int) -> bool:
+        size = min(size, self.most)
+        return self.modulus >= size and self.rest % size == 0
+
+    def advance(self, count: int) -> Phase:
+        return Phase(self.modulus, (self.rest + count) % self.modulus, self.most)
+
+    def lost(self, modulus: int = 1) -> Phase:
+        """What is known behind something unknown: it ends at a multiple of `modulus`."""
+        return Phase(modulus, 0, self.most)
+
+    def join(self, other: Phase) -> Phase:
+        """What is known when it may be this or the other."""
+        modulus = min(self.modulus, other.modulus)
+        while self.rest % modulus != other.rest % modulus:
+            modulus //= 2
+        return Phase(modulus, self.rest % modulus, self.most)
+
+
+def _after(type_: FieldType, phase: Phase) -> Phase:
+    """What is known of the position behind a value, given what is known before it."""
+    if isinstance(type_, Primitive):
+        return phase.align(type_.size).advance(type_.size)
+    if isinstance(type_, String):
+        return phase.lost()
+    if isinstance(type_, WideString):
+        return phase.lost(4)
+    if isinstance(type_, TypeDescription):
+        for field in type_.fields:
+            phase = _after(field.type, phase)
+        return phase if type_.fields else phase.advance(len(type_.wire.empty))
+    if isinstance(type_, Sequence):
+        phase = phase.align(4).advance(4)
+        return phase.join(_after(type_.item, _loop_phase(type_.item, phase)))
+    if isinstance(type_.item, Primitive):
+        return phase.align(type_.item.size).advance(type_.item.size * type_.length)
+    return _after(type_.item, _loop_phase(type_.item, phase))
+
+
+def _loop_phase(item: FieldType, phase: Phase) -> Phase:
+    """What is known at the beginning of every round of a loop over items."""
+    phase = phase.align(_first_size(item))
+    while (joined := phase.join(_after(item, phase))) != phase:
+        phase = joined
+    return phase
+
+
+def _first_size(type_: FieldType) -> int:
+    """What the very first number of a value is aligned to."""
+    if isinstance(type_, Primitive):
+        return type_.size
+    if isinstance(type_, Array):
+        return _first_size(type_.item)
+    if isinstance(type_, TypeDescription):
+        return _first_size(type_.fields[0].type) if type_.fields else 1
+    return 4
+
+
+def _is_row(type_: FieldType) -> bool:
+    """An array that is part of a run. Not float32: numpy writes these with half the digits."""
+    return (
+        isinstance(type_, Array)
+        and isinstance(type_.item, Primitive)
+        and (type_.item.is_octet or (type_.length <= LONGEST_ROW and type_.item.code != "f"))
+    )
+
+
+def _is_run(type_: FieldType) -> bool:
+    """The whole value is part of a run."""
+    if isinstance(type_, TypeDescription):
+        return all(_is_run(field.type) for field in type_.fields)
+    return isinstance(type_, Primitive) or _is_row(type_)
+
+
+def _run_size(type_: FieldType, rest: int, most: int) -> int:
+    """The bytes of a value that is part of a run, from a position that is `rest` modulo 8."""
+    if isinstance(type_, TypeDescription):
+        size = 0 if type_.fields else len(type_.wire.empty)
+        for field in type_.fields:
+            size += _run_size(field.type, rest + size, most)
+        return size
+    item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
+    assert isinstance(item, Primitive)
+    return -rest % min(item.size, most) + count * item.size
+
+
+# --- the two generators ---------------------------------------------------------------------
+
+
+class _Part(NamedTuple):
+    """A part of a run: `length` numbers, or as many bytes. `text` is the names that they are read
+    into, or the expression that is written; empty for padding."""
+
+    primitive: Primitive
+    length: int
+    text: str
+
+    @property
+    def code(self) -> str:
+        if self.primitive.is_octet and self.length > 1:
+            return f"{self.length}s"
+        return self.primitive.code * self.length
+
+    @property
+    def size(self) -> int:
+        return self.primitive.size * self.length
+
+
+class _Generator:
+    """What reading and writing have in common: lines, names, the run and the position.
+
+    The position is an index into the message with its header: the number `_offset`, plus the
+    variable `q` once something of unknown length has been passed, plus `_terms`, expressions that
+    have yet to be added to `q`.
+    """
+
+    def __init__(self, wire: Wire) -> None:
+        self.constants: dict[str, Any] = {}
+        self._wire = wire
+        self._lines: list[str] = []
+        self._indent = 1
+        self._names = 0
+        self._run: list[_Part] = []
+        self._phase = Phase(8, 0, wire.alignment)
+        self._variable = False
+        self._offset = len(wire.header)
+        self._terms: list[str] = []
+
+    def _line(self, text: str) -> None:
+        self._lines.append("    " * self._indent + text)
+
+    @contextmanager
+    def _block(self, head: str) -> Iterator[None]:
+        self._line(head)
+        self._indent += 1
+        yield
+        self._indent -= 1
+
+    def _name(self, hint: str) -> str:
+        self._names += 1
+        return f"{hint}_{self._names}"
+
+    def _settle(self) -> None:
+        """Makes `q` the position."""
+        terms = [*self._terms]
+        if self._offset:
+            terms.append(str(self._offset))
+        if terms:
+            self._line(f"q {'+=' if self._variable else '='} {' + '.join(terms)}")
+        self._variable, self._offset, self._terms = True, 0, []
+
+    def _position(self) -> str:
+        """An expression for the position: `16`, `q`, `q + 8`."""
+        if self._terms:
+            self._settle()
+        if not self._variable:
+            return str(self._offset)
+        return f"q + {self._offset}" if self._offset else "q"
+
+    def _end_run(self, method: str) -> tuple[str, str]:
+        """Defines the constant that reads or writes the run, and passes it: the constant's name,
+        and what picks the layout of a run that has several, else nothing."""
+        layouts: dict[int, struct.Struct] = {}
+        for rest in range(self._phase.rest, 8, self._phase.modulus):
+            position, codes = rest, "<"
+            for part in self._run:
+                padding = -position % min(part.primitive.size, self._wire.alignment)
+                codes += "x" * padding + part.code
+                position += padding + part.size
+            # The header makes an index four more than the position that is aligned.
+            layouts[(rest + len(self._wire.header)) % 8] = struct.Struct(codes)
+        for part in self._run:
+            self._phase = self._phase.align(part.primitive.size).advance(part.size)
+        self._run = []
+        name = self._name("R")
+        first, *others = layouts.values()
+        if all(other.format == first.format for other in others):
+            self.constants[name] = getattr(first, method)
+            self._offset += first.size
+            return name, ""
+        self._settle()
+        unused = struct.Struct("<")
+        every = [layouts.get(index, unused) for index in range(8)]
+        self.constants[name] = tuple(getattr(layout, method) for layout in every)
+        self.constants[f"SIZE_{name}"] = tuple(layout.size for layout in every)
+        phase = self._name("phase")
+        self._line(f"{phase} = q & 7")
+        self._terms.append(f"SIZE_{name}[{phase}]")
+        return name, f"[{phase}]"
+
+    def _fill(self, description: TypeDescription) -> None:
+        """What a structure without fields is."""
+        if not description.fields and self._wire.empty:
+            self._run.append(_Part(_PADDING, 1, ""))
+
+    def _stride(self, item: FieldType) -> int | None:
+        """The bytes from one item to the next, if all of them have the same layout, with the
+        first of them where we are."""
+        phase = _loop_phase(item, self._phase)
+        if not _is_run(item) or _after(item, phase) != phase:
+            return None
+        most = self._wire.alignment
+        sizes = {_run_size(item, rest, most) for rest in range(phase.rest, 8, phase.modulus)}
+        return sizes.pop() if len(sizes) == 1 else None
+
+
+class _Decoder(_Generator):
+    """Writes `decode(b)`: the value of the message `b`, or of the fields that are wanted.
+
+    `row` is what becomes of the name of a type and the names of numbers that are a row. With
+    `has_budget` it is `decode(b, left)`, which raises OverBudgetError when the message weighs more.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        wanted: Selection | None,
+        row: str = "[{1}]",
+        *,
+        has_budget: bool = False,
+    ) -> None:
+        super().__init__(wire)
+        self._wanted = wanted
+        self._row = row
+        self._has_budget = has_budget
+
+    def function(self, description: TypeDescription) -> str:
+        if self._wire.header:
+            self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
+        value = self._value(description, "message")
+        self._flush()
+        self._line(f"return {value}")
+        head = "def decode(b, left):" if self._has_budget else "def decode(b):"
+        return "\n".join([head, *self._lines, ""])
+
+    def _pass(self, type_: FieldType) -> None:
+        """Lines that pass a value without reading it."""
+        item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
+        if isinstance(type_, TypeDescription):
+            self._fill(type_)
+            for field in type_.fields:
+                self._pass(field.type)
+        elif isinstance(item, Primitive) and count * item.size <= LONGEST_ROW:
+            self._run.append(_Part(Primitive("passed", "x" * item.size, item.size), count, ""))
+        elif isinstance(item, Primitive):
+            self._flush()
+            self._pass_numbers(item, str(count))
+        elif isinstance(type_, (String, WideString)):
+            size = self._number(_COUNT, "size")
+            self._flush()
+            self._terms.append(size if isinstance(type_, String) else f"{size} * 4")
+            self._phase = self._phase.lost(1 if isinstance(type_, String) else 4)
+        elif isinstance(type_, Sequence) and isinstance(type_.item, Primitive):
+            size = self._number(_COUNT, "size")
+            self._flush()
+            empty = self._phase
+            self._pass_numbers(type_.item, size)
+            self._phase = self._phase.join(empty)
+        else:
+            wanted, self._wanted = self._wanted, {}
+            self._value(type_, "passed")
+            self._wanted = wanted
+
+    def _pass_numbers(self, primitive: Primitive, count: str) -> None:
+        self._align(primitive.size, count)
+        self._terms.append(f"{count} * {primitive.size}")
+        self._phase = _loop_phase(primitive, self._phase)
+
+    def _value(self, type_: FieldType, hint: str) -> str:
+        """The expression for a value, good after the next flush, and lines before it."""
+        if isinstance(type_, Primitive):
+            return self._number(type_, hint)
+        if isinstance(type_, TypeDescription):
+            return self._structure(type_)
+        if isinstance(type_, String):
+            return self._string(type_, hint)
+        if isinstance(type_, WideString):
+            return self._wide_string(type_, hint)
+        if isinstance(type_, Array):
+            return self._array(type_, hint)
+        return self._sequence(type_, hint)
+
+    def _structure(self, description: TypeDescription) -> str:
+        self._fill(description)
+        wanted = self._wanted
+        values = []
+        for field in description.fields:
+            if wanted is not None and field.name not in wanted:
+                self._pass(field.type)
+                continue
+            self._wanted = wanted[field.name] if wanted is not None else None
+            values.append(f"{field.name!r}: {self._value(field.type, field.name)}")
+        self._wanted = wanted
+        return "{" + ", ".join(values) + "}"
+
+    def _number(self, primitive: Primitive, hint: str) -> str:
+        name = self._name(hint)
+        self._run.append(_Part(primitive, 1, name))
+        return name
+
+    def _flush(self) -> None:
+        if not self._run:
+            return
+        names = [part.text for part in self._run if part.text]
+        target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
+        first_size = self._run[0].primitive.size
+        if min(first_size, self._wire.alignment) > self._phase.modulus:
+            # Cheaper than as many layouts, and what follows has often but one.
+            self._align(first_size, "1")
+        position = self._position()
+        name, layout = self._end_run("unpack_from")
+        self._line(f"{target}{name}{layout}(b, {'q' if layout else position})")
+
+    def _string(self, string: String, hint: str) -> str:
+        size = self._number(_COUNT, f"{hint}_size")
+        self._flush()
+        if string.bound is not None:
+            self._line(f"if {size} > {string.bound + 1}: raise ValueError")
+        self._settle()
+        name, end = self._name(hint), self._name("end")
+        if self._wire.terminator:
+            self._line(f"{end} = q + {size} - 1")
+            # Behind the message this is an IndexError. A string without even its NUL passes: the
+            # byte looked at is then the last of its size, which is 0.
+            self._line(f"if b[{end}]: raise ValueError")
+        else:
+            self._line(f"{end} = q + {size}")
+            self._line(f"if {end} > len(b): raise IndexError")
+        self._line(f"{name} = b[q:{end}].decode()")
+        self._terms.append(size)
+        self._phase = self._phase.lost()
+        return name
+
+    def _wide_string(self, string: WideString, hint: str) -> str:
+        count = self._number(_COUNT, f"{hint}_count")
+        self._flush()
+        if string.bound is not None:
+            self._line(f"if {count} > {string.bound}: raise ValueError")
+        name = self._name(hint)
+        self._line(f"{name} = read_wide_string(b, {self._position()}, {count})")
+        self._terms.append(f"{count} * 4")
+        self._phase = self._phase.lost(4)
+        return name
+
+    def _array(self, array: Array, hint: str) -> str:
+        item, length = array.item, array.length
+        if not isinstance(item, Primitive):
+            self._flush()
+            return self._loop(item, str(length), hint)
+        if item.is_octet:
+            name = self._name(hint)
+            self._run.append(_Part(item, length, name))
+            return f"base64({name})" if length > 1 else f"base64(bytes([{name}]))"
+        if _is_row(array):
+            names = ", ".join(self._number(item, hint) for _ in range(length))
+            return self._row.format(item.name, names)
+        self._flush()
+        return self._numbers(item, str(length), hint)
+
+    def _sequence(self, sequence: Sequence, hint: str) -> str:
+        item = sequence.item
+        count = self._number(_COUNT, f"{hint}_count")
+        self._flush()
+        if sequence.bound is not None:
+            self._line(f"if {count} > {sequence.bound}: raise ValueError")
+        empty = self._phase
+        if isinstance(item, Primitive):
+            value = self._numbers(item, count, hint)
+        else:
+            value = self._loop(item, count, hint)
+        self._phase = self._phase.join(empty)
+        return value
+
+    def _align(self, size: int, count: str) -> None:
+        """Passes the padding before items, of which there may be none."""
+        if not self._phase.is_aligned(size):
+            self._settle()
+            self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) & {size - 1}")
+            self._phase = self._phase.align(size)
+
+    def _numbers(self, primitive: Primitive, count: str, hint: str) -> str:
+        self._align(primitive.size, count)
+        name = self._name(hint)
+        self._line(f"{name} = read_{primitive.name}(b, {self._position()}, {count})")
+        self._terms.append(f"{count} * {primitive.size}")
+        self._phase = _loop_phase(primitive, self._phase)
+        return name
+
+    def _loop(self, item: ItemType, count: str, hint: str) -> str:
+        if self._has_budget:
+            self._line(f"left -= {count} * {weight_of(item)}")
+            self._line("if left < 0: raise OverBudgetError")
+        self._align(_first_size(item), count)
+        items = self._name(hint)
+        self._settle()
+        stride = self._stride(item)
+        self._phase = _loop_phase(item, self._phase)
+        if stride is not None:
+            value = self._value(item, hint)
+            names = "".join(f"{part.text}, " for part in self._run if part.text)
+            name, _ = self._end_run("iter_unpack")
+            end = self._name("end")
+            self._line(f"{end} = q + {count} * {stride}")
+            self._line(f"if {end} > len(b): raise ValueError")
+            self._line(f"{items} = [{value} for ({names}) in {name}(b[q:{end}])]")
+            self._line(f"q = {end}")
+            self._offset = 0
+            return items
+        # A count that lies ends with the message: every item takes at least a byte of it.
+        self._line(f"{items} = []")
+        with self._block(f"for _ in range({count}):"):
+            value = self._value(item, hint)
+            self._flush()
+            self._line(f"{items}.append({value})")
+            self._settle()
+        return items
+
+
+class _Encoder(_Generator):
+    """Writes `encode(message)`: the message, in little endian."""
+
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(wire)
+        # The header is the beginning of the first run.
+        if wire.header:
+            self._run = [_Part(PRIMITIVES["uint8"], len(wire.header), "HEADER")]
+        self._phase = self._phase.advance(-len(wire.header))
+        self._offset = 0
+        self._pieces: list[str] = []  # expressions for bytes
+        self._spilled = False
+
+    def function(self, description: TypeDescription) -> str:
+        self._value(description, "message", "message")
+        self._flush()
+        if self._spilled:
+            self._spill()
+            self._line("return join(w)")
+        elif len(self._pieces) == 1:
+            self._line(f"return {self._pieces[0]}")
+        else:
+            self._line(f"return join(({', '.join(self._pieces)}))")
+        return "\n".join(["def encode(message):", *self._lines, ""])
+
+    def _value(self, type_: FieldType, source: str, hint: str) -> None:
+        """Checks and writes what the expression `source` gives."""
+        if isinstance(type_, TypeDescription):
+            self._structure(type_, source, hint)
+        elif isinstance(type_, Primitive):
+            name = self._assign(hint, source)
+            # JSON has true and false but once each, and struct would take them for numbers.
+            if type_.name == "bool":
+                self._line(f"if {name} is not True and {name} is not False: raise TypeError")
+            else:
+                self._line(f"if {name} is True or {name} is False: raise TypeError")
+            self._run.append(_Part(type_, 1, name))
+        elif isinstance(type_, String):
+            self._string(type_, source, hint)
+        elif isinstance(type_, WideString):
+            name = self._assign(hint, f"write_wide_string({source})")
+            self._bound(f"len({name}) // 4", type_.bound)
+            self._run.append(_Part(_COUNT, 1, f"len({name}) // 4"))
+            self._bytes(name, self._phase.lost(4))
+        elif isinstance(type_, Array):
+            self._array(type_, source, hint)
+        else:
+            self._sequence(type_, source, hint)
+
+    def _assign(self, hint: str, source: str) -> str:
+        name = self._name(hint)
+        self._line(f"{name} = {source}")
+        return name
+
+    def _bound(self, size: str, bound: int | None) -> None:
+        if bound is not None:
+            self._line(f"if {size} > {bound}: raise ValueError")
+
+    def _flush(self) -> None:
+        if not self._run:
+            return
+        texts = ", ".join(part.text for part in self._run if part.text)
+        if not texts and len(self._run) == 1:
+            # A lone NUL, or the byte of an empty structure.
+            self._run, self._offset, self._phase = [], self._offset + 1, self._phase.advance(1)
+            self._pieces.append("b'\\0'")
+            return
+        name, layout = self._end_run("pack")
+        self._pieces.append(f"{name}{layout}({texts})")
+
+    def _bytes(self, name: str, phase: Phase) -> None:
+        """Writes bytes, behind the run."""
+        self._flush()
+        self._pieces.append(name)
+        self._terms.append(f"len({name})")
+        self._phase = phase
+
+    def _spill(self) -> None:
+        """Hands over the pieces so far: a loop begins or ends, or the message ends."""
+        pieces = ", ".join(self._pieces)
+        if not self._spilled:
+            self._line(f"w = [{pieces}]")
+        elif len(self._pieces) == 1:
+            self._line(f"w.append({pieces})")
+        elif self._pieces:
+            self._line(f"w += ({pieces})")
+        self._spilled, self._pieces = True, []
+
+    def _structure(self, description: TypeDescription, source: str, hint: str) -> None:
+        name = source if source.isidentifier() else self._assign(hint, source)
+        fields = description.fields
+        if not fields:
+            self._line(f"if {name} != {{}}: raise TypeError")
+            self._fill(description)
+            return
+        # As many as there are, and each of them found below: none unknown, none missing.
+        self._line(f"if len({name}) != {len(fields)}: raise KeyError")
+        for field in fields:
+            self._value(field.type, f"{name}[{field.name!r}]", field.name)
+
+    def _string(self, string: String, source: str, hint: str) -> None:
+        name = self._assign(hint, f"{source}.encode()")
+        if self._wire.terminator:
+            self._line(f"if 0 in {name}: raise ValueError")
+        self._bound(f"len({name})", string.bound)
+        size = f"len({name}) + 1" if self._wire.terminator else f"len({name})"
+        self._run.append(_Part(_COUNT, 1, size))
+        self._bytes(name, self._phase.lost())
+        if self._wire.terminator:
+            self._run.append(_Part(_PADDING, 1, ""))
+
+    def _array(self, array: Array, source: str, hint: str) -> None:
+        item, length = array.item, array.length
+        if not isinstance(item, Primitive):
+            name = self._list(hint, source)
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._flush()
+            self._loop(item, name)
+        elif item.is_octet:
+            name = self._assign(hint, f"octets({source})")
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._run.append(_Part(item, length, name if length > 1 else f"{name}[0]"))
+        elif _is_row(array):
+            name = self._assign(hint, source)
+            self._line(f"if {name}.__class__ is not list: {name} = listed({name})")
+            self._line(f"if len({name}) != {length}: raise ValueError")
+            self._line(
+                f"if not {_python_types(item)}.issuperset(map(type, {name})): raise TypeError"
+            )
+            self._run.append(_Part(item, length, f"*{name}"))
+        else:
+            name = self._assign(hint, f"write_{item.name}({source})")
+            self._line(f"if len({name}) != {length * item.size}: raise ValueError")
+            self._flush()
+            self._numbers(item, name)
+
+    def _sequence(self, sequence: Sequence, source: str, hint: str) -> None:
+        item = sequence.item
+        if isinstance(item, Primitive):
+            write = "octets" if item.is_octet else f"write_{item.name}"
+            name = self._assign(hint, f"{write}({source})")
+            count = f"len({name}) // {item.size}" if item.size > 1 else f"len({name})"
+        else:
+            name = self._list(hint, source)
+            count = f"len({name})"
+        self._bound(count, sequence.bound)
+        self._run.append(_Part(_COUNT, 1, count))
+        self._flush()
+        empty = self._phase
+        if isinstance(item, Primitive):
+            self._numbers(item, name)
+        else:
+            self._loop(item, name)
+        self._phase = self._phase.join(empty)
+
+    def _list(self, hint: str, source: str) -> str:
+        name = self._assign(hint, source)
+        self._line(f"if {name}.__class__ is not list: raise TypeError")
+        return name
+
+    def _align(self, size: int, items: str) -> None:
+        """Writes the padding before items, of which there may be none."""
+        if not self._phase.is_aligned(size):
+            self._settle()
+            padding = self._assign("padding", f"ZEROS[:(4 - q) & {size - 1}] if {items} else b''")
+            self._bytes(padding, self._phase.align(size))
+
+    def _numbers(self, primitive: Primitive, name: str) -> None:
+        self._align(primitive.size, name)
+        self._bytes(name, _loop_phase(primitive, self._phase))
+
+    def _loop(self, item: ItemType, items: str) -> None:
+        self._align(_first_size(item), items)
+        self._spill()
+        stride = self._stride(item)
+        self._phase = _loop_phase(item, self._phase)
+        self._settle()
+        element = self._name("item")
+        with self._block(f"for {element} in {items}:"):
+            self._value(item, element, "item")
+            self._flush()
+            self._spill()
+            if stride is None:
+                self._settle()
+        if stride is not None:
+            self._offset = 0
+            self._terms.append(f"len({items}) * {stride}")
+
+
+def _python_types(primitive: Primitive) -> str:
+    """The constant with the Python types that `primitive` is written from."""
+    return "BOOLS" if primitive.name == "bool" else "NUMBERS" if primitive.is_float else "INTEGERS"

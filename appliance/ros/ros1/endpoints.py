@@ -1,0 +1,284 @@
+"""The ends that a node on ROS 1 has: subscriptions, publishers, clients and services, as bytes.
+
+They are made with rospy, which is handed to them: only ros1.py imports it.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from functools import cache, partial
+from io import BytesIO
+from typing import Any, Protocol
+
+from appliance.ros.node import BusError, Durability, QosProfile, Respond
+from appliance.ros.ros1.peers import ServiceCall
+from appliance.ros.ros1.types import Definition, ServiceDefinition
+
+#: Messages of a publisher that are held until it is seen to be latched.
+HELD = 10
+
+
+class Audience(Protocol):
+    """Who is told what publishers say of themselves."""
+
+    def hear(self, topic: str, node: str, is_latched: bool) -> bool:
+        """What a publisher says of itself; whether that is news."""
+
+    def hold(self, subscription: Subscription) -> None:
+        """Have it release what it holds after the next look."""
+
+    def let_go(self, subscription: Subscription) -> None:
+        """It holds nothing any more."""
+
+
+class Caller(Protocol):
+    """The node, as far as its clients need it."""
+
+    name: str
+
+    @property
+    def master_uri(self) -> str:
+        """Where the Master is."""
+
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        """Call it on the ROS thread."""
+
+    def is_served(self, service: str) -> bool:
+        """Whether a service is on the graph."""
+
+    def doubt(self, service: str) -> None:
+        """A call of it has failed."""
+
+
+@cache
+def message_class(rospy: Any, definition: Definition) -> Any:
+    """What rospy takes for the class of a type, and has its bytes only."""
+    attributes = {
+        "__slots__": [],
+        "_type": definition.name,
+        "_md5sum": definition.md5sum,
+        "_full_text": definition.text,
+    }
+    return type("Raw", (rospy.AnyMsg,), attributes)
+
+
+@cache
+def _service_class(rospy: Any, definition: ServiceDefinition) -> Any:
+    attributes = {
+        "_type": definition.name,
+        "_md5sum": definition.md5sum,
+        "_request_class": message_class(rospy, definition.request),
+        "_response_class": message_class(rospy, definition.response),
+    }
+    return type("RawService", (), attributes)
+
+
+def forget_classes() -> None:
+    """Let go of what was made with a rospy that has ended, and with it of that, which is 1 MB."""
+    message_class.cache_clear()
+    _service_class.cache_clear()
+
+
+def _of(kind: Any, data: bytes) -> Any:
+    message = kind()
+    message._buff = data
+    return message
+
+
+def _serialized(message: Any) -> bytes:
+    buffer = BytesIO()
+    message.serialize(buffer)
+    return buffer.getvalue()
+
+
+class Subscription:
+    """A RosSubscription.
+
+    What latched publishers send is retained on MQTT, and only with a message it is told that one
+    is latched. The first of them is held until the graph was looked at again: most often the
+    subscription is then made anew, and the message comes once more.
+    """
+
+    def __init__(
+        self,
+        rospy: Any,
+        audience: Audience,
+        topic: str,
+        definition: Definition,
+        is_latched: bool,
+        callback: Callable[..., None],
+    ) -> None:
+        self._audience = audience
+        self._topic = topic
+        self._is_latched = is_latched
+        self._callback = callback
+        self._lock = threading.Lock()
+        self._is_over = False
+        self._held: deque[bytes] = deque(maxlen=HELD)
+        self._raw = rospy.AnyMsg
+        kind = message_class(rospy, definition)
+        self._own = rospy.Subscriber(topic, kind, self._on_message, tcp_nodelay=True)
+        found = self._own.impl.data_class
+        # rospy itself receives /clock when the time is simulated, as a message of its own class.
+        is_own = not issubclass(found, rospy.AnyMsg) and found._md5sum == kind._md5sum
+        if found is not kind and not is_own:
+            other = self._own.impl.type
+            self.destroy()
+            raise BusError(f"another route receives {topic} as {other}")
+
+    def _on_message(self, message: Any) -> None:
+        header: Mapping[str, str] = message._connection_header
+        is_latched = header.get("latching") == "1"
+        data = message._buff if isinstance(message, self._raw) else _serialized(message)
+        with self._lock:
+            if self._is_over:
+                return
+            is_news = self._audience.hear(self._topic, header.get("callerid", ""), is_latched)
+            if is_latched and not self._is_latched and (is_news or self._held):
+                self._held.append(data)
+                self._audience.hold(self)
+            else:
+                self._callback(data)
+
+    def release(self) -> None:
+        """Hand on what was held: not all publishers are latched, so that this one stays."""
+        self._audience.let_go(self)
+        with self._lock:
+            while self._held and not self._is_over:
+                self._callback(self._held.popleft())
+
+    def take_lost(self) -> int:
+        return 0  # TCP loses none, and rospy does not count what its queues drop
+
+    def destroy(self) -> None:
+        with self._lock:
+            self._is_over = True
+        self._audience.let_go(self)
+        self._own.unregister()
+
+
+class Publisher:
+    """A RosPublisher."""
+
+    def __init__(self, rospy: Any, topic: str, definition: Definition, qos: QosProfile) -> None:
+        self._class = kind = message_class(rospy, definition)
+        self._refusals = (rospy.ROSException, rospy.ROSSerializationException, OSError)
+        self._own = rospy.Publisher(
+            topic,
+            kind,
+            latch=qos.durability is Durability.TRANSIENT_LOCAL,
+            tcp_nodelay=True,
+            # A subscriber that does not read loses the oldest, and stops nobody.
+            queue_size=qos.depth,
+        )
+        if self._own.impl.data_class is not kind:
+            other = self._own.impl.type
+            self._own.unregister()
+            raise BusError(f"another route publishes {topic} as {other}")
+
+    def publish(self, cdr: bytes) -> None:
+        try:
+            self._own.publish(_of(self._class, cdr))
+        except self._refusals as error:
+            raise BusError(str(error)) from error
+
+    def reaches(self, nodes: Iterable[str]) -> bool:
+        """Whether one of these nodes is connected."""
+        return any(map(self._own.impl.has_connection, nodes))
+
+    def destroy(self) -> None:
+        self._own.unregister()
+
+
+class Client:
+    """A RosClient: each call is a connection and a thread of its own."""
+
+    def __init__(self, node: Caller, service: str, definition: ServiceDefinition) -> None:
+        self._node = node
+        self._service = service
+        self._definition = definition
+        self._calls: set[ServiceCall] = set()
+
+    def is_ready(self) -> bool:
+        return self._node.is_served(self._service)
+
+    def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
+        node = self._node
+
+        def finish(result: bytes | BusError) -> None:
+            if call in self._calls:
+                self._calls.discard(call)
+                if isinstance(result, BusError):
+                    node.doubt(self._service)
+                done(result)
+
+        def tell(result: bytes | BusError) -> None:
+            with suppress(BusError):
+                node.call_soon(partial(finish, result))
+
+        def give_up() -> None:
+            self._calls.discard(call)
+            call.give_up()
+
+        call = ServiceCall(
+            node.master_uri, node.name, self._service, self._definition, request, tell
+        )
+        self._calls.add(call)
+        return give_up
+
+    def destroy(self) -> None:
+        for call in self._calls:
+            call.give_up()
+        self._calls.clear()
+
+
+class Service:
+    """A RosService. rospy waits for each answer on a thread of its own."""
+
+    def __init__(
+        self,
+        rospy: Any,
+        name: str,
+        definition: ServiceDefinition,
+        callback: Callable[[bytes, Respond], None],
+        call_soon: Callable[[Callable[[], None]], None],
+    ) -> None:
+        self._error = rospy.ServiceException
+        self._response_class = message_class(rospy, definition.response)
+        self._callback = callback
+        self._call_soon = call_soon
+        self._waiting: set[queue.SimpleQueue[bytes | None]] = set()
+        try:
+            self._own = rospy.Service(name, _service_class(rospy, definition), self._take)
+        except rospy.ServiceException as error:
+            raise BusError(str(error)) from error
+
+    def _take(self, request: Any) -> Any:
+        answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._waiting.add(answer)
+        try:
+            self._call_soon(partial(self._ask, request._buff, answer.put))
+            response = answer.get()
+        except BusError as error:
+            raise self._error(str(error)) from error
+        finally:
+            self._waiting.discard(answer)
+        if response is None:
+            raise self._error("nobody on MQTT answered")
+        return _of(self._response_class, response)
+
+    def _ask(self, request: bytes, respond: Respond) -> None:
+        try:
+            self._callback(request, respond)
+        except Exception:
+            respond(None)  # rospy's thread would wait for good
+            raise
+
+    def destroy(self) -> None:
+        self._own.shutdown("its route has ended")
+        for answer in list(self._waiting):
+            answer.put(None)

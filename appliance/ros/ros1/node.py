@@ -1,0 +1,569 @@
+"""The node on ROS 1: the only file that imports rospy, and that only when the node starts.
+
+rospy gives and takes messages as their bytes, through classes that have a type's name and MD5 sum
+and nothing else. It does not come back by itself when the Master was away or came anew: the state
+of the graph, which is asked for anyway, says when our registrations are missing from it, and they
+are made again. And it starts only once: to join anew, it is imported anew.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from appliance.net.callbacks import Entries
+from appliance.ros.contained import ContainedThread
+from appliance.ros.node import (
+    BusError,
+    Durability,
+    Endpoint,
+    ParameterServer,
+    QosProfile,
+    Respond,
+    RosClient,
+    RosSubscription,
+    TakeLot,
+)
+from appliance.ros.payload.definitions import PACKED, TypeDescription, UnknownTypeError
+from appliance.ros.ros1.actions import HIDDEN, Actions, describe_action, find_actions, services_of
+from appliance.ros.ros1.endpoints import Client, Publisher, Service, Subscription
+from appliance.ros.ros1.peers import Answers, Master, MasterParameters, ask_publisher, ask_service
+from appliance.ros.ros1.rospy_cleanup import Servers, bound_receiving, unload
+from appliance.ros.ros1.types import Definition, describe, full_name, installed, installed_service
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at the graph, of which the Master does not tell changes.
+POLL_INTERVAL = 0.2
+
+#: Seconds until the types of topics are asked for again though the same nodes have them: one of
+#: them may have made a topic anew.
+TYPES_INTERVAL = 1.0
+
+#: Seconds between two attempts to find a Master at the start.
+KNOCK_INTERVAL = 0.5
+
+#: Seconds that rospy may take to leave the bus.
+LEAVE_TIME = 3.0
+
+DEFAULT_MASTER = "http://localhost:11311"
+
+#: Names of topics or services, and the nodes that have them.
+_Graph = dict[str, list[str]]
+
+
+def available() -> tuple[bool, str]:
+    """Whether a node can be started here, and if not, one line that says why and what to do.
+
+    Imports nothing.
+    """
+    if find_spec("rospy") is None:
+        return False, (
+            "there is no ROS 1 here: rospy cannot be imported. Source a ROS 1 setup file first, or "
+            "apt install python3-rospy, and install the appliance for the system's Python: "
+            "/usr/bin/python3 -m venv --system-site-packages"
+        )
+    messages = find_spec("std_msgs")
+    folders = list(messages.submodule_search_locations or ()) if messages is not None else []
+    if not any(Path(folder, "msg", "_String.py").is_file() for folder in folders):
+        return False, (
+            "ROS 2's packages come before those of ROS 1 here, and have the same names. Make an "
+            "environment without the extra `ros`, and source no ROS 2"
+            if folders
+            else "there is rospy, but not std_msgs. apt install python3-std-msgs"
+        )
+    return True, ""
+
+
+def found() -> str:
+    """The ROS 1 that is used, in words; where one is `available`."""
+    spec = find_spec("rospy")
+    where = Path(spec.origin).parent.parent if spec is not None and spec.origin else "?"
+    distribution = os.environ.get("ROS_DISTRO", "")
+    return f"ROS 1{' ' if distribution else ''}{distribution} in {where}"
+
+
+def master_uri() -> str:
+    """Where the Master is, as every node of ROS 1 takes it."""
+    return os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
+
+
+def remappings(arguments: Iterable[str]) -> Iterator[str]:
+    """The remappings among ROS arguments, with or without ROS 2's `-r` before them."""
+    before = ""
+    for argument in arguments:
+        if ":=" in argument and before not in ("-p", "--param"):
+            yield argument
+        before = argument
+
+
+class Ros1Node(ContainedThread):
+    """A RosNode on ROS 1. There can be one at a time in a process, as rospy is one.
+
+    Messages come on threads of rospy's, one at a time for each subscription.
+    """
+
+    wire = PACKED
+
+    def __init__(
+        self, name: str = "appliance", namespace: str = "/", arguments: Sequence[str] = ()
+    ) -> None:
+        """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
+        super().__init__()
+        self._arguments = list(remappings(arguments))
+        said = dict(argument.split(":=", 1) for argument in self._arguments)
+        space = os.environ.get("ROS_NAMESPACE", "") if namespace == "/" else namespace
+        space = said.get("__ns", space).strip("/")
+        self.name = (
+            f"/{space}/{said.get('__name', name)}" if space else f"/{said.get('__name', name)}"
+        )
+        self._master = Master(said.get("__master", master_uri()), self.name)
+        self.parameter_server: ParameterServer | None = MasterParameters(self._master)
+        self._base_name = name
+        self._namespace = namespace
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._told: dict[str, Definition] = {}
+        self._complained: set[str] = set()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Be as if there had been no bus yet."""
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._is_running = False
+        self._rospy: Any = None
+        self._uri = ""
+        #: Why the Master cannot be asked, if it cannot.
+        self._silence: str | None = None
+        # The graph, as of the last look.
+        self._publishers: _Graph = {}
+        self._subscribers: _Graph = {}
+        self._servers: _Graph = {}
+        self._types: dict[str, str] = {}
+        self._types_asked = 0.0
+        #: The types of the actions that have a server.
+        self._actions: dict[str, str] = {}
+        self._action_clients = Actions(self)
+        #: By topic and node, whether a publisher has said to be latched: it does in its messages.
+        self._heard: dict[tuple[str, str], bool] = {}
+        #: Definitions of types that are not installed, and the types of services.
+        self._definitions: Answers[Definition] = Answers()
+        self._service_types: Answers[str] = Answers()
+        #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
+        self._holding: dict[Subscription, None] = {}
+
+    @property
+    def obstacle(self) -> str | None:
+        silence = self._silence
+        return None if silence is None else f"the ROS Master does not answer: {silence}"
+
+    def start(
+        self,
+        poll: Callable[[], None],
+        failed: Callable[[str], None],
+        entries: Entries | None = None,
+    ) -> None:
+        self._entries = entries
+        is_available, reason = available()
+        if not is_available:
+            failed(reason)
+            return
+        if self._thread is not None:  # it has failed, and is about to end
+            self._thread.join()
+            self._forget()
+        self._thread = threading.Thread(
+            target=self._run, args=(poll, failed), name="ros", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._work.put(lambda: None)
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        thread.join(LEAVE_TIME)
+        if thread.is_alive():
+            # It waits for a Master that does not answer, with a socket that has no time limit.
+            log.warning("ROS is left without a word: the Master does not answer")
+
+    def _run(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
+        reason = ""
+        try:
+            if self._join():
+                self._is_running = True
+                self._spin(poll)
+        except Exception as error:
+            # The thread's end, whatever ended it: it must be told, and the bus be left in order.
+            log.debug("the ROS thread ended", exc_info=True)
+            reason = (
+                str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
+            )
+        finally:
+            self._is_running = False
+            self._leave()
+        if reason:
+            failed(reason)
+
+    def _join(self) -> bool:
+        """Wait for the Master and become a node; False when the stop came first."""
+        os.environ["ROS_MASTER_URI"] = self._master.uri
+        if self._namespace != "/":
+            os.environ["ROS_NAMESPACE"] = self._namespace
+        if not self._await_master():
+            return False
+        self._check_name()
+        unload()
+        self._rospy = rospy = import_module("rospy")
+        # rospy would take over the logging of the whole process.
+        rospy.core.configure_logging = lambda *_, **__: None
+        rospy.init_node(
+            self._base_name,
+            argv=["appliance", *self._arguments],
+            # What this node logs would be a message on a topic that may itself be bridged.
+            disable_rosout=True,
+            disable_signals=True,
+        )
+        Servers(rospy)
+        bound_receiving(rospy)
+        self.name = rospy.get_name()
+        self._uri = rospy.core.get_node_uri()
+        self._master.caller = self.name
+        return True
+
+    def _check_name(self) -> None:
+        """The Master would end the other, and let that, tried again, end this one."""
+        uri = self._find_namesake()
+        if uri is not None:
+            raise BusError(
+                f"another node, at {uri}, is called {self.name}: end it, or give this one another "
+                "name, bridge.node"
+            )
+
+    def _await_master(self) -> bool:
+        while not self._stopping.is_set():
+            try:
+                self._master.call("getPid")
+            except BusError as error:
+                if self._silence is None:
+                    log.warning("waiting for the ROS Master: %s", error)
+                self._silence = str(error)
+                self._stopping.wait(KNOCK_INTERVAL)
+            else:
+                self._silence = None
+                return True
+        return False
+
+    def _spin(self, poll: Callable[[], None]) -> None:
+        while not self._stopping.is_set():
+            if self._rospy.is_shutdown():
+                raise BusError(
+                    f"{self.name} was shut down from outside: by `rosnode kill`, or by another "
+                    "node of the same name"
+                )
+            if self._see():
+                holding = list(self._holding)
+                poll()
+                for subscription in holding:
+                    subscription.release()
+            self._do_work(monotonic() + POLL_INTERVAL)
+
+    def _do_work(self, until: float) -> None:
+        while not self._stopping.is_set():
+            try:
+                callback = self._work.get(timeout=max(0.0, until - monotonic()))
+            except queue.Empty:
+                return
+            callback()
+
+    def _leave(self) -> None:
+        self._definitions.close()
+        self._service_types.close()
+        if self._rospy is not None:
+            self._rospy.signal_shutdown("the appliance stops")
+
+    def call_soon(self, callback: Callable[[], None]) -> None:
+        if not self._is_running:
+            raise BusError("ROS is not ready")
+        self._work.put(self._contained("ros.task", callback))
+
+    # The graph
+
+    def nodes(self) -> list[str]:
+        graphs = (self._publishers, self._subscribers, self._servers)
+        return sorted({node for graph in graphs for nodes in graph.values() for node in nodes})
+
+    def _see(self) -> bool:
+        """Look at the graph; False when there is none to be seen."""
+        try:
+            state = [dict(found) for found in self._master.call("getSystemState")]
+            self._register_missing(*state)
+            connected = self._add_connected(*state[:2])
+            is_other = state != [self._publishers, self._subscribers, self._servers]
+            if is_other or monotonic() >= self._types_asked + TYPES_INTERVAL:
+                self._types_asked = monotonic()
+                types = dict(self._master.call("getTopicTypes"))
+                before = {topic: self._types[topic] for topic in connected if topic in self._types}
+                self._types = before | {
+                    topic: full_name(name) for topic, name in types.items() if name != "*"
+                }
+                self._publishers, self._subscribers, self._servers = state
+                self._actions = find_actions(self._types, self._publishers)
+                there = {(topic, node) for topic in state[0] for node in state[0][topic]}
+                for key in self._heard.keys() - there:
+                    self._heard.pop(key, None)
+                self._definitions.keep(there)
+        except (BusError, TypeError, ValueError) as error:
+            if self._silence is None:
+                log.warning("the ROS Master does not answer; what is connected stays so: %s", error)
+            self._silence = str(error)
+            return False
+        if self._silence is not None:
+            self._silence = None
+            log.info("the ROS Master is back at %s", self._master.uri)
+        return True
+
+    def _register_missing(self, publishers: _Graph, subscribers: _Graph, servers: _Graph) -> None:
+        """Tell the Master what we have that it does not know of: it has come anew."""
+        from rospy.impl.registration import get_service_manager, get_topic_manager
+
+        topics, master = get_topic_manager(), self._master
+        published = [own for own in topics.get_publications() if self._lacks(publishers, own[0])]
+        subscribed = [own for own in topics.get_subscriptions() if self._lacks(subscribers, own[0])]
+        served = [own for own in get_service_manager().get_services() if own[0] not in servers]
+        count = len(published) + len(subscribed) + len(served)
+        if not count or self._find_namesake():  # which the Master lets end this one, just now
+            return
+        for topic, type_name in published:
+            master.call("registerPublisher", topic, type_name, self._uri)
+        for topic, type_name in subscribed:
+            uris = master.call("registerSubscriber", topic, type_name, self._uri)
+            # As the Master tells it later, of others that come.
+            Master(self._uri, self.name).call("publisherUpdate", topic, uris)
+        for service, uri in served:
+            master.call("registerService", service, uri, self._uri)
+        log.info("registered with the ROS Master anew: %d topics and services", count)
+
+    def _lacks(self, graph: _Graph, topic: str) -> bool:
+        return self.name not in graph.get(topic, ())
+
+    def _find_namesake(self) -> str | None:
+        """The URI of another node with this one's name; None when there is none, or none any
+        more."""
+        with suppress(BusError):
+            uri = str(self._master.call("lookupNode", self.name))
+            if uri != self._uri:
+                Master(uri, self.name).call("getPid")
+                return uri
+        return None
+
+    def _add_connected(self, publishers: _Graph, subscribers: _Graph) -> set[str]:
+        """Add who is connected to us: a Master that has come anew does not know of nodes that do
+        not register again, and these go on. Returns the topics that they have with us."""
+        from rospy.impl.registration import get_topic_manager
+
+        topics = get_topic_manager()
+        found = set()
+        for graph, own, attribute in (
+            (publishers, topics.subs, "callerid_pub"),
+            (subscribers, topics.pubs, "endpoint_id"),
+        ):
+            for topic, impl in list(own.items()):
+                nodes = {getattr(peer, attribute) for peer in impl.connections}
+                if more := nodes.difference(graph.get(topic, ()), {"unknown", ""}):
+                    graph[topic] = [*graph.get(topic, ()), *sorted(more)]
+                    found.add(topic)
+        return found
+
+    def now(self) -> int:
+        rospy = self._rospy
+        if rospy is None or rospy.rostime.is_wallclock():
+            return time.time_ns()
+        return int(rospy.rostime.get_rostime().to_nsec())
+
+    def topics(self) -> dict[str, list[str]]:
+        return {
+            topic: [self._types[topic]]
+            for topic in self._publishers | self._subscribers
+            if topic in self._types
+        }
+
+    def services(self) -> dict[str, list[str]]:
+        found = services_of(self._actions)
+        for service, nodes in self._servers.items():
+            key = service, *nodes
+            ask = partial(ask_service, self._master.uri, self.name, service)
+            try:
+                name = self._service_types.get(key, ask)
+            except BusError as error:  # its node has ended without a word, most often
+                log.debug("%s is left out: %s", service, error)
+                continue
+            if name is not None:
+                found[service] = [full_name(name, "srv")]
+        self._service_types.keep({(service, *nodes) for service, nodes in self._servers.items()})
+        return found
+
+    def count(self, topic: str) -> tuple[int, int]:
+        topic = self._resolve(topic.replace(HIDDEN, "/"))
+        # One that has said to be latched counts twice, so that it is seen to be another now.
+        publishers = len(self._publishers.get(topic, ())) + len(self._latched(topic))
+        return publishers, len(self._subscribers.get(topic, ()))
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        topic = self._resolve(topic)
+        has_latched = bool(self._latched(topic))
+        found = []
+        for node, type_name in self._others(self._publishers, topic):
+            if self._is_known(type_name, node, topic):
+                # One that has said nothing yet is taken for what the others are.
+                is_latched = self._heard.get((topic, node), has_latched)
+                durability = Durability.TRANSIENT_LOCAL if is_latched else Durability.VOLATILE
+                found.append(Endpoint(node, type_name, QosProfile(durability=durability, depth=1)))
+        return found
+
+    def _latched(self, topic: str) -> list[str]:
+        """The publishers that have said to be latched."""
+        heard = list(self._heard.items())  # other threads add to it
+        return [node for (name, node), is_latched in heard if is_latched and name == topic]
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        topic = self._resolve(topic)
+        return [
+            Endpoint(node, type_name, QosProfile(depth=0))
+            for node, type_name in self._others(self._subscribers, topic)
+        ]
+
+    def _others(self, graph: _Graph, topic: str) -> list[tuple[str, str]]:
+        type_name = self._types.get(topic)
+        if type_name is None:
+            return []
+        return [(node, type_name) for node in graph.get(topic, ()) if node != self.name]
+
+    def _is_known(self, type_name: str, node: str, topic: str) -> bool:
+        """Whether it is known what the type is made of, or that it cannot be: one that is not
+        installed here is asked for."""
+        with suppress(UnknownTypeError):
+            self._definition(type_name)
+            return True
+        ask = partial(ask_publisher, self._master.uri, self.name, node, topic)
+        try:
+            told = self._definitions.get((topic, node), ask)
+        except BusError as error:
+            self._complain(type_name, f"is not installed here, and is not told: {error}")
+            return True
+        if told is not None and self._told.setdefault(type_name, told) != told:
+            self._complain(
+                type_name, f"is another for {node} than it was: restart the appliance to receive it"
+            )
+        return told is not None
+
+    def _complain(self, type_name: str, problem: str) -> None:
+        if type_name not in self._complained:
+            self._complained.add(type_name)
+            log.warning("%s %s", type_name, problem)
+
+    def _definition(self, type_name: str) -> Definition:
+        told = self._told.get(type_name)
+        return told if told is not None else _installed(type_name)
+
+    def describe(self, type_name: str) -> TypeDescription:
+        action = describe_action(type_name, self.describe)
+        if action is not None:
+            return action
+        return describe(type_name, self._definition(type_name).text)
+
+    def resolve(self, topic: str) -> str:
+        return self._resolve(topic)
+
+    def _resolve(self, name: str) -> str:
+        return str(self._rospy.resolve_name(name)) if self._arguments else name
+
+    # Subscriptions and publishers
+
+    def subscribe_raw(
+        self,
+        topic: str,
+        type_name: str,
+        qos: QosProfile,
+        callback: Callable[..., None],
+        *,
+        timed: bool = False,
+        on_loop: TakeLot | None = None,
+    ) -> RosSubscription:
+        if HIDDEN in topic:
+            return self._action_clients.subscribe(topic, type_name, callback)
+        is_latched = qos.durability is Durability.TRANSIENT_LOCAL
+        definition = self._definition(type_name)
+        topic = self._resolve(topic)
+        contained = self._contained("ros.message", callback)
+        return Subscription(self._rospy, self, topic, definition, is_latched, contained)
+
+    def hear(self, topic: str, node: str, is_latched: bool) -> bool:
+        """What a publisher says of itself; whether that is news."""
+        key = topic, node
+        before = self._heard.get(key)
+        if before is is_latched:
+            return False
+        self._heard[key] = is_latched
+        return is_latched or before is not None
+
+    def hold(self, subscription: Subscription) -> None:
+        """Have it release what it holds after the next look."""
+        self._holding[subscription] = None
+
+    def let_go(self, subscription: Subscription) -> None:
+        """It holds nothing any more."""
+        self._holding.pop(subscription, None)
+
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Publisher:
+        return Publisher(self._rospy, topic, self._definition(type_name), qos)
+
+    # Services
+
+    def action_type(self, action: str) -> str | None:
+        """The type `pkg/action/Name` of an action, None when it has no server."""
+        return self._actions.get(action)
+
+    def action_servers(self, action: str) -> list[str]:
+        """The nodes that serve an action."""
+        return self._publishers.get(f"{action}/result", [])
+
+    def create_client(self, service: str, type_name: str) -> RosClient:
+        if HIDDEN in service:
+            return self._action_clients.create_client(service, type_name)
+        return Client(self, self._resolve(service), installed_service(type_name))
+
+    @property
+    def master_uri(self) -> str:
+        """Where the Master is."""
+        return self._master.uri
+
+    def is_served(self, service: str) -> bool:
+        """Whether a service is on the graph."""
+        return service in self._servers
+
+    def doubt(self, service: str) -> None:
+        """Ask a service anew for its type: a call of it has failed."""
+        self._service_types.doubt((service, *self._servers.get(service, ())))
+
+    def create_service(
+        self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
+    ) -> Service:
+        definition = installed_service(type_name)
+        return Service(self._rospy, service, definition, callback, self.call_soon)
+
+
+@cache
+def _installed(type_name: str) -> Definition:
+    return installed(type_name)

@@ -1,0 +1,256 @@
+"""A topic from ROS to MQTT."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from time import monotonic
+
+from appliance.broker.message import Message, Watched
+from appliance.mqtt.codec import Properties, encode_property_list, encode_string
+from appliance.ros.mailbox import LARGE, Lane, Mailbox
+from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
+from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.payloads import RAW, check, packer
+from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
+from appliance.ros.topics.flows import Echo, Flow, Route, Tell
+from appliance.ros.topics.transforms import TYPES, StaticTransforms
+
+#: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
+QUIET = 1.0
+
+#: Seconds of which the messages may come at once and are not above the rate: those of a fast topic
+#: come in lots when the computer is busy.
+HELD_UP = 0.05
+
+
+class ToMqtt(Flow):
+    """From ROS to MQTT: a raw subscription, whose messages go to the mailbox as MQTT's."""
+
+    direction = "to_mqtt"
+    absence = "no node publishes it"
+
+    def __init__(
+        self,
+        route: Route,
+        ros: str,
+        converters: Converters,
+        tell: Tell,
+        mailbox: Mailbox,
+        publish: Callable[[Iterable[tuple[Lane, Message]]], None],
+    ) -> None:
+        """`publish` is how messages leave that are on the loop's thread already."""
+        super().__init__(route, ros, converters, tell)
+        settings = route.settings
+        self.echo: Echo | None = None
+        self._mailbox = mailbox
+        self._publish = publish
+        self._lane = Lane(settings.samples, self.counters)
+        self._interval = 1 / settings.rate if settings.rate else 0.0
+        self._saved_up = max(0.0, HELD_UP - self._interval)
+        self._due = 0.0
+        #: Bytes that may be sent now; fewer than none when a message was larger than that.
+        self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
+        self._budget_at = 0.0
+        #: The newest of those that were above these, and when it came. For both threads, of which
+        #: one at a time lets a message in.
+        self._held: tuple[bytes, float] | None = None
+        self._admission = threading.Lock()
+        self._subscription: RosSubscription | None = None
+        #: Whether a message was large, whatever its type says: texts and paths may be, too.
+        self._is_large = False
+        self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
+        self._transforms: StaticTransforms | None = None
+        #: What makes of a message one with all that belongs to it, before any is left out.
+        self._gather: Callable[[bytes], bytes] | None = None
+        self._topic_wire = encode_string(self.mqtt)
+        #: The properties of the last message, most often those of the next, and their bytes.
+        self._properties: Properties = {}
+        self._properties_wire = b""
+        self._qos = 0
+        self._retain = False
+
+    def __str__(self) -> str:
+        return f"{self.ros} → {self.mqtt}"
+
+    def _find(self, node: RosNode) -> list[Endpoint]:
+        return node.publishers(self.ros)
+
+    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
+        qos = subscription_qos(endpoints, self._lane.keep, self._converters.bulk(type_name))
+        if self._is_large and not mqtt_retain(qos):  # a latched one would only come once more
+            return subscription_qos(endpoints, self._lane.keep)
+        return qos
+
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        self._unsubscribe()
+        settings = self.settings
+        converter = None
+        if settings.encoding not in RAW:
+            converter = self._converters.get(type_name, settings.fields)
+            check(converter, settings.encoding, to_ros=False)
+        about = [("ros-type", type_name)]
+        if type_hash is not None:
+            about.append(("ros-type-hash", type_hash))
+        self._pack = packer(converter, settings.encoding, settings.compression, about)
+        wanted_qos, wanted_retain = settings.qos, settings.retain
+        self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
+        self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
+        self._gather = None
+        if type_name in TYPES and self._retain and mqtt_retain(qos):
+            known = self._transforms or StaticTransforms(self._converters.get(type_name))
+            self._transforms, self._gather = known, known.add
+        self._subscription = node.subscribe_raw(
+            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_lot
+        )
+        return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
+
+    def close(self) -> None:
+        self._unsubscribe()
+        self._send_held()
+
+    def _unsubscribe(self) -> None:
+        self.bridged = None
+        if self._subscription is not None:
+            self.counters.lost += self._subscription.take_lost()
+            self._subscription.destroy()
+            self._subscription = None
+
+    def look(self, node: RosNode, thorough: bool) -> bool:
+        has_changed = super().look(node, thorough)
+        if thorough and self._subscription is not None:
+            self.counters.lost += self._subscription.take_lost()
+        if self._held is not None:
+            self._catch_up(monotonic())
+        return has_changed
+
+    def lost(self) -> None:
+        super().lost()
+        self._send_held()
+        self._subscription = self._transforms = None
+
+    def on_message(self, cdr: bytes, published_at: int = 0) -> None:
+        """A message from ROS; `published_at` is known of a few, in nanoseconds since the epoch."""
+        message = self._convert(cdr, published_at)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
+
+    def on_lot(self, lot: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
+        """The same for messages that the loop's thread has taken itself. Nobody else has them then,
+        and but for those that may still be in the mailbox they go straight to the broker. Of those
+        that are late the newest goes, unless the route asks for more, or they are latched: then
+        each may be another publisher's last."""
+        lane, wanted = self._lane, self._wanted
+        is_latched = wanted is not None and mqtt_retain(wanted[1])
+        if is_late and lane.keep == 1 and not is_latched:
+            lost += len(lot) - 1
+            lot = lot[-1:]
+        self.counters.dropped += lost
+        batch = []
+        failure: Exception | None = None
+        for cdr, published_at in lot:
+            try:
+                message = self._convert(cdr, published_at)
+            except Exception as error:  # it alone is lost, and told behind the others
+                self.fail(f"ended in a fault: {error!r:.200}")
+                failure = error
+                continue
+            if message is None:
+                continue
+            if lane.waiting:
+                self._mailbox.put(lane, message)
+            else:
+                batch.append((lane, message))
+        if batch:
+            self._publish(batch)
+        if failure is not None:
+            raise failure
+
+    def _convert(self, cdr: bytes, published_at: int) -> Message | None:
+        """The message for MQTT; None for one that does not go there.
+
+        Nothing may be logged by ROS here: it would feed /rosout.
+        """
+        if len(cdr) > LARGE:
+            self._is_large = True  # the next thorough look subscribes for fewer of them
+        if self.echo is not None and self.echo.is_own(cdr):
+            return None
+        if self._gather is not None:
+            try:
+                cdr = self._gather(cdr)
+            except ConversionError as error:
+                self.fail(f"cannot be converted: {error}")
+                return None
+        if self._interval or self._bytes_per_second:
+            now = monotonic()
+            with self._admission:
+                is_admitted = self._admit(now)
+                self._held = None if is_admitted else (cdr, now)
+            if not is_admitted:
+                return None
+        return self._message(cdr, published_at)
+
+    def _catch_up(self, now: float) -> None:
+        """Send what was held back, if nothing has come since: what a topic says last holds on."""
+        with self._admission:
+            held = self._held
+            if held is None or now < held[1] + (self._interval or QUIET):
+                return
+            self.counters.throttled -= 1  # once was enough
+            if self._admit(now):
+                self._release(held[0])
+
+    def _send_held(self) -> None:
+        """Send what is held back although it is early: there will be no later."""
+        with self._admission:
+            if self._held is not None:
+                self.counters.throttled -= 1
+                self._release(self._held[0])
+
+    def _release(self, cdr: bytes) -> None:
+        self._held = None
+        message = self._message(cdr, 0)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
+
+    def _message(self, cdr: bytes, published_at: int) -> Message | None:
+        try:
+            payload, properties = self._pack(cdr)
+        except ConversionError as error:
+            self.fail(f"cannot be converted: {error}")
+            return None
+        if self._bytes_per_second:
+            self._budget -= len(payload)
+        if properties is not self._properties:
+            self._properties, self._properties_wire = properties, encode_property_list(properties)
+        message = Watched(
+            self.mqtt,
+            payload,
+            self._qos,
+            self._retain,
+            properties,
+            None,
+            self._topic_wire,
+            self._properties_wire,
+        )
+        message.watcher = self.counters
+        if published_at:
+            self._lane.timed = message, published_at
+        return message
+
+    def _admit(self, now: float) -> bool:
+        """Whether a message at that time keeps to the rate, as an average over uneven ones, and to
+        the budget of bytes, of which those of a second can be saved up."""
+        if self._bytes_per_second:
+            saved = self._budget + (now - self._budget_at) * self._bytes_per_second
+            self._budget = min(saved, self._bytes_per_second)
+            self._budget_at = now
+        if now < self._due or self._budget < 0:
+            self.counters.throttled += 1
+            return False
+        if self._interval:
+            late = now - self._due
+            if late >= self._interval:
+                late = min(late, self._saved_up)
+            self._due = now - late + self._interval
+        return True

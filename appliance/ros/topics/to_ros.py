@@ -1,0 +1,273 @@
+"""A topic from MQTT to ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Decision, Objection
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Property, quote
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.callbacks import Entries
+from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
+from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.payloads import CONTENT_TYPE, check, claim, unpacker
+from appliance.ros.qos import publisher_qos
+from appliance.ros.topics.arrivals import Arrivals
+from appliance.ros.topics.conversions import LITTLE, Turns, size_of
+from appliance.ros.topics.flows import Echo, Flow, Route, Tell
+from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
+
+#: Characters of a reason that a client is told.
+REASON_LENGTH = 500
+
+
+class AgainstRulesError(ConversionError):
+    """A message that could be converted, and that the route's rules do not let through."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a flow to ROS needs: the loop, a way to it from any thread, the broker, who commands
+    which ROS topic alone, whose turn it is to have a large message converted, and what is known of
+    how clients' commands come."""
+
+    entries: Entries
+    post: Callable[..., None]
+    broker: Broker
+    leases: Leases
+    turns: Turns
+    arrivals: Arrivals
+
+
+class ToRos(Flow):
+    """From MQTT to ROS: a publisher. `receive`, `fail` and what a Guard has are for the loop's
+    thread."""
+
+    direction = "to_ros"
+    absence = "no node subscribes to it, which would tell its type; the route can name it"
+
+    def __init__(
+        self,
+        route: Route,
+        ros: str,
+        converters: Converters,
+        tell: Tell,
+        around: Surroundings,
+    ) -> None:
+        super().__init__(route, ros, converters, tell)
+        self._around = around
+        self._is_left = True
+        self.echo: Echo | None = None
+        #: The topic's name on ROS, where a remapping gives it another.
+        self._name = ros
+        self._lease = Lease(ros)
+        #: Replaced as one, because the loop's thread reads it.
+        self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
+
+    def __str__(self) -> str:
+        return f"{self.mqtt} → {self.ros}"
+
+    def _find(self, node: RosNode) -> list[Endpoint]:
+        found = node.subscribers(self.ros)
+        if found or self.is_matched:
+            return found
+        if self.settings.type is None and self.settings.to == "both":
+            return node.publishers(self.ros)  # whoever is there knows the type
+        return found
+
+    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
+        return publisher_qos(endpoints, self.settings.samples)
+
+    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
+        settings = self.settings
+        converter = self._converters.get(type_name)
+        check(converter, settings.encoding, to_ros=True)
+        unpack = unpacker(converter, settings.encoding, settings.compression, settings.limits)
+        publisher = node.create_publisher(self.ros, type_name, qos)
+        name = node.resolve(self.ros)
+        if name != self._name:
+            self._name = name
+            self._around.post(self._share_lease)
+        before, self._out = self._out, (unpack, publisher)
+        if before is not None:
+            before[1].destroy()
+        return ""
+
+    def close(self) -> None:
+        self.bridged = None
+        before, self._out = self._out, None
+        if before is not None:
+            before[1].destroy()
+
+    def lost(self) -> None:
+        super().lost()
+        self._out = None
+
+    @property
+    def takes_retained(self) -> bool:
+        """Whether retained messages from before the route are wanted."""
+        rules = self.settings.rules
+        return rules is not None and rules.take_retained
+
+    def enter(self, before: ToRos | None) -> None:
+        """Messages are going to be received from now on; until now `before` has had them."""
+        self._is_left = False
+        self._share_lease()
+        broker = self._around.broker
+        # Also when anybody may command: the topic is then known as one that no answer goes to.
+        broker.guards.setdefault(self.mqtt, []).append(self)
+        broker.guards_changed()
+
+    def leave(self) -> None:
+        """None will be received any more; may be called twice."""
+        if self._is_left:
+            return
+        self._is_left = True
+        broker = self._around.broker
+        guards = broker.guards[self.mqtt]
+        guards.remove(self)
+        if not guards:
+            del broker.guards[self.mqtt]
+        broker.guards_changed()
+
+    def receive(
+        self, message: Message, retain: bool, origin: Session | None, number: int
+    ) -> Objection | None:
+        """A message from MQTT, of that session, which came with that number; returns what is wrong
+        with it, which is told.
+
+        With `retain` it is from before the route: it may be an old command, and does not reach ROS.
+        """
+        if retain:
+            return None
+        if self._lease.is_overtaken(number, origin):  # while it waited for its turn
+            self.counters.expired += 1
+            self._tell_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
+            return None
+        cdr = self._convert(message, origin)
+        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message, origin, number)
+
+    def _convert(self, message: Message, origin: Session | None) -> bytes | Objection:
+        """The message's CDR, or what is wrong with it, which is told."""
+        out = self._out
+        if out is None:
+            return self._object(message, f"was refused: {self._why_not()}")
+        try:
+            return self._read(out[0], message, origin)
+        except AgainstRulesError as error:
+            problem = f"was refused: {error}"
+            self.refuse(problem)
+            return self.objection(message, problem)
+        except ConversionError as error:
+            problem = f"cannot be converted: {error}"
+            return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
+
+    def _publish(
+        self, cdr: bytes, message: Message, origin: Session | None, number: int
+    ) -> Objection | None:
+        """Publish on ROS what the message was converted to; returns why that failed."""
+        out = self._out
+        if out is None:
+            return self._object(message, f"was refused: {self._why_not()}")
+        try:
+            if self.echo is not None:
+                self.echo.sent(cdr)
+            out[1].publish(cdr)
+        except BusError as error:
+            return self._object(message, f"could not be published: {error}")
+        finally:  # who says stop is not driven on, also when ROS does not take it
+            self._lease.said(cdr, number, origin, self._around.entries.time())
+        self.counters.messages += 1
+        self.counters.bytes += len(message.payload)
+        return None
+
+    def _object(
+        self,
+        message: Message,
+        problem: str,
+        code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+    ) -> Objection:
+        self.fail(problem)
+        return self.objection(message, problem, code)
+
+    def objection(
+        self,
+        message: Message,
+        problem: str,
+        code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+    ) -> Objection:
+        """What the client is told: the code, and why."""
+        return Objection(message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
+
+    def fault(self, message: Message, error: Exception) -> Objection:
+        """What the client is told when it is the appliance that failed, which is reported."""
+        self._around.broker.faults.caught("bridge.receive", error, self)
+        self.counters.errors += 1
+        return self.objection(message, "could not be carried: see the log")
+
+    # Who may publish: a Guard of the broker's
+
+    def decide(self, session: Session) -> Decision:
+        """Whether the session may publish a command now."""
+        return self._lease.decide(session)
+
+    def announced(self, message: Message, session: Session) -> None:
+        """A message of QoS 2 has come: where there are rules, its time may say something."""
+
+    def inspect(self, message: Message, session: Session) -> Objection | None:
+        """Whether a message of QoS 2 can be converted; of a large one that is found out when it is
+        its turn, unless that is now."""
+        turns = self._around.turns
+        if size_of(message.payload) <= LITTLE:
+            cdr = self._convert(message, session)
+        elif turns.is_busy:
+            return None
+        else:
+            cdr = turns.now(partial(self._convert, message, session)) or b""
+        return cdr if isinstance(cdr, Objection) else None
+
+    def refused(self, session: Session) -> None:
+        """A message of the session was refused, by this guard or another."""
+        if not self.decide(session):
+            self.counters.refused += 1
+
+    def _share_lease(self) -> None:
+        """What else goes to the topic, by whatever route and name, has the same lease."""
+        self._lease = self._around.leases.of(self._name)
+        self._around.broker.guards_changed()
+
+    def _read(
+        self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
+    ) -> bytes:
+        """The message's CDR. Raises ConversionError, also for what says to be something else."""
+        properties = message.properties
+        if properties is None:
+            return convert(message.payload)
+        wanted = self._wanted
+        claimed = claim(properties, "ros-type")
+        if wanted is not None and claimed is not None and claimed != wanted[0]:
+            problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
+            raise ConversionError("", problem)
+        try:
+            return convert(message.payload)
+        except ConversionError as error:
+            said = properties.get(Property.CONTENT_TYPE)
+            encoding = self.settings.encoding
+            if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
+                raise
+            problem = (
+                f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"
+            )
+            raise ConversionError(error.path, problem) from None
+
+    def _why_not(self) -> str:
+        if self._wanted is not None:
+            return "its type cannot be bridged"
+        if self._count is None:
+            return "ROS is not ready"
+        return f"no node subscribes to {self.ros}, which would tell its type; the route can name it"
