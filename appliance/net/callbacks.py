@@ -2,7 +2,7 @@
 
 The parts of the appliance never hand a callback to the loop itself, but here. What escapes from one
 is caught, counted and reported (`Faults`), what it served is ended by `failed`, and nothing else
-is. `tests/test_entries.py` finds callbacks that pass this by.
+is. `tests/net/test_callbacks.py` finds callbacks that pass this by.
 """
 
 from __future__ import annotations

@@ -31,6 +31,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, Repeated
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.graph import CallRoutes, Calls
+from appliance.ros.leftovers import Owners, is_of_route
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
@@ -45,7 +46,6 @@ from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.conversions import LITTLE, Turns, size_of
 from appliance.ros.topics.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
 from appliance.ros.topics.lease import Leases
-from appliance.ros.leftovers import Owners, is_of_route
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import Surroundings, ToRos
 

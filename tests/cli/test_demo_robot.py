@@ -1,4 +1,4 @@
-"""The demo robot's motion and its scanner; the node itself runs in tests/ros/test_ros2.py."""
+"""The demo robot's motion and its scanner; the node itself runs in tests/ros/ros2/test_ros2.py."""
 
 from __future__ import annotations
 

@@ -153,7 +153,7 @@ def test_another_computer_of_the_network():
     pytest.importorskip("rclpy")
     if not has_namespaces():
         pytest.skip("needs root, iproute2 and network namespaces, for two computers")
-    program = Path(__file__).with_name("two_computers.py")
+    program = Path(__file__).parents[1] / "two_computers.py"
     environment = {
         name: value
         for name, value in for_other_programs().items()

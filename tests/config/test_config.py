@@ -17,7 +17,7 @@ from appliance.app import wiring
 from appliance.broker.ports import UserLimits
 from appliance.config import Bind, ConfigError, Settings, reading
 
-REFERENCE = Path(__file__).parent.parent / "appliance.yaml"
+REFERENCE = Path(__file__).parents[2] / "appliance.yaml"
 HERE = Path("/srv/robot/appliance.yaml")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from aiohttp import web
-from test_amqtt_broker import Login, connect_of, own, running
+from test_amqtt import Login, connect_of, own, running
 from waiting import until
 
 from appliance.broker.ports import Action, Decision, Identity, Refusal

@@ -62,7 +62,7 @@ class Peer:
     async def start(self, name="peer", **environment):
         self.process = await asyncio.create_subprocess_exec(
             sys.executable,
-            str(Path(__file__).parent / "peer.py"),
+            str(Path(__file__).parents[1] / "peer.py"),
             name,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
@@ -443,7 +443,7 @@ async def test_images_pass_through_the_larger_shared_memory(house):
     await until(lambda: house.bridged(), "the node")
     assert max(size for name, size in shared_memory().items() if name not in before) > 4 << 20
     profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
-    assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent.parent]
+    assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent]
     peer = await Peer().start("camera", **profile)
     try:
         await peer.do("advertise", "/image", BYTES)

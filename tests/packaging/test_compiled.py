@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 #: The tests of what is compiled, as far as they run in their own process.
-TESTS = ["tests/broker", "tests/mqtt", "tests/test_tls.py", "tests/test_websocket.py"]
+TESTS = ["tests/broker", "tests/mqtt", "tests/net/test_tls.py", "tests/net/test_websocket.py"]
 
 #: Prints where two of the compiled modules come from.
-WHERE = "from appliance import wire; from appliance.broker import client; print(wire, client)"
+WHERE = "from appliance.broker import client; from appliance.net import tls; print(client, tls)"
 
 
 @pytest.fixture(scope="module")

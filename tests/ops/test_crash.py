@@ -140,7 +140,7 @@ def test_a_signal_whoever_else_wants_its_report(folder: Path) -> None:
     """rclpy's EventsExecutor enables the fault handler for standard error."""
     code = (
         "import faulthandler, os, sys; from pathlib import Path\n"
-        "from appliance import config, crash;"
+        "from appliance import config; from appliance.ops import crash;"
         "folder = Path(sys.argv[1]);"
         "crash.CrashReports(folder, config.loads('', folder / 'appliance.yaml')).start();"
         "faulthandler.enable(); os.abort()"

@@ -5,7 +5,8 @@ Built once for all tests, which takes a minute, and kept in `build/` until somet
 system for it, as debootstrap makes one:
 
     debootstrap --variant=minbase bookworm /tmp/bare
-    APPLIANCE_BARE_ROOT=/tmp/bare APPLIANCE_BINARY=dist/appliance pytest tests/ros/test_binary.py
+    export APPLIANCE_BARE_ROOT=/tmp/bare APPLIANCE_BINARY=dist/appliance
+    pytest tests/packaging/test_binary.py
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class Driver:
     async def start(self):
         self.process = await asyncio.create_subprocess_exec(
             sys.executable,
-            str(Path(__file__).parent / "driver.py"),
+            str(Path(__file__).parents[1] / "driver.py"),
             *self.arguments,
             env=for_other_programs(),
         )

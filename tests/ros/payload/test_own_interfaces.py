@@ -51,7 +51,7 @@ def build_workspace(folder):
     (source / "msg").mkdir(parents=True)
     for name, text in DEFINITIONS.items():
         (source / f"msg/{name}.msg").write_text(text)
-    builder = Path(__file__).parent / "interfaces.py"
+    builder = Path(__file__).parents[1] / "interfaces.py"
     arguments = [source, prefix, "rover_msgs", "std_msgs", "builtin_interfaces"]
     built = subprocess.run(
         [sys.executable, builder, *arguments],

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 from raw_client import RawClient
+from service.supervisor import NotifySocket, Supervised
 from waiting import eventually
 
 from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries
 from appliance.ops.control import ask
 from appliance.ops.sd_notify import Notifier
-from service.supervisor import NotifySocket, Supervised
 
 WATCHDOG = 1.0
 

@@ -17,7 +17,7 @@ import pytest
 from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries, contained, shield
 
-PACKAGE = Path(__file__).parents[1] / "appliance"
+PACKAGE = Path(__file__).parents[2] / "appliance"
 
 #: The one module that may hand callbacks to the loop.
 ENTRIES = PACKAGE / "entries.py"
