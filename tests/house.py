@@ -20,9 +20,9 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.connection import ClientProtocol
+from appliance.net.connection import ClientConnection
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
-from appliance.net.scheduler import Network
+from appliance.net.scheduler import Scheduler
 from appliance.store import MemoryStore
 
 
@@ -69,7 +69,7 @@ class House:
         return self.listeners
 
     @property
-    def network(self) -> Network:
+    def network(self) -> Scheduler:
         return self.listeners.network
 
     async def _ask(
@@ -133,7 +133,7 @@ class House:
         assert self.network.output == 0
         check_network(self.network)
 
-    def protocol(self, client_id: str) -> ClientProtocol:
+    def protocol(self, client_id: str) -> ClientConnection:
         """The server's end of a client's connection."""
         for protocol in self.network.open:
             session = protocol._client.session
@@ -142,7 +142,7 @@ class House:
         raise AssertionError(f"{client_id} is not connected")
 
 
-def check_network(network: Network) -> None:
+def check_network(network: Scheduler) -> None:
     """`check_accounts`, with what the connections hold of what came in and of what goes out."""
     strangers = network.broker.ledger.accounts.strangers
     accounts = {strangers} | {protocol.account for protocol in network.open}

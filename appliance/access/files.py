@@ -17,7 +17,7 @@ from appliance.access.checks import BusyError, Checks
 from appliance.access.passwords import Passwords
 from appliance.access.problems import AccessFileError, Problem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
-from appliance.access.throttle import Guesses, Recent
+from appliance.access.throttle import LoginThrottle, Recent
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
 from appliance.host.addresses import network
 from appliance.mqtt.codec import quote
@@ -121,7 +121,7 @@ class FileAccess:
     changes: when all clients come back at once, nothing is hashed again, however many users, and
     no guesser is in their way.
 
-    Other logins are guesses until they are checked: see `Guesses`. When an address has made so many
+    Other logins are guesses until they are checked: see `LoginThrottle`. When an address has made so many
     wrong ones that the next would wait too long, it is told to come again (0x89), and nothing is
     hashed. Who then comes again with the same password waits in a line of its own: a guesser tries
     others. A password that was found wrong is no guess when it comes again, but a device that was
@@ -159,7 +159,7 @@ class FileAccess:
         self._checking: dict[tuple[bytes, bytes], asyncio.Task[str | Refusal | None]] = {}
         self._closed = False
         self._patience = patience
-        self.guesses = Guesses(failed_logins)
+        self.guesses = LoginThrottle(failed_logins)
         # One of two cores stays with the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._checks: Checks[str | None] = Checks(workers, max_waiting)

@@ -39,7 +39,7 @@ class _Failures:
     free_at: dict[str, float] = field(default_factory=dict)
 
 
-class Guesses:
+class LoginThrottle:
     """How long a login has to wait before its password is looked at.
 
     Of one address there is one guess after the other, the slower the more were wrong: `allowed` of

@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from appliance.broker.ledger import Ledger
+    from appliance.broker.accounting import Accounting
     from appliance.broker.session import Session
 
 #: Seconds in which a full queue has to drain for its reader to be waited for.
@@ -88,7 +88,7 @@ class Congestion:
         "awaited",
     )
 
-    def __init__(self, session: Session, ledger: Ledger) -> None:
+    def __init__(self, session: Session, ledger: Accounting) -> None:
         self._session = session
         self._ledger = ledger
         self._a_message = PATIENCE / ledger.limits.queue_messages

@@ -15,11 +15,10 @@ from dataclasses import replace
 from datetime import timedelta
 from typing import Protocol, TypeAlias
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.backpressure import Congestion
-from appliance.broker.complaints import Complaints
 from appliance.broker.faults import Faults
-from appliance.broker.ledger import Ledger
 from appliance.broker.message import Heads, Late, Message
 from appliance.broker.ports import (
     Access,
@@ -33,9 +32,16 @@ from appliance.broker.ports import (
     Observer,
     Store,
 )
+from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.retained import Retained
-from appliance.broker.routing import Route, Router
-from appliance.broker.session import Delivery, Held, PendingWill, Session, subscription_size
+from appliance.broker.routing import Fanout, Router
+from appliance.broker.session import (
+    Delivery,
+    PendingWill,
+    Session,
+    UnreleasedPublish,
+    subscription_size,
+)
 from appliance.broker.shared import Share, Target
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
@@ -128,12 +134,12 @@ class Broker:
         self.store = store
         self.limits = limits or Limits()
         self.features = features or Features()
-        self.complaints = Complaints()
+        self.complaints = RateLimitedLog()
         #: When `tick` was last through.
         self.ticked_at = -math.inf
         #: What escaped somewhere, and was caught where it entered.
         self.faults = Faults(self.complaints)
-        self.ledger = Ledger(self.limits, store, faults=self.faults)
+        self.ledger = Accounting(self.limits, store, faults=self.faults)
         #: What the broker counts.
         self.counters = self.ledger.counters
         self.sessions: dict[str, Session] = {}
@@ -534,7 +540,7 @@ class Broker:
         """Whether the rules in force let the session receive the topic's messages."""
         return self.router.may_receive(session, topic)
 
-    def route(self, session: Session, topic_wire: bytes) -> Route:
+    def route(self, session: Session, topic_wire: bytes) -> Fanout:
         """See `Router.route`."""
         return self.router.route(session, topic_wire)
 
@@ -581,7 +587,7 @@ class Broker:
             self.ledger.refusing = True
 
     def publish_to(
-        self, targets: list[Target], route: Route, message: Message, origin: Session
+        self, targets: list[Target], route: Fanout, message: Message, origin: Session
     ) -> ReasonCode:
         """`publish`, for who has the message's route already: to these of its targets."""
         if not route.allowed:
@@ -658,7 +664,7 @@ class Broker:
                 return objection
         return None
 
-    def shortage(self, route: Route, message: Message, origin: Session) -> str:
+    def shortage(self, route: Fanout, message: Message, origin: Session) -> str:
         """Why a message was refused for want of room (0x97), in words for its publisher."""
         if message.retain and message.payload:
             shortage = self.retained.shortage(message, origin.account)
@@ -670,7 +676,7 @@ class Broker:
         why = f": {reader.shortage(message.size)}" if reader is not None else ""
         return f"nobody who subscribed to its topic has room for it{why}"
 
-    def without_room(self, route: Route, message: Message) -> tuple[frozenset[Receiver], bool]:
+    def without_room(self, route: Fanout, message: Message) -> tuple[frozenset[Receiver], bool]:
         """Who could not keep a QoS 2 message now, and whether that is everybody.
 
         It can be refused only as a whole, at its PUBREC: so it is when nobody has room. When some
@@ -693,7 +699,7 @@ class Broker:
             is_taken |= any(not qos and session.link is not None for session, qos, _, _ in members)
         return frozenset(full), bool(full) and not is_taken
 
-    def congestions(self, route: Route, message: Message) -> list[Congestion]:
+    def congestions(self, route: Fanout, message: Message) -> list[Congestion]:
         """Those readers of a QoS 1 or 2 message that have no room for it, but soon will.
 
         Of a group that is one of these if nobody in it has room.
@@ -718,12 +724,12 @@ class Broker:
         congestions = [session.congestion for session in full]
         return [each for each in congestions if each is not None and each.patience()]
 
-    def _count_looks(self, route: Route) -> None:
+    def _count_looks(self, route: Fanout) -> None:
         """All receivers of a route are asked, each on its own."""
         looks = len(route.targets) + sum(len(members) for _, members in route.shares)
         self.counters.effort += looks // LOOKS_FOR_ONE
 
-    def must_store(self, route: Route, message: Message, origin: Session) -> bool:
+    def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""
         self._count_looks(route)
         return (
@@ -733,7 +739,7 @@ class Broker:
             or any(qos and session.persistent for _, m in route.shares for session, qos, _, _ in m)
         )
 
-    def release(self, held: Held, origin: Session, age: float) -> None:
+    def release(self, held: UnreleasedPublish, origin: Session, age: float) -> None:
         """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
 
         `age` is in seconds from its coming.
@@ -772,7 +778,7 @@ class Broker:
                 shares.append((share, members))
         self.publish_to(targets, replace(route, shares=shares), message, origin)
 
-    def refuse_publish(self, session: Session, route: Route, message: Message) -> None:
+    def refuse_publish(self, session: Session, route: Fanout, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
         self.counters.effort += REFUSAL_EFFORT

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
+from appliance.broker.accounting import EFFORT_A_TURN
 from appliance.broker.backpressure import (
     LEAST_COUNTED,
     MESSAGE_PATIENCE,
@@ -29,12 +30,11 @@ from appliance.broker.handshake import (
     pending_will,
 )
 from appliance.broker.inflow import Inflow
-from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import OVERHEAD, Late, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
-from appliance.broker.ports import INSIDE, Exchange, Identity, Question, Refusal, Wire
-from appliance.broker.routing import Route
-from appliance.broker.session import Held, Session
+from appliance.broker.ports import INSIDE, Exchange, Identity, Question, Refusal, Transport
+from appliance.broker.routing import Fanout
+from appliance.broker.session import Session, UnreleasedPublish
 from appliance.broker.subscribing import Awaited, Step, answers, subscribe, unsubscribe
 from appliance.mqtt.codec import (
     V5,
@@ -115,7 +115,7 @@ _TOLD: Final = frozenset(
 class Client:
     """One network connection: does what its packets say; what it is sent goes through `output`."""
 
-    def __init__(self, broker: Broker, wire: Wire) -> None:
+    def __init__(self, broker: Broker, wire: Transport) -> None:
         self.broker = broker
         self.wire = wire
         limits = broker.limits
@@ -373,7 +373,7 @@ class Client:
                 reason = self._reason(code, route, message) if code >= 0x80 else ""
                 self.output.acknowledge(0x40, packet_id, code, reason)
 
-    def _reason(self, code: int, route: Route, message: Message) -> str:
+    def _reason(self, code: int, route: Fanout, message: Message) -> str:
         """Why a message was refused, in words, if the client is told any."""
         session = self.session
         if session is None or self._version != 5 or not self.output.explains:
@@ -393,7 +393,7 @@ class Client:
         return True
 
     def _hold(
-        self, route: Route, size: int, publish: Callable[[Any], None], packet: object
+        self, route: Fanout, size: int, publish: Callable[[Any], None], packet: object
     ) -> bool:
         """Let a PUBLISH, and all behind it, wait until it is known where it may go; False when it
         has waited, or nobody is asked about it.
@@ -444,7 +444,7 @@ class Client:
         self._begin(work())
         return True
 
-    def _is_asked_about(self, route: Route) -> bool:
+    def _is_asked_about(self, route: Fanout) -> bool:
         """Whether somebody is asked about the client itself, or another of its user."""
         identity = self.session.identity if self.session is not None else None
         return identity is not None and any(
@@ -467,7 +467,7 @@ class Client:
 
     # --- backpressure: see the module of that name ---------------------------------------------
 
-    def _must_wait(self, arrived: Arrived, message: Message, route: Route) -> bool:
+    def _must_wait(self, arrived: Arrived, message: Message, route: Fanout) -> bool:
         """Let the message wait if readers have no room for it, and soon will."""
         congestions = self.broker.congestions(route, message) if route.allowed else []
         allowance = self._allowance
@@ -607,7 +607,7 @@ class Client:
             self._refuse_qos2(packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
 
     def _on_publish_qos2(
-        self, session: Session, packet_id: int, message: Message, route: Route
+        self, session: Session, packet_id: int, message: Message, route: Fanout
     ) -> None:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         self._counters.effort += HELD_EFFORT
@@ -652,7 +652,7 @@ class Client:
             if everybody and refuses:
                 code = ReasonCode.QUOTA_EXCEEDED
                 self._counters.publish_dropped += 1
-            elif not session.hold(packet_id, Held(message, full, self.wire.now())):
+            elif not session.hold(packet_id, UnreleasedPublish(message, full, self.wire.now())):
                 code = ReasonCode.QUOTA_EXCEEDED
                 shortage = session.shortage(message.size)
                 reason = f"no room for its unfinished QoS 2 messages: {shortage}"
@@ -1121,7 +1121,7 @@ class Client:
         else:
             self._make_sure()
 
-    def let_go(self, wire: Wire) -> None:
+    def let_go(self, wire: Transport) -> None:
         """The connection is gone, and not to be held any longer: `wire` stands for it now."""
         self.wire = self.output.wire = wire
 

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable
 from typing import TypeVar
 
-from appliance.broker.complaints import Complaints
+from appliance.broker.rate_limited_log import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ class Faults:
     place in the code, and it is its own affair how many there may be in all.
     """
 
-    def __init__(self, complaints: Complaints | None = None) -> None:
+    def __init__(self, complaints: RateLimitedLog | None = None) -> None:
         #: Seconds of the broker's clock.
         self.now = 0.0
         #: How many there were since the start; in all, and by entry.
@@ -44,7 +44,7 @@ class Faults:
         #: The last report that was written.
         self.reported = ""
         self.report: Callable[[BaseException, str], object] = _no_report
-        self._complaints = complaints or Complaints()
+        self._complaints = complaints or RateLimitedLog()
         self._places: set[str] = set()
 
     def caught(self, entry: str, error: BaseException, served: object = "") -> None:

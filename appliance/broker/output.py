@@ -7,7 +7,7 @@ from typing import Protocol, cast
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Contact, Objection, Wire
+from appliance.broker.ports import Contact, Objection, Transport
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Disconnect, Packet, Puback, Pubrec, Suback
@@ -53,10 +53,10 @@ class Talker(Protocol):
 class Output:
     """The way to one network client; the `Link` of its session once it has logged in.
 
-    What it is sent is collected, and goes to the `Wire` at the flush.
+    What it is sent is collected, and goes to the `Transport` at the flush.
     """
 
-    def __init__(self, broker: Broker, wire: Wire, client: Talker) -> None:
+    def __init__(self, broker: Broker, wire: Transport, client: Talker) -> None:
         self.wire = wire
         self.writable = True
         self.session: Session | None = None

@@ -14,7 +14,7 @@ from appliance.mqtt.reason import ReasonCode
 if TYPE_CHECKING:
     from appliance.broker.accounts import Account
     from appliance.broker.message import Message
-    from appliance.broker.session import Delivery, Held, Session
+    from appliance.broker.session import Delivery, Session, UnreleasedPublish
     from appliance.mqtt.packets import Connect
 
 
@@ -283,7 +283,7 @@ class Store(Protocol):
     def completed(self, session: Session, packet_id: int) -> None:
         """PUBCOMP came."""
 
-    def held(self, session: Session, packet_id: int, held: Held) -> None:
+    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
         """A QoS 2 message of the session's client waits for its PUBREL."""
 
     def unheld(self, session: Session, packet_id: int) -> None:
@@ -352,7 +352,7 @@ class Secured:
     certificate: str = ""
 
 
-class Wire(Protocol):
+class Transport(Protocol):
     """The connection under a client, as a listener implements it."""
 
     #: Where the client is, for the log: "127.0.0.1:54321".

@@ -7,10 +7,10 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from appliance.broker.accounting import EFFORT_A_TURN, Accounting
 from appliance.broker.accounts import Account
-from appliance.broker.complaints import Complaints
-from appliance.broker.ledger import EFFORT_A_TURN, Ledger
 from appliance.broker.message import Message
+from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.session import LEVEL_SIZE
 from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
@@ -45,7 +45,10 @@ class Retained:
     """
 
     def __init__(
-        self, ledger: Ledger, complaints: Complaints, changed: Callable[[Message, Account], None]
+        self,
+        ledger: Accounting,
+        complaints: RateLimitedLog,
+        changed: Callable[[Message, Account], None],
     ) -> None:
         #: Bytes of all of them, see `retained_size`.
         self.bytes = 0

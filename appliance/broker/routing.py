@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from appliance.broker.ledger import Ledger
+from appliance.broker.accounting import Accounting
 from appliance.broker.ports import Access, Action, Asked, Decision, Guard, Identity, Question
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target, as_target
@@ -40,7 +40,7 @@ _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
 
 
 @dataclass(slots=True)
-class Route:
+class Fanout:
     """What is known about one topic for one publishing session, until the epoch changes."""
 
     topic: str
@@ -62,7 +62,7 @@ class Router:
     `sessions` are all there are, by client id: what is known of topics is kept in them.
     """
 
-    def __init__(self, access: Access, ledger: Ledger, sessions: dict[str, Session]) -> None:
+    def __init__(self, access: Access, ledger: Accounting, sessions: dict[str, Session]) -> None:
         #: The rules in force.
         self.access = access
         #: Those of them who may have to ask somebody else; None where nobody has to.
@@ -120,7 +120,7 @@ class Router:
             self._subscriptions.remove(inner, topic_filter)
             del self.shares[topic_filter]
 
-    def route(self, session: Session, topic_wire: bytes) -> Route:
+    def route(self, session: Session, topic_wire: bytes) -> Fanout:
         """Where messages of the session to the topic go, looked up once an epoch.
 
         Raises:
@@ -148,7 +148,7 @@ class Router:
             session.routes.clear()
             session.readable.clear()
 
-    def _find_route(self, session: Session, topic_wire: bytes) -> Route:
+    def _find_route(self, session: Session, topic_wire: bytes) -> Fanout:
         topic, _ = decode_string(topic_wire, 0)
         try:
             check_topic(topic)
@@ -161,7 +161,7 @@ class Router:
         finally:
             self._undecided = None
 
-    def _decide_route(self, session: Session, topic: str, undecided: list[Question]) -> Route:
+    def _decide_route(self, session: Session, topic: str, undecided: list[Question]) -> Fanout:
         decision = self._may_publish(session, topic)
         if decision and topic in self.guards:
             verdicts = [
@@ -172,7 +172,7 @@ class Router:
         self._counters.effort += ROUTE_EFFORT
         matches = self._match(topic) if decision else []
         targets, shares = self._targets(session, topic, matches)
-        return Route(
+        return Fanout(
             topic, decision.allowed, decision.reason, targets, shares, bool(matches), undecided
         )
 
@@ -285,7 +285,7 @@ class Router:
         return self.decide(session.identity, Action.RECEIVE, topic).pending
 
 
-def _route_size(route: Route, topic_wire: bytes) -> int:
+def _route_size(route: Fanout, topic_wire: bytes) -> int:
     """Bytes that a route takes in the cache of its session."""
     size = ROUTE_SIZE + text_size(route.topic) + len(topic_wire)
     members = [target for _, members in route.shares for target in members]

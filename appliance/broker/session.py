@@ -8,8 +8,8 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.backpressure import Congestion
-from appliance.broker.ledger import Ledger
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Link
 from appliance.mqtt.codec import text_size
@@ -17,7 +17,7 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 if TYPE_CHECKING:
-    from appliance.broker.routing import Route
+    from appliance.broker.routing import Fanout
     from appliance.broker.shared import Share
 
 
@@ -65,7 +65,7 @@ def subscription_size(topic_filter: str) -> int:
 _NUMBERS = itertools.count()
 
 
-class Held(NamedTuple):
+class UnreleasedPublish(NamedTuple):
     """A QoS 2 message that waits for PUBREL, and who had no room for it at its PUBREC."""
 
     message: Message
@@ -74,7 +74,7 @@ class Held(NamedTuple):
     since: float = -math.inf
 
 
-def held_size(held: Held) -> int:
+def held_size(held: UnreleasedPublish) -> int:
     """Bytes that are counted for it."""
     return held.message.size + HELD_SIZE + FULL_SIZE * len(held.full)
 
@@ -136,7 +136,7 @@ class Session:
         "window",
     )
 
-    def __init__(self, client_id: str, identity: Identity | None, ledger: Ledger) -> None:
+    def __init__(self, client_id: str, identity: Identity | None, ledger: Accounting) -> None:
         self.client_id = client_id
         self.identity = identity
         self.ledger = ledger
@@ -179,7 +179,7 @@ class Session:
         #: is kept.
         self.large: dict[str | int, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
-        self.received: dict[int, Held] = {}
+        self.received: dict[int, UnreleasedPublish] = {}
         self.bytes = 0
         #: Whether the access rules have changed since they let in what waits.
         self.unchecked = False
@@ -187,7 +187,7 @@ class Session:
         self.readable: dict[str, bool] = {}
         self.readable_epoch = -1
         #: Where this session's messages go, by topic; valid while `epoch` is the broker's.
-        self.routes: dict[bytes, Route] = {}
+        self.routes: dict[bytes, Fanout] = {}
         self.epoch = -1
         self._last_packet_id = 0
 
@@ -466,7 +466,7 @@ class Session:
         self,
         inflight: dict[int, Delivery | None],
         queue: list[Delivery],
-        received: dict[int, Held],
+        received: dict[int, UnreleasedPublish],
     ) -> None:
         """Owe again what the session was owed when the broker ended."""
         self.inflight.update(inflight)
@@ -692,7 +692,7 @@ class Session:
 
     # --- QoS 2 from the client -----------------------------------------------------------------
 
-    def hold(self, packet_id: int, held: Held) -> bool:
+    def hold(self, packet_id: int, held: UnreleasedPublish) -> bool:
         """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
         if not self.fits(held_size(held)):
             return False
@@ -708,7 +708,7 @@ class Session:
         for packet_id, held in self.received.items():
             self.received[packet_id] = held._replace(since=-math.inf)
 
-    def unhold(self, packet_id: int) -> Held | None:
+    def unhold(self, packet_id: int) -> UnreleasedPublish | None:
         """The message that PUBREL releases, once."""
         held = self.received.pop(packet_id, None)
         if held is not None:

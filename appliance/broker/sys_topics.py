@@ -12,7 +12,7 @@ PREFIX = "$SYS/broker/"
 _WINDOWS = (1, 5, 15)
 
 
-class Load:
+class LoadAverage:
     """Moving averages a minute of a growing counter, over 1, 5 and 15 minutes, as `uptime` does."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class SysTopics:
         self._version = version
         self._started_at = broker.now
         self._updated_at = broker.now
-        self._loads: dict[str, Load] = {}
+        self._loads: dict[str, LoadAverage] = {}
         self._sent: dict[str, str] = {}
 
     def update(self) -> list[tuple[str, bytes]]:
@@ -110,7 +110,7 @@ class SysTopics:
             "connections": counters.connects,
             "sockets": counters.sockets,
         }.items():
-            load = self._loads.setdefault(name, Load())
+            load = self._loads.setdefault(name, LoadAverage())
             if seconds > 0:
                 load.update(value, seconds)
             values |= {f"load/{name}/{minutes}": text for minutes, text in load.values()}

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from appliance.cli.connection import Reach, connecting
+from appliance.cli.connection import CallTarget, connecting
 from appliance.cli.console import CommandError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ param_app = typer.Typer(no_args_is_help=True, help="Parameters of the robot's no
 
 
 @contextmanager
-def _caller(reach: Reach) -> Iterator[Caller]:
+def _caller(reach: CallTarget) -> Iterator[Caller]:
     from appliance.cli.mqtt_client import ClientError
     from appliance.cli.rpc_client import Caller
 
@@ -66,7 +66,7 @@ def _print(line: bytes) -> None:
 
 @connecting
 def call(
-    reach: Reach,
+    reach: CallTarget,
     service: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
     request: Annotated[
         str, typer.Argument(metavar="JSON", help="The request's fields; - is standard input.")
@@ -89,7 +89,7 @@ def call(
 
 @connecting
 def goal(
-    reach: Reach,
+    reach: CallTarget,
     action: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
     fields: Annotated[
         str, typer.Argument(metavar="JSON", help="The goal's fields; - is standard input.")
@@ -157,7 +157,7 @@ ShownTimeout = Annotated[
 @param_app.command("get")
 @connecting
 def param_get(
-    reach: Reach,
+    reach: CallTarget,
     node: NodeArgument,
     name: Annotated[str, typer.Argument(help="The parameter.")],
     timeout: ShownTimeout = 3.0,
@@ -176,7 +176,7 @@ def param_get(
 
 @param_app.command("list")
 @connecting
-def param_list(reach: Reach, node: NodeArgument, timeout: ShownTimeout = 3.0) -> None:
+def param_list(reach: CallTarget, node: NodeArgument, timeout: ShownTimeout = 3.0) -> None:
     """Print a node's parameters and their values, one a line.
 
     Example: appliance param list -u alice /controller
@@ -200,7 +200,7 @@ def _not_shown(topic: str, timeout: float) -> str:
 @param_app.command("set")
 @connecting
 def param_set(
-    reach: Reach,
+    reach: CallTarget,
     node: NodeArgument,
     name: Annotated[str, typer.Argument(help="The parameter.")],
     value: Annotated[str, typer.Argument(help="Its value, as JSON or YAML.")],

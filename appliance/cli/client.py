@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.connection import Connection, connecting
+from appliance.cli.connection import ConnectionOptions, connecting
 from appliance.cli.console import CommandError
 
 _EXPLAINED = "On the robot, `appliance acl explain USER TOPIC` says which rule decides it."
@@ -17,7 +17,7 @@ _EXPLAINED = "On the robot, `appliance acl explain USER TOPIC` says which rule d
 
 @connecting
 def pub(
-    connection: Connection,
+    connection: ConnectionOptions,
     topic: str,
     message: Annotated[
         str | None, typer.Option("--message", "-m", help="The payload; else standard input.")
@@ -55,7 +55,7 @@ def pub(
 
 @connecting
 def sub(
-    connection: Connection,
+    connection: ConnectionOptions,
     filters: Annotated[list[str], typer.Argument(metavar="FILTER...")],
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="The topic before each payload.")

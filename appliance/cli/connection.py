@@ -21,7 +21,7 @@ _HERE = "localhost"
 
 
 @dataclass(frozen=True)
-class Connection:
+class ConnectionOptions:
     """The options of a command that connects; what none says is the configuration's, if any."""
 
     host: Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")] = _HERE
@@ -114,7 +114,7 @@ class Connection:
 
 
 @dataclass(frozen=True)
-class Reach(Connection):
+class CallTarget(ConnectionOptions):
     """The options of a command that is about a robot."""
 
     robot: Annotated[
@@ -144,7 +144,7 @@ def _is_configured() -> bool:
 
 
 def connecting(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options that its first argument, a `Connection`, is made of."""
+    """The command with the options that its first argument, a `ConnectionOptions`, is made of."""
     first, *own = inspect.signature(command, eval_str=True).parameters.values()
     options = inspect.signature(first.annotation, eval_str=True).parameters
 

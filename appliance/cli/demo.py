@@ -28,17 +28,17 @@ STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class TourError(Exception):
+class DemoError(Exception):
     """The demo cannot start; the message says why and what to do."""
 
 
 def run(settings: Settings) -> int:
     """Runs broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
     if not any(listener.is_mqtts for listener in settings.broker.listeners):
-        raise TourError("the demo needs a listener with tls: true")
+        raise DemoError("the demo needs a listener with tls: true")
     with contextlib.suppress(ControlError):
         pid = ask(settings.control, "status")["pid"]
-        raise TourError(f"this demo runs already, as process {pid}; Ctrl-C in its terminal ends it")
+        raise DemoError(f"this demo runs already, as process {pid}; Ctrl-C in its terminal ends it")
     for listener in settings.broker.listeners:
         if listener.bind.path is None:
             _check_free(listener.bind)
@@ -47,10 +47,10 @@ def run(settings: Settings) -> int:
 
 
 async def _main(settings: Settings) -> None:
-    await Tour(settings).run()
+    await Demo(settings).run()
 
 
-class Tour(App):
+class Demo(App):
     """The appliance with a demo robot beside it, which starts and stops with it."""
 
     def __init__(self, settings: Settings) -> None:
@@ -88,7 +88,7 @@ def _check_free(bind: Bind) -> None:
         try:
             trial.bind((bind.host, bind.port))
         except OSError as error:
-            raise TourError(
+            raise DemoError(
                 f"{bind} cannot be used: {(error.strerror or str(error)).lower()}. Another broker "
                 "may run there; choose other ports: make run PORT=9883 PLAIN_PORT=9884"
             ) from None

@@ -136,7 +136,7 @@ def demo(config: ConfigOption = None) -> None:
     try:
         with _start_errors():
             raise typer.Exit(tour.run(settings))
-    except tour.TourError as error:
+    except tour.DemoError as error:
         raise CommandError(str(error)) from None
 
 

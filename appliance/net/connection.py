@@ -22,7 +22,7 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net import lingering as farewell
 from appliance.net import tls
 from appliance.net.callbacks import contained, contained_made
-from appliance.net.scheduler import PUBLISH_BURST, Network
+from appliance.net.scheduler import PUBLISH_BURST, Scheduler
 from appliance.net.sockets import Probe, contact, inbox
 from appliance.net.websocket import WebSocket
 
@@ -72,14 +72,14 @@ REVOKED_TIMEOUT = 1.0
 _NOTHING = memoryview(b"")
 
 
-class ClientProtocol:
+class ClientConnection:
     """One connection: bytes to the `Client`, and as its `Wire` bytes from it.
 
     It is an `asyncio.Protocol` without being derived from it, which makes it faster when compiled.
     """
 
     def __init__(
-        self, network: Network, address: str, host: str, anonymous: bool | None = None
+        self, network: Scheduler, address: str, host: str, anonymous: bool | None = None
     ) -> None:
         self.address = address
         self._anonymous = anonymous  # what its listener says of clients without a user name

@@ -14,7 +14,7 @@ BYTES = 64 * 1024 * 1024
 _SCRATCH = bytearray(256 * 1024)
 
 
-class Farewell:
+class LingeringClose:
     """A connection after its last byte was written, until the other side has closed it as well.
 
     To close a socket that has unread input is to reset the connection, and that may take from the
@@ -23,7 +23,7 @@ class Farewell:
     """
 
     def __init__(
-        self, connection: socket.socket, ended: Callable[[Farewell], None], entries: Entries
+        self, connection: socket.socket, ended: Callable[[LingeringClose], None], entries: Entries
     ) -> None:
         self._socket = connection
         self._ended = ended

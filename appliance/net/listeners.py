@@ -18,8 +18,8 @@ from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
 from appliance.host.addresses import network
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.connection import ClientProtocol
-from appliance.net.scheduler import FAREWELLS, Authenticate, Certificates, Member, Network
+from appliance.net.connection import ClientConnection
+from appliance.net.scheduler import FAREWELLS, Authenticate, Certificates, Member, Scheduler
 from appliance.net.sockets import allow_files, listen, listen_on_path
 
 log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ class Listeners:
         self.broker = broker
         self.admission = admission
         self._addresses = _Addresses(admission)
-        self.network = Network(
+        self.network = Scheduler(
             broker,
             authenticate,
             exchange,
@@ -119,7 +119,7 @@ class Listeners:
             certificates=certificates,
         )
         self._doors: list[_Door] = []
-        self._handshakes: set[ClientProtocol] = set()
+        self._handshakes: set[ClientConnection] = set()
         self._stall: asyncio.TimerHandle | None = None
 
     @property
@@ -212,7 +212,7 @@ class Listeners:
             if self.broker.journal is not None:
                 self.broker.journal.refused(address, refusal)
             return
-        protocol = ClientProtocol(self.network, address, host, listener.anonymous)
+        protocol = ClientConnection(self.network, address, host, listener.anonymous)
         self.network.open.add(protocol)
         self._addresses.came(protocol)
         context = None
@@ -224,7 +224,7 @@ class Listeners:
 
     async def _begin(
         self,
-        protocol: ClientProtocol,
+        protocol: ClientConnection,
         connection: socket.socket,
         context: ssl.SSLContext | None,
         is_websocket: bool,

@@ -17,7 +17,7 @@ from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.host.clock import SpareClock
 from appliance.mqtt.packets import Connect
 from appliance.net.callbacks import Entries
-from appliance.net.lingering import Farewell
+from appliance.net.lingering import LingeringClose
 from appliance.net.turns import Charged, Turn
 
 #: Messages that are few: after more than these it is checked whether who sends them has to wait.
@@ -38,7 +38,7 @@ UNLOOKED = 300
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
 
-#: Closed connections that are listened to at a time, see `Farewell`.
+#: Closed connections that are listened to at a time, see `LingeringClose`.
 FAREWELLS = 256
 
 #: Who sent this CONNECT, from this address, over this TLS connection, if it is one; and does its
@@ -92,7 +92,7 @@ class Doorkeeper(Protocol):
         """It has ended, once."""
 
 
-class Network:
+class Scheduler:
     """All connections, and what they share; the doorkeeper is told what becomes of each.
 
     `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
@@ -132,7 +132,7 @@ class Network:
         self._counting = False
         #: What each account has caused beyond the end of the round.
         self._beyond: dict[Account, int] = {}
-        self._farewells: set[Farewell] = set()
+        self._farewells: set[LingeringClose] = set()
         self._all_closed: asyncio.Event | None = None
 
     def use(self, connect_timeout: float, publish_rate: float) -> None:
@@ -300,15 +300,15 @@ class Network:
         self._tell_when_all_closed()
 
     def part(self, connection: socket.socket) -> None:
-        """Close a connection whose last bytes are on their way, see `Farewell`."""
+        """Close a connection whose last bytes are on their way, see `LingeringClose`."""
         if len(self._farewells) < FAREWELLS:
-            farewell = Farewell(connection, self._parted, self.entries)
+            farewell = LingeringClose(connection, self._parted, self.entries)
             self._farewells.add(farewell)
             farewell.listen()
         else:
             connection.close()
 
-    def _parted(self, farewell: Farewell) -> None:
+    def _parted(self, farewell: LingeringClose) -> None:
         self._farewells.discard(farewell)
         self._tell_when_all_closed()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.session import Session
-from appliance.net.scheduler import Network
+from appliance.net.scheduler import Scheduler
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ class Pulse:
     """
 
     def __init__(
-        self, broker: Broker, network: Network, session: Session, time: Callable[[], float]
+        self, broker: Broker, network: Scheduler, session: Session, time: Callable[[], float]
     ) -> None:
         self._broker = broker
         self._network = network

@@ -43,8 +43,8 @@ from appliance.ros.skipped import Skip, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
 from appliance.ros.topics.arrivals import Arrivals
 from appliance.ros.topics.commands import Commands
-from appliance.ros.topics.conversions import LITTLE, Turns, size_of
-from appliance.ros.topics.flows import Bridged, Direction, Echo, Flow, Route, RouteSettings
+from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
+from appliance.ros.topics.flows import Bridged, BridgeRoute, Direction, Echo, Flow, RouteSettings
 from appliance.ros.topics.lease import Leases
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import Surroundings, ToRos
@@ -130,7 +130,7 @@ class Bridge:
         self._owners: Owners | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
-        self._turns = Turns(entries, broker.ledger)
+        self._turns = ConversionQueue(entries, broker.ledger)
         self._around = Surroundings(entries, self._post, broker, Leases(), self._turns, Arrivals())
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None
@@ -139,8 +139,8 @@ class Bridge:
         self._announced = b""
         self._announced_skips = b""
         #: Replaced as one by the loop's thread; the ROS thread follows at its next look.
-        self._routes: list[Route] = []
-        self._followed: list[Route] | None = None
+        self._routes: list[BridgeRoute] = []
+        self._followed: list[BridgeRoute] | None = None
         #: Topics that have a route by name, which goes before patterns.
         self._named: dict[Direction, set[str]] = {"to_mqtt": set(), "to_ros": set()}
         #: The topics when patterns were last matched, and those that no pattern took.
@@ -178,13 +178,13 @@ class Bridge:
     def replace(self, routes: Iterable[RouteSettings]) -> None:
         """Carry these routes from now on; one that was there before does not notice."""
         known = {(route.settings, route.direction): route for route in self._routes}
-        wanted: list[Route] = []
+        wanted: list[BridgeRoute] = []
         directions: tuple[tuple[Direction, str], ...] = (("to_ros", "mqtt"), ("to_mqtt", "ros"))
         for settings in routes:
             for direction, other in directions:
                 if settings.to != other:
                     route = known.get((settings, direction))
-                    wanted.append(route or Route(settings, direction))
+                    wanted.append(route or BridgeRoute(settings, direction))
         self._named = {
             direction: {
                 route.settings.names[0]
@@ -196,7 +196,7 @@ class Bridge:
         self._receive_for(wanted)
         self._routes = wanted
 
-    def _receive_for(self, routes: list[Route]) -> None:
+    def _receive_for(self, routes: list[BridgeRoute]) -> None:
         flows: dict[tuple[str, str], ToRos] = {}
         for route in routes:
             if route.direction != "to_ros" or route.is_pattern:
@@ -234,7 +234,7 @@ class Bridge:
         self._matched = flows
         self._receive_for(self._routes)
 
-    def _new_to_ros(self, route: Route, ros: str) -> ToRos:
+    def _new_to_ros(self, route: BridgeRoute, ros: str) -> ToRos:
         kind = ToRos if route.settings.rules is None else Commands
         return kind(route, ros, self._converters, self._tell, self._around)
 
@@ -259,7 +259,7 @@ class Bridge:
         for topic in before.keys() - wanted.keys():
             self._broker.unsubscribe(session, topic)
 
-    def _add_to_mqtt(self, route: Route, ros: str) -> None:
+    def _add_to_mqtt(self, route: BridgeRoute, ros: str) -> None:
         flow = ToMqtt(route, ros, self._converters, self._tell, self._mailbox, self._publish)
         key = flow.ros, flow.mqtt
         if key in self._to_mqtt:
@@ -269,7 +269,7 @@ class Bridge:
         self._to_mqtt[key] = flow
         self._pair(key)
 
-    def _add_to_ros(self, route: Route, ros: str) -> None:
+    def _add_to_ros(self, route: BridgeRoute, ros: str) -> None:
         flow = self._new_to_ros(route, ros)
         key = flow.ros, flow.mqtt
         self._found[key] = flow
@@ -353,7 +353,7 @@ class Bridge:
 
     def status(self) -> list[RouteStatus]:
         """Every route's state and counters, one entry a direction."""
-        flows: dict[Route, list[Flow]] = {}
+        flows: dict[BridgeRoute, list[Flow]] = {}
         for flow in self._flows():
             flows.setdefault(flow.route, []).append(flow)
         return [route_status(route, flows.get(route, [])) for route in self._routes]
@@ -696,7 +696,7 @@ class Bridge:
         return has_changed
 
     def _find_refused(
-        self, patterns: list[Route], taken: Mapping[Direction, set[str]]
+        self, patterns: list[BridgeRoute], taken: Mapping[Direction, set[str]]
     ) -> list[Skip]:
         found: dict[tuple[str, str], Skip] = {}
         for route in patterns:

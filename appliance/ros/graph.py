@@ -13,7 +13,7 @@ from typing import TypeAlias
 from appliance.broker.broker import Broker
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.actions import ActionRoutes, ActionSettings
-from appliance.ros.calls.dispatcher import CallCounters, CallLimits, Switchboard
+from appliance.ros.calls.dispatcher import CallCounters, CallDispatcher, CallLimits
 from appliance.ros.calls.parameter_server import ServerParameters
 from appliance.ros.calls.parameter_topics import ParameterSettings
 from appliance.ros.calls.parameters import ParameterRoutes
@@ -23,7 +23,7 @@ from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.skipped import Skip
-from appliance.ros.topics.conversions import Turns
+from appliance.ros.topics.conversions import ConversionQueue
 
 __all__ = [
     "ActionSettings",
@@ -69,7 +69,7 @@ class Calls:
         mailbox: Mailbox,
         post: Callable[..., None],
         announce: Callable[[], None],
-        turns: Turns,
+        turns: ConversionQueue,
     ) -> None:
         """`post` calls on the loop's thread; `announce` is called there when what `bridged` gives
         may have changed."""
@@ -78,7 +78,7 @@ class Calls:
         self._post = post
         self._announce = announce
         self._routes = CallRoutes()
-        self.board = Switchboard(broker, entries, turns)
+        self.board = CallDispatcher(broker, entries, turns)
         self._requests = Requests(node, entries.loop, post, self._follow)
         self._services = ServiceRoutes(self.board, self._requests, converters, node, entries, post)
         self._actions = ActionRoutes(

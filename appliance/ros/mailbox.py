@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from appliance.broker.message import Message
-from appliance.ros.metrics import Counters
+from appliance.ros.metrics import FlowCounters
 
 #: The most that waits in all: a loop that was busy for a second with 10 kHz on the bus.
 MAX_MESSAGES = 10_000
@@ -31,7 +31,7 @@ class Lane:
     """
 
     keep: int
-    counters: Counters
+    counters: FlowCounters
     timed: tuple[Message, int] | None = None
     waiting: deque[Message] = field(default_factory=deque)
     #: Where it waits for its turn, if it does.

@@ -53,7 +53,7 @@ class Latency:
 
 
 @dataclass(eq=False, slots=True)
-class Counters:
+class FlowCounters:
     """What is counted in one direction, all from the start; `bytes` are payload on MQTT.
 
     `lost` are those that ROS's middleware says it lost before they came here, `dropped` did not fit
@@ -78,7 +78,7 @@ class Counters:
     last_error: str | None = None
     latency: Latency = field(default_factory=Latency)
 
-    def add(self, other: Counters) -> None:
+    def add(self, other: FlowCounters) -> None:
         """Count all that the other has counted; its last error is now the last."""
         for item in fields(self):
             if item.type == "int":

@@ -9,7 +9,13 @@ from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
 from appliance.net.callbacks import Entries
-from appliance.ros.payload.definitions import CDR, TypeDescription, UnknownTypeError, Wire, describe
+from appliance.ros.payload.definitions import (
+    CDR,
+    Serialization,
+    TypeDescription,
+    UnknownTypeError,
+    describe,
+)
 
 
 class BusError(Exception):
@@ -149,7 +155,7 @@ class RosNode(Protocol):
     #: The node's full name, such as `/appliance`.
     name: str
     #: How messages are serialized on the bus.
-    wire: Wire
+    wire: Serialization
     #: Where parameters are; None when every node keeps its own, and has services for them.
     parameter_server: ParameterServer | None
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.ros.metrics import Counters, Latency
+from appliance.ros.metrics import FlowCounters, Latency
 from appliance.ros.payload.payloads import Encoding
-from appliance.ros.topics.flows import Bridged, Direction, Flow, Route, RouteSettings
+from appliance.ros.topics.flows import Bridged, BridgeRoute, Direction, Flow, RouteSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class TopicStatus:
     `rate` is in messages a second, `size` the mean payload in bytes, `latency_ms` from the
     publisher on ROS to the broker, None while none was measured. `last_error` is what was wrong
     with the last message that was not carried. Counts are since the topic came;
-    for what is counted see `Counters`.
+    for what is counted see `FlowCounters`.
     """
 
     ros: str
@@ -52,7 +52,7 @@ class RouteStatus:
     """What a route carries in one direction, and what it has counted since the start.
 
     `rate` and `byte_rate` are a second; `commanding` names who holds the lease of an exclusive
-    route, and of which topic. For what is counted see `Counters`.
+    route, and of which topic. For what is counted see `FlowCounters`.
     """
 
     settings: RouteSettings
@@ -100,9 +100,9 @@ def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
     )
 
 
-def route_status(route: Route, flows: Sequence[Flow]) -> RouteStatus:
+def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
     """How a route is doing, with its flows and those that it had."""
-    total = Counters()
+    total = FlowCounters()
     for counters in (route.past, *(flow.counters for flow in flows)):
         total.add(counters)
     rates = [flow.meter.rates for flow in flows]

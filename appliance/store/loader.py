@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, cast
 
 from appliance.broker.accounts import Account
-from appliance.broker.kept import Kept, Owed
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
-from appliance.broker.session import Delivery, Held, PendingWill, Session
+from appliance.broker.saved_sessions import PendingDelivery, SavedSession
+from appliance.broker.session import Delivery, PendingWill, Session, UnreleasedPublish
 from appliance.broker.shared import Share
 from appliance.mqtt.codec import (
     MAXIMUM_PAIRS,
@@ -130,7 +130,7 @@ def retained_row(key: int, message: int, owner: Account) -> Row:
 
 
 def received_row(
-    key: int, session: int, packet_id: int, message: int, held: Held, full: list[int]
+    key: int, session: int, packet_id: int, message: int, held: UnreleasedPublish, full: list[int]
 ) -> Row:
     """The row of a QoS 2 message that waits for PUBREL; `full` are the sessions without room."""
     no_room = None
@@ -148,7 +148,7 @@ class LoadedSession:
     """A session, and the keys of its rows, in the same order as what they stand for."""
 
     key: int
-    kept: Kept
+    kept: SavedSession
     filters: dict[str, int] = field(default_factory=dict)
     inflight: list[int] = field(default_factory=list)
     queue: list[int] = field(default_factory=list)
@@ -310,7 +310,7 @@ def _session(row: Row, offset: float, loaded: Loaded) -> LoadedSession:
         delay = _within(will_delay, 0, 0xFFFF_FFFF)
         pending = PendingWill(message, delay, loaded.expiries.get(_of(int, will)))
     identity = Identity(None if username is None else _of(str, username), _of(str, client_id))
-    kept = Kept(
+    kept = SavedSession(
         identity,
         _within(expiry, 0, 0xFFFF_FFFF),
         _time(ends_at, offset),
@@ -356,7 +356,7 @@ def _take_owed(row: Row, loaded: Loaded) -> None:
     ids = None if subscription_ids is None else json.loads(_of(str, subscription_ids))
     if ids is not None:
         ids = [_within(number, 1, 268_435_455) for number in _of(list, ids)]
-    owed = Owed(
+    owed = PendingDelivery(
         loaded.messages[_of(int, message)],
         _within(qos, 1, 2),
         _within(retain, 0, 1) == 1,

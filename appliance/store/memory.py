@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from appliance.broker.accounts import Account
 from appliance.broker.message import Message
-from appliance.broker.session import Delivery, Held, Session
+from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.mqtt.packets import Subscription
 
 
@@ -58,7 +58,7 @@ class MemoryStore:
     def completed(self, session: Session, packet_id: int) -> None:
         """The session has forgotten it."""
 
-    def held(self, session: Session, packet_id: int, held: Held) -> None:
+    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
         """The session has it."""
 
     def unheld(self, session: Session, packet_id: int) -> None:

@@ -15,10 +15,10 @@ from typing import cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
-from appliance.broker.kept import restore
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
-from appliance.broker.session import Delivery, Held, Session
+from appliance.broker.saved_sessions import restore
+from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.host.clock import NUDGE, StepWatch
 from appliance.mqtt.packets import Subscription
 from appliance.net.callbacks import Entries, Repeated
@@ -682,7 +682,7 @@ class SqliteStore:
             self._open.remove(Table.OWED, key)
             self._stage_lazily()
 
-    def held(self, session: Session, packet_id: int, held: Held) -> None:
+    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
         """See `Store`."""
         known = self._sessions.get(session)
         if known is None:

@@ -16,7 +16,7 @@ from appliance.access import FileAccess, Passwords
 from appliance.access import checks as checks_module
 from appliance.access import passwords as passwords_module
 from appliance.access import throttle as guesses_module
-from appliance.access.throttle import Guesses, Recent
+from appliance.access.throttle import LoginThrottle, Recent
 from appliance.broker.ports import Accepted, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 
@@ -36,7 +36,7 @@ class Clock:
 
 def test_an_address_that_guesses_is_slowed_more_and_more_and_forgiven() -> None:
     clock = Clock()
-    guesses = Guesses(6, clock)
+    guesses = LoginThrottle(6, clock)
     waits = []
     for _ in range(16):
         wait = guesses.turn("10.0.0.1:1")
@@ -56,7 +56,7 @@ def test_an_address_that_guesses_is_slowed_more_and_more_and_forgiven() -> None:
 
 
 def test_a_user_that_many_guess_at_is_held_up_for_a_bounded_time() -> None:
-    guesses = Guesses(6, Clock())
+    guesses = LoginThrottle(6, Clock())
     for number in range(100):
         guesses.failed(f"10.0.0.{number}", "alice")
     assert guesses.hold_up("alice") == guesses_module.USER_PATIENCE
@@ -68,7 +68,7 @@ def test_a_user_that_many_guess_at_is_held_up_for_a_bounded_time() -> None:
 
 def test_what_is_remembered_of_guessers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guesses_module, "REMEMBERED", 100)
-    guesses = Guesses(6, Clock())
+    guesses = LoginThrottle(6, Clock())
     for number in range(1000):
         guesses.failed(f"10.0.{number // 250}.{number % 250}", "x" * 60_000 + str(number))
     assert len(guesses._networks) == len(guesses._users) == 100
@@ -157,7 +157,7 @@ async def test_a_proof_is_a_guess_too(files: tuple[Path, Path]) -> None:
     passwords.set("sally", "geheim", for_scram=True)
     passwords.save()
     access = FileAccess(*files, "r2d2", failed_logins=5)
-    access.guesses = Guesses(5, Clock())  # however long the passwords take
+    access.guesses = LoginThrottle(5, Clock())  # however long the passwords take
 
     def log_in(password: str, address: str | None, user: str = "sally") -> ReasonCode | None:
         exchange = access.exchange("SCRAM-SHA-256", address)

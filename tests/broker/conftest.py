@@ -25,8 +25,8 @@ from appliance.broker.ports import (
 from appliance.broker.retained import retained_size
 from appliance.broker.session import (
     Delivery,
-    Held,
     Session,
+    UnreleasedPublish,
     held_size,
     subscription_size,
 )
@@ -160,7 +160,7 @@ class FakeStore(MemoryStore):
         self._stage()
         self.settled(session, delivery)
 
-    def held(self, session: Session, packet_id: int, held: Held) -> None:
+    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
         self._stage()
 
     def unheld(self, session: Session, packet_id: int) -> None:

@@ -6,6 +6,7 @@ from itertools import product
 
 import pytest
 
+from appliance.broker.accounting import EFFORT_A_TURN
 from appliance.broker.broker import (
     EFFORT_A_TICK,
     HELD_EFFORT,
@@ -13,7 +14,6 @@ from appliance.broker.broker import (
     LOOKS_FOR_ONE,
     Broker,
 )
-from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.shared import ASKED
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will

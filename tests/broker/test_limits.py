@@ -7,11 +7,11 @@ from itertools import product
 
 import pytest
 
+from appliance.broker.accounting import EFFORT_A_TURN
 from appliance.broker.broker import ENDINGS_A_TURN, Broker
-from appliance.broker.complaints import BURST, INTERVAL
-from appliance.broker.ledger import EFFORT_A_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
+from appliance.broker.rate_limited_log import BURST, INTERVAL
 from appliance.broker.session import REPLAYED_A_TURN, subscription_size
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.connection import STRANGERS_PAIRS

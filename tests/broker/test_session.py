@@ -11,11 +11,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
-from appliance.broker.ledger import Ledger
 from appliance.broker.message import OVERHEAD, Heads, Message, Watched
 from appliance.broker.ports import Identity, Limits
-from appliance.broker.session import Held, Session
+from appliance.broker.session import Session, UnreleasedPublish
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, Will
 from appliance.mqtt.topics import matches
@@ -419,7 +419,7 @@ class Recorder:
 @pytest.fixture
 def session() -> Session:
     limits = Limits(inflight=2, queue_messages=3, queue_bytes=100_000)
-    session = Session("client", Identity("user", "client"), Ledger(limits, MemoryStore()))
+    session = Session("client", Identity("user", "client"), Accounting(limits, MemoryStore()))
     session.link = Recorder()
     return session
 
@@ -463,7 +463,7 @@ def test_window_queue_and_drops(session: Session):
 
 def test_no_room_means_no_room_even_with_an_open_window(session: Session):
     assert not session.deliver(Message("a", bytes(200_000)), 1, False, None)
-    assert not session.hold(1, Held(Message("a", bytes(200_000)), frozenset()))
+    assert not session.hold(1, UnreleasedPublish(Message("a", bytes(200_000)), frozenset()))
     assert session.deliver(Message("a", bytes(200_000)), 0, False, None)  # it passes through
     session.link.writable = False  # type: ignore[union-attr]
     assert not session.deliver(Message("a", bytes(200_000)), 0, False, None)
@@ -471,7 +471,7 @@ def test_no_room_means_no_room_even_with_an_open_window(session: Session):
 
 
 def test_a_message_that_is_released_twice_is_released_once(session: Session):
-    held = Held(Message("a", b"x", 2), frozenset())
+    held = UnreleasedPublish(Message("a", b"x", 2), frozenset())
     assert session.hold(5, held)
     assert session.unhold(5) is held
     assert session.unhold(5) is None

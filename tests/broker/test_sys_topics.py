@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from appliance.broker.broker import Broker
-from appliance.broker.sys_topics import PREFIX, Load, SysTopics
+from appliance.broker.sys_topics import PREFIX, LoadAverage, SysTopics
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Pingreq
 from appliance.mqtt.topics import check_topic
@@ -140,7 +140,7 @@ def test_a_session_inside_the_appliance_is_no_client(sys_topics: SysTopics, brok
 
 
 def test_load_is_a_moving_average_a_minute():
-    load = Load()
+    load = LoadAverage()
     total = 0
     for _ in range(100):
         total += 50

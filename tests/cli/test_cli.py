@@ -322,7 +322,7 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
     monkeypatch.setenv("APPLIANCE_PASSWORD", "secret")
 
     def target(**options: str | int | Path | None) -> object:
-        return connection.Connection(host="h", user="alice", **options).target()  # type: ignore[arg-type]
+        return connection.ConnectionOptions(host="h", user="alice", **options).target()  # type: ignore[arg-type]
 
     from appliance.cli.mqtt_client import Target
 

@@ -83,16 +83,16 @@ def test_a_port_that_is_taken(demo: Path, monkeypatch: pytest.MonkeyPatch) -> No
     with socket.create_server(("0.0.0.0", 0)) as other:
         monkeypatch.setenv("APPLIANCE_PORT", str(other.getsockname()[1]))
         settings = config.load(demo / "run/appliance.yaml")
-        with pytest.raises(tour.TourError, match="make run PORT="):
+        with pytest.raises(tour.DemoError, match="make run PORT="):
             tour.run(settings)
 
 
 async def test_a_demo_that_runs_already(demo: Path) -> None:
     settings = config.load(demo / "run/appliance.yaml")
-    first = tour.Tour(settings)
+    first = tour.Demo(settings)
     await first.start()
     try:
-        with pytest.raises(tour.TourError, match=f"runs already, as process {os.getpid()}"):
+        with pytest.raises(tour.DemoError, match=f"runs already, as process {os.getpid()}"):
             await asyncio.to_thread(tour.run, settings)
     finally:
         await first.stop()
@@ -100,5 +100,5 @@ async def test_a_demo_that_runs_already(demo: Path) -> None:
 
 def test_the_demo_needs_tls(demo: Path) -> None:
     settings = config.loads("broker: {listeners: [{bind: ':0'}]}", demo / "x.yaml", {})
-    with pytest.raises(tour.TourError, match="tls: true"):
+    with pytest.raises(tour.DemoError, match="tls: true"):
         tour.run(settings)

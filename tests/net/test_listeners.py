@@ -371,7 +371,7 @@ async def test_a_connection_that_breaks(house: House, tls):
     await until(lambda: len(house.network.open) == 1)
 
 
-def break_packets(protocol: wire.ClientProtocol) -> None:
+def break_packets(protocol: wire.ClientConnection) -> None:
     """Let something that nobody expected escape while the client's next packet is worked on."""
     protocol._client._on_packet = Mock(side_effect=ZeroDivisionError)  # type: ignore[method-assign]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from house import Caller, House, check_network, make_contexts
 
-from appliance.broker.ledger import EFFORT_A_TURN
+from appliance.broker.accounting import EFFORT_A_TURN
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -21,7 +21,7 @@ from appliance.mqtt.packets import (
     Subscription,
     Will,
 )
-from appliance.net.connection import LITTLE, ClientProtocol
+from appliance.net.connection import LITTLE, ClientConnection
 from appliance.net.scheduler import EFFORT_A_ROUND, EFFORT_BEYOND, UNLOOKED
 
 CROWD = 40
@@ -38,7 +38,7 @@ async def until(holds: Callable[[], bool], what: Callable[[], object]) -> None:
     pytest.fail(f"waited in vain, and have {what()}")
 
 
-async def crowd(house: House, will: Will | None = None) -> list[tuple[Caller, ClientProtocol]]:
+async def crowd(house: House, will: Will | None = None) -> list[tuple[Caller, ClientConnection]]:
     """Clients of one user."""
     there = []
     for number in range(CROWD):

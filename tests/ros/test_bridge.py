@@ -22,7 +22,7 @@ from appliance.ros.bridge import THOROUGH_LOOK, Bridge, Bridged, RouteSettings
 from appliance.ros.graph import ParameterSettings
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
-from appliance.ros.topics.flows import Echo, Route
+from appliance.ros.topics.flows import BridgeRoute, Echo
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
@@ -481,7 +481,7 @@ async def test_patterns(house):
 
 
 def matches(route, *names, types=(STRING,)):
-    return [name for name in names if Route(route, "to_mqtt").matches(name, types)]
+    return [name for name in names if BridgeRoute(route, "to_mqtt").matches(name, types)]
 
 
 def test_what_patterns_match():
@@ -494,7 +494,7 @@ def test_what_patterns_match():
 
 
 def test_what_is_left_out_is_so_in_hidden_names_too():
-    route = Route(to_mqtt(("/**", "/_debug/**", "!/**/raw")), "to_mqtt")
+    route = BridgeRoute(to_mqtt(("/**", "/_debug/**", "!/**/raw")), "to_mqtt")
     assert route.matches("/_debug/state", [STRING])
     assert not route.matches("/_debug/raw", [STRING])
     shown = ParameterSettings(("/_debug/*", "!/**/secret"), "r2d2{node}").of("/_debug")

@@ -9,7 +9,7 @@ import pytest
 
 from appliance.broker.broker import Broker
 from appliance.ros.bridge import Bridge
-from appliance.ros.metrics import BOUNDS, Counters, Latency, Meter
+from appliance.ros.metrics import BOUNDS, FlowCounters, Latency, Meter
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules
 
@@ -212,7 +212,10 @@ def test_latency():
 
 
 def test_counters_add_up():
-    one, two = Counters(messages=1, bytes=10, last_error="old"), Counters(messages=2, stops=3)
+    one, two = (
+        FlowCounters(messages=1, bytes=10, last_error="old"),
+        FlowCounters(messages=2, stops=3),
+    )
     two.latency.observe(0.001)
     one.add(two)
     assert (one.messages, one.bytes, one.stops, one.last_error) == (3, 10, 3, "old")

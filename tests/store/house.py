@@ -14,7 +14,7 @@ from waiting import PATIENCE
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits
-from appliance.broker.session import FULL_SIZE, Delivery, Held, Session
+from appliance.broker.session import FULL_SIZE, Delivery, Session, UnreleasedPublish
 from appliance.broker.shared import Share
 from appliance.store import SqliteStore
 
@@ -100,7 +100,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         group = share.filter if share and share.filter in groups else None
         return _message(message), qos, retain, ids or None, group
 
-    def full(held: Held) -> set[str]:
+    def full(held: UnreleasedPublish) -> set[str]:
         """Of those that are still there, or there again."""
         names = {each.filter for each in held.full if isinstance(each, Share)}
         return (names & groups) | {

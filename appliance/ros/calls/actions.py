@@ -39,12 +39,12 @@ from appliance.ros.calls.dispatcher import (
     Answer,
     Call,
     CallCounters,
+    CallDispatcher,
+    CallEndpoint,
     CallError,
     ErrorCode,
-    Offer,
     Place,
     Places,
-    Switchboard,
     error_payload,
 )
 from appliance.ros.calls.fair import FairTable
@@ -52,7 +52,7 @@ from appliance.ros.calls.goals import ALL, CANCEL, STATUS
 from appliance.ros.calls.requests import Key, Requests
 from appliance.ros.calls.services import from_ros, to_request
 from appliance.ros.mailbox import Lane, Mailbox
-from appliance.ros.metrics import Counters
+from appliance.ros.metrics import FlowCounters
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payload.converter import ConversionError, Converters
@@ -153,7 +153,7 @@ class ActionRoutes:
 
     def __init__(
         self,
-        board: Switchboard,
+        board: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,
@@ -375,11 +375,11 @@ class Action:
         self._subscribed: str | None = None
         self._is_over = False
         self._servers = 0
-        self._counted = Counters()
+        self._counted = FlowCounters()
         self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
         self._status_lane = Lane(1, self._counted)
         self._offers = [
-            Offer(
+            CallEndpoint(
                 f"{self.base}/{verb}",
                 f"{ros} {verb[1:]}",
                 route.timeout,

@@ -40,7 +40,7 @@ from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net.callbacks import Entries
-from appliance.ros.calls.replay_guard import Backlog
+from appliance.ros.calls.replay_guard import ReplayGuard
 from appliance.ros.payload.converter import TooLargeError
 from appliance.ros.payload.payloads import (
     CONTENT_TYPE,
@@ -51,7 +51,7 @@ from appliance.ros.payload.payloads import (
     named_encoding,
 )
 from appliance.ros.topics.arrivals import SENT_AT, said_age
-from appliance.ros.topics.conversions import Turns, user_of
+from appliance.ros.topics.conversions import ConversionQueue, user_of
 
 log = logging.getLogger(__name__)
 
@@ -225,7 +225,7 @@ Handle: TypeAlias = Callable[[Call], Callable[[], Awaitable[Answer]]]
 
 
 @dataclass(eq=False, slots=True)
-class Offer:
+class CallEndpoint:
     """What can be called under a topic, and how it is handled.
 
     `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
@@ -250,7 +250,7 @@ Receive: TypeAlias = Callable[[Session, Message], None]
 class Ear(InsideLink):
     """The link for what one session publishes."""
 
-    def __init__(self, switchboard: Switchboard, origin: Session | None) -> None:
+    def __init__(self, switchboard: CallDispatcher, origin: Session | None) -> None:
         self._switchboard = switchboard
         self._origin = origin
 
@@ -268,13 +268,13 @@ class Ear(InsideLink):
             self._switchboard.receive(self._origin, message, subscription_ids[0])
 
 
-class Switchboard:
+class CallDispatcher:
     """Takes calls from MQTT, has them handled, and answers each of them once."""
 
-    def __init__(self, broker: Broker, entries: Entries, turns: Turns) -> None:
+    def __init__(self, broker: Broker, entries: Entries, turns: ConversionQueue) -> None:
         self.limits = CallLimits()
         self.turns = turns
-        self._backlog = Backlog()
+        self._backlog = ReplayGuard()
         self._broker = broker
         self._entries = entries
         self._loop = entries.loop
@@ -284,10 +284,10 @@ class Switchboard:
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
         #: By topic, the first of those that were offered there; the others wait for it to go.
-        self._offers: dict[str, list[Offer]] = {}
+        self._offers: dict[str, list[CallEndpoint]] = {}
         self._places = Places("calls")
         self._cancel_places = Places("calls that cancel goals", sure=True)
-        self._calls: dict[Call, Offer] = {}
+        self._calls: dict[Call, CallEndpoint] = {}
         self._bytes: Counter[str | None] = Counter()
         self._report_at: dict[str, float] = {}
 
@@ -343,7 +343,7 @@ class Switchboard:
         if self._session is not None:
             self._broker.unsubscribe(self._session, topic_filter)
 
-    def offer(self, offer: Offer) -> None:
+    def offer(self, offer: CallEndpoint) -> None:
         """Let `offer.topic`, which may have a `+` in it, be called."""
         offers = self._offers.setdefault(offer.topic, [])
         offers.append(offer)
@@ -353,13 +353,13 @@ class Switchboard:
             text = "%s cannot be called: calls at %s are for %s"
             log.warning(text, offer.name, offer.topic, offers[0].name)
 
-    def _listen_for(self, offer: Offer) -> None:
+    def _listen_for(self, offer: CallEndpoint) -> None:
         self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
         self.listen(
             f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
         )
 
-    def withdraw(self, offer: Offer) -> None:
+    def withdraw(self, offer: CallEndpoint) -> None:
         """Offer it no longer; calls under way have their answers yet."""
         offers = self._offers.get(offer.topic, [])
         if offer not in offers:
@@ -419,7 +419,9 @@ class Switchboard:
 
     # Calls
 
-    def _take(self, offer: Offer, caller: Session, message: Message, has_token: bool) -> None:
+    def _take(
+        self, offer: CallEndpoint, caller: Session, message: Message, has_token: bool
+    ) -> None:
         offer.counters.calls += 1
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
@@ -443,7 +445,7 @@ class Switchboard:
         self._enter(offer, call)
         self.turns.do(caller, len(call.payload), partial(self._begin, offer, call))
 
-    def _enter(self, offer: Offer, call: Call) -> None:
+    def _enter(self, offer: CallEndpoint, call: Call) -> None:
         places = self._cancel_places if offer.is_cancel else self._places
         call.place = places.take(call.caller)
         offer.counters.under_way += 1
@@ -453,7 +455,7 @@ class Switchboard:
             "calls.timeout", offer.timeout, self._expire, call, served=offer.name
         )
 
-    def _begin(self, offer: Offer, call: Call) -> None:
+    def _begin(self, offer: CallEndpoint, call: Call) -> None:
         """It is the call's turn to be converted."""
         if call not in self._calls:  # it was given up
             return
@@ -528,7 +530,7 @@ class Switchboard:
                 f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
             )
 
-    def _admit(self, offer: Offer, call: Call, message: Message) -> None:
+    def _admit(self, offer: CallEndpoint, call: Call, message: Message) -> None:
         """Raises CallError for a call that is not even looked at."""
         caller = call.caller
         if message.retain:
@@ -552,7 +554,7 @@ class Switchboard:
             text = f"a call of {offer.name} may be {either}, not {call.encoding}"
             raise CallError("bad_request", text)
 
-    def _check_age(self, offer: Offer, caller: Session, message: Message) -> None:
+    def _check_age(self, offer: CallEndpoint, caller: Session, message: Message) -> None:
         """Nobody waits for the answer of an old call any more, and what it would do nobody expects.
 
         To cancel is how an action is stopped: that is done whatever it says of its age, and only
@@ -581,7 +583,9 @@ class Switchboard:
         if total and total + size > TOTAL_BYTES:
             raise CallError("too_many", f"{total} bytes of calls of all clients are under way")
 
-    async def _run(self, offer: Offer, call: Call, find: Callable[[], Awaitable[Answer]]) -> None:
+    async def _run(
+        self, offer: CallEndpoint, call: Call, find: Callable[[], Awaitable[Answer]]
+    ) -> None:
         try:
             answer = await find()
         except CallError as error:
@@ -622,14 +626,14 @@ class Switchboard:
         if call.task is not None and call.task.cancelled():  # before it had begun
             self._tell(offer, call, _too_late(offer) if call.is_late else _stopping())
 
-    def _tell(self, offer: Offer, call: Call, error: CallError) -> None:
+    def _tell(self, offer: CallEndpoint, call: Call, error: CallError) -> None:
         if error.code == "bad_request" and call.doubt:
             error = CallError(error.code, f"{error}{call.doubt}")
         self._fail(offer, call.caller, call.reply, call.encoding, error)
 
     def _fail(
         self,
-        offer: Offer,
+        offer: CallEndpoint,
         caller: Session,
         reply: Message | None,
         encoding: CallEncoding,
@@ -687,7 +691,7 @@ def _take_off(counter: Counter[K], key: K, count: int) -> None:
         del counter[key]
 
 
-def _too_late(offer: Offer) -> CallError:
+def _too_late(offer: CallEndpoint) -> CallError:
     return CallError("timeout", f"no answer from {offer.name} within {offer.timeout:g} s")
 
 

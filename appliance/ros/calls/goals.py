@@ -14,7 +14,7 @@ from typing import Any
 
 from appliance.ros.calls.dispatcher import Answer, CallError
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.definitions import Wire
+from appliance.ros.payload.definitions import Serialization
 from appliance.ros.payload.payloads import RAW, CallEncoding, dumps, loads
 
 CANCEL = "action_msgs/srv/CancelGoal"
@@ -40,13 +40,13 @@ _WHICH = (
 # it is by itself.
 
 
-def with_id(goal: bytes, id_: bytes, wire: Wire) -> bytes:
+def with_id(goal: bytes, id_: bytes, wire: Serialization) -> bytes:
     """The serialized request of `send_goal`."""
     start = len(wire.header)
     return goal[:start] + id_ + goal[start:]
 
 
-def split_id(cdr: bytes, wire: Wire) -> tuple[bytes, bytes]:
+def split_id(cdr: bytes, wire: Serialization) -> tuple[bytes, bytes]:
     """The goal's id and the serialized feedback, of a message with both."""
     start = len(wire.header)
     return cdr[start : start + 16], cdr[:start] + cdr[start + 16 :]
@@ -67,7 +67,7 @@ def accepted(
     return Answer(dumps({"goal_id": id_.hex(), "stamp": stamp}, encoding), encoding)
 
 
-def status_of(result: bytes, wire: Wire) -> str:
+def status_of(result: bytes, wire: Serialization) -> str:
     """The status in a response of `get_result`."""
     start = len(wire.header)
     return _state(result[start] if len(result) > start else 0)

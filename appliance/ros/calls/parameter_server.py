@@ -20,7 +20,7 @@ from typing import Any
 
 import pybase64
 
-from appliance.ros.calls.dispatcher import Call, CallError, Switchboard
+from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
 from appliance.ros.calls.parameter_topics import Holder, ParameterTopics, shorten, to_bytes
 from appliance.ros.node import BusError, ParameterServer, RosNode
 from appliance.ros.patterns import is_plain
@@ -46,7 +46,7 @@ class ServerParameters(ParameterTopics[Holder]):
 
     def __init__(
         self,
-        board: Switchboard,
+        board: CallDispatcher,
         node: RosNode,
         loop: asyncio.AbstractEventLoop,
         post: Callable[..., None],

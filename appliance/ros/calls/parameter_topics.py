@@ -18,7 +18,14 @@ import pybase64
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.topics import check_topic
-from appliance.ros.calls.dispatcher import Answer, Call, CallCounters, CallError, Offer, Switchboard
+from appliance.ros.calls.dispatcher import (
+    Answer,
+    Call,
+    CallCounters,
+    CallDispatcher,
+    CallEndpoint,
+    CallError,
+)
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payload.converter import LARGEST_LENIENT, ConversionError, TooLargeError
 from appliance.ros.payload.payloads import CONTENT_TYPE, InputLimits, dumps, loads
@@ -64,7 +71,7 @@ class Holder:
     route: ParameterSettings
     wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
-    offers: list[Offer] = field(default_factory=list)
+    offers: list[CallEndpoint] = field(default_factory=list)
 
     def wants(self, parameter: str) -> bool:
         """Whether it is shown, and may be set."""
@@ -80,7 +87,7 @@ class ParameterTopics(ABC, Generic[HolderT]):
     #: The type of a value on the bus, for who asks what is bridged.
     type_name = ""
 
-    def __init__(self, board: Switchboard) -> None:
+    def __init__(self, board: CallDispatcher) -> None:
         self._board = board
         self._counters: dict[ParameterSettings, CallCounters] = {}
         self._routes: Sequence[ParameterSettings] = ()
@@ -133,7 +140,7 @@ class ParameterTopics(ABC, Generic[HolderT]):
 
         route = holder.route
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
-            offer = Offer(
+            offer = CallEndpoint(
                 f"{holder.base}/{topic}",
                 f"the parameters of {holder.name or '/'}",
                 route.timeout,

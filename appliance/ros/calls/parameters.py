@@ -19,7 +19,7 @@ from typing import Any
 import pybase64
 
 from appliance.net.callbacks import Entries
-from appliance.ros.calls.dispatcher import Call, CallError, Switchboard
+from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
 from appliance.ros.calls.parameter_topics import Holder, ParameterTopics, shorten, to_bytes, unlike
 from appliance.ros.calls.requests import Requests
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
@@ -82,7 +82,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
 
     def __init__(
         self,
-        board: Switchboard,
+        board: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,

@@ -29,7 +29,7 @@ class _Behind:
     in_a_row: int = 1
 
 
-class Backlog:
+class ReplayGuard:
     """Who has sent old messages, and until when its others are taken for such.
 
     What is sent again after a lost connection tells how old it is. What its client queued in the

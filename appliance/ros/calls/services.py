@@ -32,9 +32,9 @@ from appliance.ros.calls.dispatcher import (
     Answer,
     Call,
     CallCounters,
+    CallDispatcher,
+    CallEndpoint,
     CallError,
-    Offer,
-    Switchboard,
 )
 from appliance.ros.calls.requests import Key, Requests
 from appliance.ros.node import BusError, Respond, RosNode, RosService
@@ -124,7 +124,7 @@ class ServiceRoutes:
 
     def __init__(
         self,
-        board: Switchboard,
+        board: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,
@@ -139,7 +139,7 @@ class ServiceRoutes:
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
-        self._offered: dict[str, tuple[ServiceSettings, Offer]] = {}
+        self._offered: dict[str, tuple[ServiceSettings, CallEndpoint]] = {}
         self._provided: dict[ServiceSettings, Provided] = {}
         #: Services that patterns speak of and do not take.
         self._refused: list[Skip] = []
@@ -206,7 +206,7 @@ class ServiceRoutes:
 
     def _offer(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
-        offer = Offer(
+        offer = CallEndpoint(
             topic,
             name,
             route.timeout,
@@ -364,7 +364,7 @@ class Provided:
         self,
         route: ServiceSettings,
         counters: CallCounters,
-        board: Switchboard,
+        board: CallDispatcher,
         converters: Converters,
         node: RosNode,
         entries: Entries,

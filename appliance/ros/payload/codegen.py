@@ -31,10 +31,10 @@ from appliance.ros.payload.definitions import (
     Primitive,
     Selection,
     Sequence,
+    Serialization,
     String,
     TypeDescription,
     WideString,
-    Wire,
 )
 
 # What generated code raises when a message is not exactly as expected.
@@ -249,7 +249,7 @@ class _Generator:
     have yet to be added to `q`.
     """
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Serialization) -> None:
         self.constants: dict[str, Any] = {}
         self._wire = wire
         self._lines: list[str] = []
@@ -348,7 +348,7 @@ class _Decoder(_Generator):
 
     def __init__(
         self,
-        wire: Wire,
+        wire: Serialization,
         wanted: Selection | None,
         row: str = "[{1}]",
         *,
@@ -554,7 +554,7 @@ class _Decoder(_Generator):
 class _Encoder(_Generator):
     """Writes `encode(message)`: the message, in little endian."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Serialization) -> None:
         super().__init__(wire)
         # The header is the beginning of the first run.
         if wire.header:

@@ -115,7 +115,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Wire:
+class Serialization:
     """How messages are serialized.
 
     `encoding` is what that is called on MQTT. Messages begin with `header`. Numbers are aligned to
@@ -132,10 +132,10 @@ class Wire:
 
 
 #: ROS 2's: plain CDR, little endian, no options.
-CDR = Wire("cdr", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
+CDR = Serialization("cdr", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
 
 #: ROS 1's: always little endian, and nothing but the values.
-PACKED = Wire("ros1", b"", 1, b"", b"")
+PACKED = Serialization("ros1", b"", 1, b"", b"")
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class TypeDescription:
 
     name: str
     fields: tuple[Field, ...]
-    wire: Wire = CDR
+    wire: Serialization = CDR
 
 
 ItemType = Primitive | String | WideString | TypeDescription

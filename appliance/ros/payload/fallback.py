@@ -29,10 +29,10 @@ from appliance.ros.payload.definitions import (
     Primitive,
     Selection,
     Sequence,
+    Serialization,
     String,
     TypeDescription,
     WideString,
-    Wire,
     least_size,
 )
 
@@ -115,7 +115,7 @@ class _Reader:
     def __init__(
         self,
         cdr: bytes,
-        wire: Wire,
+        wire: Serialization,
         order: str,
         binary: bool,
         strict: bool,
@@ -236,7 +236,7 @@ def accept(
 
 
 class _Checker:
-    def __init__(self, now: Callable[[], int], wire: Wire, budget: _Budget) -> None:
+    def __init__(self, now: Callable[[], int], wire: Serialization, budget: _Budget) -> None:
         self._now = now
         self._wire = wire
         self._budget = budget

@@ -16,7 +16,7 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.ros.payload import cbor
 from appliance.ros.payload.converter import NO_BINARY, Converter, image_format
 from appliance.ros.payload.cost import ITEMS, too_much, weigh_cbor, weigh_json
-from appliance.ros.payload.definitions import CDR, PACKED, UnknownTypeError, Wire
+from appliance.ros.payload.definitions import CDR, PACKED, Serialization, UnknownTypeError
 from appliance.ros.payload.fallback import ConversionError, TooLargeError
 
 Encoding: TypeAlias = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
@@ -33,7 +33,7 @@ CONTENT_TYPE = {
 }
 
 #: ROS's own serialized bytes, of ROS 2 and of ROS 1.
-RAW: dict[str, Wire] = {wire.encoding: wire for wire in (CDR, PACKED)}
+RAW: dict[str, Serialization] = {wire.encoding: wire for wire in (CDR, PACKED)}
 
 _OF_CONTENT_TYPE: dict[str, CallEncoding] = {
     "application/json": "json",

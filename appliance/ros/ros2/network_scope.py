@@ -24,7 +24,7 @@ from appliance.ros.ros2 import discovery
 _FAST_DDS = re.compile(r"(/\S+/lib(?:fastrtps|fastdds)\.so\S*)$", re.MULTILINE)
 
 
-class Reach(IntEnum):
+class NetworkScope(IntEnum):
     """Who can be heard."""
 
     NOBODY = 0
@@ -32,10 +32,10 @@ class Reach(IntEnum):
     NETWORK = 2
 
 
-def reach(environment: Mapping[str, str] | None = None) -> Reach:
+def reach(environment: Mapping[str, str] | None = None) -> NetworkScope:
     """What there is now, as far as ROS may use it."""
     environment = os.environ if environment is None else environment
-    found = Reach.NOBODY
+    found = NetworkScope.NOBODY
     states = psutil.net_if_stats()
     for name, addresses in psutil.net_if_addrs().items():
         if name not in states or not states[name].isup:
@@ -44,8 +44,8 @@ def reach(environment: Mapping[str, str] | None = None) -> Reach:
             if address.family != socket.AF_INET:
                 continue
             is_loopback = ipaddress.IPv4Address(address.address).is_loopback
-            found = max(found, Reach.THIS_COMPUTER if is_loopback else Reach.NETWORK)
-    return min(found, Reach.THIS_COMPUTER) if discovery.is_local(environment) else found
+            found = max(found, NetworkScope.THIS_COMPUTER if is_loopback else NetworkScope.NETWORK)
+    return min(found, NetworkScope.THIS_COMPUTER) if discovery.is_local(environment) else found
 
 
 def look_again() -> None:

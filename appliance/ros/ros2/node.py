@@ -45,7 +45,7 @@ from appliance.ros.ros2.loop_subscription import (
     UnavailableError,
     published_at,
 )
-from appliance.ros.ros2.network_scope import Reach, look_again, reach
+from appliance.ros.ros2.network_scope import NetworkScope, look_again, reach
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +135,7 @@ class Ros2Node(ContainedThread):
         self._is_event_driven = False
         self._clock: Any = None
         #: Who could be heard when the bus was joined.
-        self._reach = Reach.NOBODY
+        self._reach = NetworkScope.NOBODY
         #: Whether the loop's thread may take messages itself, as far as is known.
         self._takes_on_loop = True
         self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
@@ -226,7 +226,7 @@ class Ros2Node(ContainedThread):
                 # A finite time-out also mends EventsExecutor, whose endless wait overflows.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
-                if self._reach < Reach.NETWORK and time.monotonic() >= look_at:
+                if self._reach < NetworkScope.NETWORK and time.monotonic() >= look_at:
                     look_at = time.monotonic() + NETWORK_INTERVAL
                     if reach() > self._reach:
                         raise BusError("there was no network yet when it was joined, and is now")

@@ -24,7 +24,7 @@ from appliance.ros.payload.converter import ConversionError, Converter, Converte
 from appliance.ros.payload.payloads import unpacked_size
 from appliance.ros.topics.arrivals import BEGINS, QUEUED, SENT_AT, Verdict, said_age, sent_at
 from appliance.ros.topics.conversions import LITTLE, size_of
-from appliance.ros.topics.flows import REPORT_INTERVAL, Route, Tell
+from appliance.ros.topics.flows import REPORT_INTERVAL, BridgeRoute, Tell
 from appliance.ros.topics.lease import OVERTAKEN, Lease
 from appliance.ros.topics.rules import CommandRules, FieldLimits
 from appliance.ros.topics.to_ros import AgainstRulesError, Surroundings, ToRos
@@ -145,7 +145,7 @@ class Commands(ToRos):
 
     def __init__(
         self,
-        route: Route,
+        route: BridgeRoute,
         ros: str,
         converters: Converters,
         tell: Tell,

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from time import thread_time
 from typing import TypeAlias, TypeVar
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
-from appliance.broker.ledger import Ledger
 from appliance.broker.session import Session
 from appliance.net.callbacks import Entries
 from appliance.ros.payload.payloads import ZSTD_MAGIC
@@ -49,10 +49,10 @@ class _Work:
     size: int
 
 
-class Turns:
+class ConversionQueue:
     """Does what takes long, one thing a turn."""
 
-    def __init__(self, entries: Entries, ledger: Ledger) -> None:
+    def __init__(self, entries: Entries, ledger: Accounting) -> None:
         self._entries = entries
         self._ledger = ledger
         #: What waits, by client; and the clients whose turn it is, by user.

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import ClassVar, Literal, Protocol, TypeAlias
 
-from appliance.ros.metrics import Counters, Meter
+from appliance.ros.metrics import FlowCounters, Meter
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.definitions import CDR, UnknownTypeError, Wire
+from appliance.ros.payload.definitions import CDR, Serialization, UnknownTypeError
 from appliance.ros.payload.payloads import Compression, Encoding, InputLimits
 from appliance.ros.skipped import Skip, Why
 from appliance.ros.topics.rules import CommandRules
@@ -83,7 +83,7 @@ class RouteSettings:
         return not isinstance(self.ros, str) or "*" in self.ros or "*" in (self.type or "")
 
 
-class Route:
+class BridgeRoute:
     """A route in one direction."""
 
     def __init__(self, settings: RouteSettings, direction: Direction) -> None:
@@ -91,7 +91,7 @@ class Route:
         self.direction: Direction = direction
         self.is_pattern = settings.is_pattern
         #: What those of its flows have counted that have ended.
-        self.past = Counters()
+        self.past = FlowCounters()
         self._names = Names(settings.names)
         self._types = compile_pattern(settings.type) if settings.type else None
 
@@ -139,7 +139,7 @@ class Echo:
     the echo, and the echo in its place as the other's message: on MQTT nobody can tell.
     """
 
-    def __init__(self, wire: Wire = CDR) -> None:
+    def __init__(self, wire: Serialization = CDR) -> None:
         self._header = len(wire.header)
         #: In CDR, up to three bytes may have been added at the end.
         self._padding = 3 if wire.header else 0
@@ -176,7 +176,7 @@ class Flow(ABC):
 
     def __init__(
         self,
-        route: Route,
+        route: BridgeRoute,
         ros: str,
         converters: Converters,
         tell: Tell,
@@ -185,7 +185,7 @@ class Flow(ABC):
         self.settings = settings = route.settings
         self.ros = ros
         self.mqtt = settings.mqtt.replace("{ros}", ros)
-        self.counters = Counters()
+        self.counters = FlowCounters()
         #: For the loop's thread.
         self.meter = Meter()
         self.bridged: Bridged | None = None

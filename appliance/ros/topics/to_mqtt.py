@@ -13,7 +13,7 @@ from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.payloads import RAW, check, packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
-from appliance.ros.topics.flows import Echo, Flow, Route, Tell
+from appliance.ros.topics.flows import BridgeRoute, Echo, Flow, Tell
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
 
 #: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
@@ -32,7 +32,7 @@ class ToMqtt(Flow):
 
     def __init__(
         self,
-        route: Route,
+        route: BridgeRoute,
         ros: str,
         converters: Converters,
         tell: Tell,

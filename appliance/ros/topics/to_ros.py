@@ -18,8 +18,8 @@ from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.payloads import CONTENT_TYPE, check, claim, unpacker
 from appliance.ros.qos import publisher_qos
 from appliance.ros.topics.arrivals import Arrivals
-from appliance.ros.topics.conversions import LITTLE, Turns, size_of
-from appliance.ros.topics.flows import Echo, Flow, Route, Tell
+from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
+from appliance.ros.topics.flows import BridgeRoute, Echo, Flow, Tell
 from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
 
 #: Characters of a reason that a client is told.
@@ -40,7 +40,7 @@ class Surroundings:
     post: Callable[..., None]
     broker: Broker
     leases: Leases
-    turns: Turns
+    turns: ConversionQueue
     arrivals: Arrivals
 
 
@@ -53,7 +53,7 @@ class ToRos(Flow):
 
     def __init__(
         self,
-        route: Route,
+        route: BridgeRoute,
         ros: str,
         converters: Converters,
         tell: Tell,

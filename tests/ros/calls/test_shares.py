@@ -12,9 +12,9 @@ from call_house import AllTypes, House, action, call_routes, parameters, service
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
-from appliance.broker.ledger import Ledger
 from appliance.broker.ports import Identity, Limits
 from appliance.net.callbacks import Entries
 from appliance.ros.bridge import RouteSettings
@@ -405,8 +405,8 @@ LARGE = turns.LITTLE + 1
 
 def turn_house(memory=1 << 20):
     clock = Clock()
-    ledger = Ledger(Limits(memory=memory), MemoryStore())
-    return clock, turns.Turns(Entries(clock, Faults()), ledger)
+    ledger = Accounting(Limits(memory=memory), MemoryStore())
+    return clock, turns.ConversionQueue(Entries(clock, Faults()), ledger)
 
 
 def test_one_is_done_at_once_and_the_others_one_a_turn():

@@ -31,7 +31,7 @@ from appliance.ros.diagnostics import TYPE
 from appliance.ros.graph import CallRoutes, ServiceSettings
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
-from appliance.ros.ros2.network_scope import Reach, reach
+from appliance.ros.ros2.network_scope import NetworkScope, reach
 
 __all__ = ["domain"]  # a fixture for all tests here
 
@@ -208,12 +208,12 @@ async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeyp
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
     monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
     monkeypatch.setattr(ros2, "reach", lambda: found)
-    found = Reach.THIS_COMPUTER
+    found = NetworkScope.THIS_COMPUTER
     house = start(route("/a", "mqtt", "text"))
     await until(lambda: house.bridge.peers == 1, "the peer")
     await asyncio.sleep(0.5)
     assert house.bridge.state == "joined"
-    first, found = house.node._context, Reach.NETWORK
+    first, found = house.node._context, NetworkScope.NETWORK
     await until(lambda: house.bridge.state == "lost", "the new start")
     assert house.bridge.problem == "there was no network yet when it was joined, and is now"
     await until(lambda: house.bridge.peers == 1, "the peer again")
@@ -227,7 +227,7 @@ async def test_a_network_that_comes_while_the_bus_is_joined_is_used(start, peer,
 
     def reach():
         is_joined = bool(houses) and houses[0].node._executor is not None
-        return Reach.NETWORK if is_joined else Reach.THIS_COMPUTER
+        return NetworkScope.NETWORK if is_joined else NetworkScope.THIS_COMPUTER
 
     monkeypatch.setattr(ros2, "reach", reach)
     houses.append(start(route("/a", "mqtt", "text")))
@@ -244,12 +244,12 @@ def test_how_far_one_can_be_heard(monkeypatch):
     }
     monkeypatch.setattr(psutil, "net_if_stats", lambda: states)
     monkeypatch.setattr(psutil, "net_if_addrs", lambda: ends)
-    assert reach({}) is Reach.THIS_COMPUTER
+    assert reach({}) is NetworkScope.THIS_COMPUTER
     states["eth0"] = up
-    assert reach({}) is Reach.NETWORK
-    assert reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is Reach.THIS_COMPUTER
+    assert reach({}) is NetworkScope.NETWORK
+    assert reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is NetworkScope.THIS_COMPUTER
     states["lo"] = states["eth0"] = down
-    assert reach({}) is Reach.NOBODY
+    assert reach({}) is NetworkScope.NOBODY
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ import pytest
 from waiting import until
 from zstandard import ZstdCompressor
 
+from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
-from appliance.broker.ledger import Ledger
 from appliance.broker.message import Late, Message
 from appliance.broker.ports import Action, Contact, Decision
 from appliance.mqtt.codec import Property, decode_varint
@@ -31,8 +31,8 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.ros.bridge import RouteSettings
-from appliance.ros.calls.dispatcher import Answer, CallCounters, Offer
-from appliance.ros.calls.replay_guard import Backlog
+from appliance.ros.calls.dispatcher import Answer, CallCounters, CallEndpoint
+from appliance.ros.calls.replay_guard import ReplayGuard
 from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProfile
 from appliance.ros.payload.converter import Converter
 from appliance.ros.payload.fallback import ConversionError
@@ -925,7 +925,7 @@ async def test_no_answer_to_a_call_is_a_command(house):
     async def slow():
         return Answer(GO)
 
-    offer = Offer("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
+    offer = CallEndpoint("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
     board.offer(offer)
     driver = Driver(house.broker, "a")
     properties = {Property.RESPONSE_TOPIC: TOPIC}
@@ -941,7 +941,7 @@ class TestBacklog:
     NEW = Message(TOPIC, GO)
 
     def begin(self):
-        backlog = Backlog()
+        backlog = ReplayGuard()
         assert backlog.has(Late(self.NEW, math.inf), self, 0.5, 100.0)
         return backlog
 
@@ -1678,7 +1678,7 @@ async def test_what_waits_takes_memory_that_is_counted(house, monkeypatch):
     assert ledger.queued_bytes >= before + len(GO) + len(twist())
     assert account.bytes - own == ledger.queued_bytes - before
     with monkeypatch.context() as patch:
-        patch.setattr(Ledger, "fits", lambda *_: False)
+        patch.setattr(Accounting, "fits", lambda *_: False)
         b.drive()
     await until(lambda: house.robot.received == [twist(0.5)])
     assert (ledger.queued_bytes, account.bytes) == (before, own)

@@ -57,7 +57,7 @@ class Counters:
 
 
 @dataclass(slots=True)
-class Ledger:
+class Accounting:
     """What all sessions share: the limits, the counters, the clock and the bytes queued in all."""
 
     limits: Limits

@@ -9,12 +9,12 @@ from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
-from appliance.broker.session import Delivery, Held, PendingWill, Session
+from appliance.broker.session import Delivery, PendingWill, Session, UnreleasedPublish
 from appliance.mqtt.packets import Subscription
 
 
 @dataclass(slots=True)
-class Owed:
+class PendingDelivery:
     """A QoS 1 or 2 message that a session is to be sent; `share` is the filter of its group."""
 
     message: Message
@@ -25,7 +25,7 @@ class Owed:
 
 
 @dataclass(slots=True)
-class Kept:
+class SavedSession:
     """A session and all that belongs to it; times are in seconds of the broker's clock.
 
     `ends_at` is None for one whose client was connected.
@@ -40,15 +40,17 @@ class Kept:
     #: Those of them whose retained messages were not all sent.
     replaying: list[Subscription] = field(default_factory=list)
     #: By packet id, in the order sent; None where only PUBREL is left.
-    inflight: dict[int, Owed | None] = field(default_factory=dict)
-    queue: list[Owed] = field(default_factory=list)
+    inflight: dict[int, PendingDelivery | None] = field(default_factory=dict)
+    queue: list[PendingDelivery] = field(default_factory=list)
     #: QoS 2 messages that wait for PUBREL, with the sessions and groups that had no room for them.
     received: dict[int, tuple[Message, list[str], list[str]]] = field(default_factory=dict)
     #: What the broker made of it.
     session: Session | None = None
 
 
-def restore(broker: Broker, kept: list[Kept], retained: list[tuple[Message, Account]]) -> None:
+def restore(
+    broker: Broker, kept: list[SavedSession], retained: list[tuple[Message, Account]]
+) -> None:
     """Take up the sessions and retained messages of the last run, before anybody connects.
 
     A client that was connected when that ended counts as gone since now: so do the time that
@@ -83,13 +85,13 @@ def restore(broker: Broker, kept: list[Kept], retained: list[tuple[Message, Acco
             broker.begin_replay(entry.session, subscription)
 
 
-def _left_at(entry: Kept) -> float:
+def _left_at(entry: SavedSession) -> float:
     # Who was still there then has left last.
     return math.inf if entry.ends_at is None else entry.ends_at - entry.expiry
 
 
-def _restore_owed(broker: Broker, entry: Kept) -> None:
-    def delivery(owed: Owed) -> Delivery:
+def _restore_owed(broker: Broker, entry: SavedSession) -> None:
+    def delivery(owed: PendingDelivery) -> Delivery:
         share = broker.router.shares.get(owed.share) if owed.share is not None else None
         return Delivery(owed.message, owed.qos, owed.retain, owed.subscription_ids, share)
 
@@ -101,7 +103,7 @@ def _restore_owed(broker: Broker, entry: Kept) -> None:
         },
         [delivery(owed) for owed in entry.queue],
         {
-            packet_id: Held(
+            packet_id: UnreleasedPublish(
                 message,
                 frozenset(
                     receiver

@@ -25,7 +25,7 @@ class _Heard:
     last: str = ""
 
 
-class Complaints:
+class RateLimitedLog:
     """Passes warnings on to the log, and counts those of one key that are too many.
 
     What was left out is told as a number when the interval is over.
