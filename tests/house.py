@@ -159,6 +159,12 @@ def check_network(network: Scheduler) -> None:
     check_accounts(network.broker, wires=total, wires_of=wires)
 
 
+def abort(transport: asyncio.WriteTransport) -> None:
+    """Close it at once, also when it has closed itself behind its last bytes: asyncio's raises."""
+    with contextlib.suppress(AttributeError):
+        transport.abort()
+
+
 class Caller:
     """A client's end of a connection."""
 
@@ -188,9 +194,7 @@ class Caller:
         return b""
 
     def hang_up(self) -> None:
-        # asyncio's own, when it has closed behind its last bytes, cannot be aborted any more.
-        with contextlib.suppress(AttributeError):
-            self.writer.transport.abort()
+        abort(self.writer.transport)
 
 
 class Watches:

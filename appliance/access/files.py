@@ -121,11 +121,11 @@ class FileAccess:
     changes: when all clients come back at once, nothing is hashed again, however many users, and
     no guesser is in their way.
 
-    Other logins are guesses until they are checked: see `LoginThrottle`. When an address has made so many
-    wrong ones that the next would wait too long, it is told to come again (0x89), and nothing is
-    hashed. Who then comes again with the same password waits in a line of its own: a guesser tries
-    others. A password that was found wrong is no guess when it comes again, but a device that was
-    set up wrongly: it slows nobody, and is not hashed again.
+    Other logins are guesses until they are checked: see `LoginThrottle`. When an address has made
+    so many wrong ones that the next would wait too long, it is told to come again (0x89), and
+    nothing is hashed. Who then comes again with the same password waits in a line of its own: a
+    guesser tries others. A password that was found wrong is no guess when it comes again, but a
+    device that was set up wrongly: it slows nobody, and is not hashed again.
     """
 
     def __init__(

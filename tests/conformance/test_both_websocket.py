@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
+from house import abort
 from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
@@ -129,7 +130,7 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
 
         async def dial() -> Caller:
             reader, writer = await asyncio.open_connection(host, port)
-            stack.callback(writer.transport.abort)
+            stack.callback(abort, writer.transport)
             return Caller(reader, writer)
 
         yield dial

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import itertools
 import random
 import ssl
@@ -16,7 +17,7 @@ from typing import Any, cast
 import paho.mqtt.client as paho
 import pytest
 import uvloop
-from house import Caller, House, Watches, make_contexts
+from house import Caller, House, Watches, abort, make_contexts
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from waiting import PATIENCE, until
 from websockets.asyncio.client import ClientConnection, connect
@@ -123,7 +124,7 @@ async def talk(house: House, tls: bool = False, path: str = "/mqtt", **options: 
     )
     talker = Talker(connection)
     house.callers.append(talker)  # type: ignore[arg-type]
-    talker.hang_up = connection.transport.abort  # type: ignore[attr-defined]
+    talker.hang_up = functools.partial(abort, connection.transport)  # type: ignore[attr-defined]
     return talker
 
 
