@@ -129,7 +129,7 @@ class House:
         await self.listeners.stop()
         assert not self.network.open
         assert not self.broker.clients
-        assert self.broker.ledger.queued_bytes == 0
+        assert self.broker.accounting.queued_bytes == 0
         assert self.network.output == 0
         check_network(self.network)
 
@@ -144,7 +144,7 @@ class House:
 
 def check_network(network: Scheduler) -> None:
     """`check_accounts`, with what the connections hold of what came in and of what goes out."""
-    strangers = network.broker.ledger.accounts.strangers
+    strangers = network.broker.accounting.accounts.strangers
     accounts = {strangers} | {protocol.account for protocol in network.open}
     accounts |= {session.account for session in network.broker.sessions.values()}
     wires = {account: account.output for account in accounts}

@@ -647,7 +647,7 @@ async def _store_fails(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("flush.overflow")
 async def _overflows(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
-    site.broker.ledger.overflowed.append(protocol._client.session)
+    site.broker.accounting.overflowed.append(protocol._client.session)
     site.broker.flush()
 
 
@@ -708,7 +708,7 @@ async def _waits(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("clock.full")
 async def _fills(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
-    site.broker.ledger.filled.append((protocol._client.session, "a limit"))
+    site.broker.accounting.filled.append((protocol._client.session, "a limit"))
 
 
 @reach("bridge.sweep")
@@ -969,7 +969,7 @@ def _wrong(site: Site) -> str:
     guests = {guest for each in neighbours for guest in each.guests}
     if not guests <= network.open:
         return f"guests that are gone: {[*map(str, guests - network.open)]}"
-    strangers = broker.ledger.accounts.strangers
+    strangers = broker.accounting.accounts.strangers
     admitted = sum(sum(each.clients.values()) for each in neighbours)
     logged_in = sum(protocol.account is not strangers for protocol in network.open)
     if admitted != logged_in:

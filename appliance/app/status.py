@@ -179,18 +179,18 @@ class Status:
         }
 
     def _memory(self) -> dict[str, Any]:
-        ledger = self._parts.broker.ledger
+        accounting = self._parts.broker.accounting
         return {
             "process": self._process.memory_info().rss,
-            "queued": ledger.queued_bytes,
-            "limit": ledger.memory,
+            "queued": accounting.queued_bytes,
+            "limit": accounting.memory,
         }
 
     def _short(self) -> Iterator[dict[str, Any]]:
         """What is nearly used up, by all together or by the user who has most, and who has it."""
         broker = self._parts.broker
-        ledger, limits, own = broker.ledger, broker.limits, broker.limits.user
-        accounts, quotas, store = ledger.accounts, ledger.quotas, broker.store
+        accounting, limits, own = broker.accounting, broker.limits, broker.limits.user
+        accounts, quotas, store = accounting.accounts, accounting.quotas, broker.store
         figures: list[tuple[str, int, int, int | None, Callable[[Account], int]]] = [
             (
                 "connections",
@@ -200,7 +200,7 @@ class Status:
                 _CONNECTIONS,
             ),
             ("sessions", accounts.sessions, limits.sessions, own.sessions, _SESSIONS),
-            ("memory", ledger.queued_bytes, ledger.memory, quotas.memory.own, _MEMORY),
+            ("memory", accounting.queued_bytes, accounting.memory, quotas.memory.own, _MEMORY),
             (
                 "retained_messages",
                 accounts.retained,

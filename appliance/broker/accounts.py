@@ -43,7 +43,7 @@ class Account:
         self.present: dict[Session, None] = {}
         #: And those whose clients are not, in the order of their leaving.
         self.absent: dict[Session, None] = {}
-        #: Its part of `Ledger.queued_bytes`, and of that what waits in the network.
+        #: Its part of `Accounting.queued_bytes`, and of that what waits in the network.
         self.bytes = 0
         self.output = 0
         #: Retained messages that it was the last to publish, and their bytes.

@@ -75,12 +75,12 @@ class Congestion:
     __slots__ = (
         "_a_byte",
         "_a_message",
+        "_accounting",
         "_allowance",
         "_dawdled",
         "_earned",
         "_held_back",
         "_is_owed",
-        "_ledger",
         "_looked_at",
         "_session",
         "_unwritten",
@@ -88,13 +88,13 @@ class Congestion:
         "awaited",
     )
 
-    def __init__(self, session: Session, ledger: Accounting) -> None:
+    def __init__(self, session: Session, accounting: Accounting) -> None:
         self._session = session
-        self._ledger = ledger
-        self._a_message = PATIENCE / ledger.limits.queue_messages
-        self._a_byte = PATIENCE / ledger.limits.queue_bytes
+        self._accounting = accounting
+        self._a_message = PATIENCE / accounting.limits.queue_messages
+        self._a_byte = PATIENCE / accounting.limits.queue_bytes
         self._allowance = Allowance(PATIENCE)
-        self._looked_at = ledger.spare()
+        self._looked_at = accounting.spare()
         self._earned = 0.0  # since it was looked at
         self._dawdled = 0.0
         #: Packet ids that wait for the flush, and for a batch of the store.
@@ -106,7 +106,7 @@ class Congestion:
         self._waiting: dict[Waiting, None] = {}
         #: Whether somebody waits for room and was not told yet that there is some.
         self.awaited = False
-        ledger.congested[session] = None
+        accounting.congested[session] = None
 
     def acknowledged(self, packet_id: int, size: int) -> None:
         """The reader has a message of so many bytes."""
@@ -114,7 +114,7 @@ class Congestion:
         by_size = size * self._a_byte
         self._earned += by_size if by_size > self._a_message else self._a_message
         if self._allowance.used_up and self._earned > PATIENCE / 2 and self.patience():
-            self._ledger.congested[self._session] = None
+            self._accounting.congested[self._session] = None
 
     @property
     def left(self) -> float:
@@ -154,8 +154,8 @@ class Congestion:
     def _settle(self) -> None:
         """Take account of the time up to now."""
         # The reader is not to blame for the time in which the broker had others to serve.
-        now, idle = self._ledger.spare(), 0.0
-        if self._is_owed or self._ledger.failing:
+        now, idle = self._accounting.spare(), 0.0
+        if self._is_owed or self._accounting.failing:
             idle = now - self._looked_at
             self._dawdled += idle
         self._allowance.change(self._earned - idle)
@@ -164,7 +164,7 @@ class Congestion:
 
     def dawdled(self) -> float:
         """Seconds since the beginning in which it was the reader that was waited for."""
-        if self._session in self._ledger.congested:
+        if self._session in self._accounting.congested:
             self._settle()
         return self._dawdled
 
@@ -174,7 +174,7 @@ class Congestion:
         allowance = self._allowance
         if not allowance.used_up:
             return allowance.left
-        self._ledger.congested.pop(self._session, None)
+        self._accounting.congested.pop(self._session, None)
         return 0.0
 
     def wait(self, publisher: Waiting) -> None:
@@ -197,15 +197,15 @@ class Congestion:
 
     def resume(self) -> None:
         """The reader has come back, to what is left of the patience with it."""
-        self._looked_at = self._ledger.spare()
+        self._looked_at = self._accounting.spare()
         self._earned = 0.0
         self._unwritten.clear()
         self._held_back.clear()
         self._is_owed = True
         if not self._allowance.used_up:
-            self._ledger.congested[self._session] = None
+            self._accounting.congested[self._session] = None
 
     def end(self) -> None:
         """The queue is empty, or its reader gone: nobody waits for it."""
-        self._ledger.congested.pop(self._session, None)
+        self._accounting.congested.pop(self._session, None)
         self.wake()

@@ -134,18 +134,18 @@ class Broker:
         self.store = store
         self.limits = limits or Limits()
         self.features = features or Features()
-        self.complaints = RateLimitedLog()
+        self.rate_limited_log = RateLimitedLog()
         #: When `tick` was last through.
         self.ticked_at = -math.inf
         #: What escaped somewhere, and was caught where it entered.
-        self.faults = Faults(self.complaints)
-        self.ledger = Accounting(self.limits, store, faults=self.faults)
+        self.faults = Faults(self.rate_limited_log)
+        self.accounting = Accounting(self.limits, store, faults=self.faults)
         #: What the broker counts.
-        self.counters = self.ledger.counters
+        self.counters = self.accounting.counters
         self.sessions: dict[str, Session] = {}
-        self.router = Router(access, self.ledger, self.sessions)
-        self.ledger.may_keep = self.router.may_keep
-        self.retained = Retained(self.ledger, self.complaints, self._retained_changed)
+        self.router = Router(access, self.accounting, self.sessions)
+        self.accounting.may_keep = self.router.may_keep
+        self.retained = Retained(self.accounting, self.rate_limited_log, self._retained_changed)
         self.heads = Heads()
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
@@ -169,7 +169,7 @@ class Broker:
     @property
     def now(self) -> float:
         """Seconds of the clock that `tick` was last given."""
-        return self.ledger.now
+        return self.accounting.now
 
     @property
     def subscription_count(self) -> int:
@@ -200,9 +200,9 @@ class Broker:
                 will has no room.
         """
         self.counters.effort += CONNECT_EFFORT
-        account = self.ledger.accounts.of(identity)
-        if will is not None and not self.ledger.fits(account, will.message.size):
-            reason = f"no room for its will: {self.ledger.memory_shortage(will.message.size)}"
+        account = self.accounting.accounts.of(identity)
+        if will is not None and not self.accounting.fits(account, will.message.size):
+            reason = f"no room for its will: {self.accounting.memory_shortage(will.message.size)}"
             raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason)
         session = self.sessions.get(identity.client_id)
         if session is not None:
@@ -223,11 +223,11 @@ class Broker:
         session = self.sessions.get(identity.client_id)
         present = session is not None
         if session is None:
-            session = Session(identity.client_id, identity, self.ledger)
+            session = Session(identity.client_id, identity, self.accounting)
             self.sessions[identity.client_id] = session
         session.link = link
         try:
-            self.ledger.accounts.came(session)
+            self.accounting.accounts.came(session)
             session.connected_at = self.now
             session.ends_at = None
             session.set_will(will)
@@ -267,13 +267,13 @@ class Broker:
         Raises:
             ProtocolError: 0x97, none may be ended for it.
         """
-        accounts, own = self.ledger.accounts, self.limits.user.connections
+        accounts, own = self.accounting.accounts, self.limits.user.connections
         if own is not None and account.connections >= own:
             raise _has_all(account, account.connections, "connections")
         if accounts.connections < self.limits.connections:
             return None
         holder = accounts.largest(lambda each: each.connections)
-        if self.ledger.quotas.connections.must_yield(holder.connections, account.connections):
+        if self.accounting.quotas.connections.must_yield(holder.connections, account.connections):
             return next(reversed(holder.present))
         raise _all_taken(account, account.connections, "connections", self.limits.connections)
 
@@ -286,7 +286,7 @@ class Broker:
         Raises:
             ProtocolError: 0x97, none may be ended for it.
         """
-        accounts, own = self.ledger.accounts, self.limits.user.sessions
+        accounts, own = self.accounting.accounts, self.limits.user.sessions
         has_all_of_its_own = own is not None and account.sessions >= own
         if not has_all_of_its_own and accounts.sessions < self.limits.sessions:
             return None
@@ -301,7 +301,7 @@ class Broker:
             raise _has_all(account, account.sessions, "sessions")
         # With fewer sessions than connections allowed all may be in use.
         holder = accounts.largest(lambda each: each.connections)
-        if self.ledger.quotas.sessions.must_yield(holder.sessions, account.sessions):
+        if self.accounting.quotas.sessions.must_yield(holder.sessions, account.sessions):
             return next(reversed(holder.present))
         raise _all_taken(account, account.sessions, "sessions", self.limits.sessions)
 
@@ -312,7 +312,7 @@ class Broker:
         key = ("taken back", what, holder.username)
         if holder is account:
             own = self.limits.user.sessions
-            self.complaints.tell(
+            self.rate_limited_log.warning(
                 self.now,
                 key,
                 "%s makes room for another session of its user: %s has %d sessions, there may be "
@@ -323,7 +323,7 @@ class Broker:
                 "sessions" if own is None or account.sessions < own else "user.sessions",
             )
         else:
-            self.complaints.tell(
+            self.rate_limited_log.warning(
                 self.now,
                 key,
                 "%s makes room for %s: broker.limits.%s is reached, and %s has most of it "
@@ -342,7 +342,7 @@ class Broker:
     def claim(self, session: Session, identity: Identity) -> None:
         """A session that was made for a client that had not logged in yet has found its user."""
         session.identity = identity
-        self.ledger.accounts.move(session, self.ledger.accounts.of(identity))
+        self.accounting.accounts.move(session, self.accounting.accounts.of(identity))
         self.store.session_saved(session)
         session.readable.clear()
         self.router.changed()
@@ -369,7 +369,7 @@ class Broker:
             # It was stored by a version that let clients have such an id; nobody comes for it.
             log.warning("the session of %s is ended: its client id is the appliance's own", before)
             self._end(before)
-        session = Session(client_id, None, self.ledger)
+        session = Session(client_id, None, self.accounting)
         session.link = link
         session.link_for = link_for
         self.sessions[client_id] = session
@@ -409,7 +409,7 @@ class Broker:
         if not session.persistent:
             self._end(session)
             return
-        self.ledger.accounts.left(session)
+        self.accounting.accounts.left(session)
         session.ends_at = self.now + session.expiry
         if will is not None and will.delay:
             session.will_at = self.now + will.delay
@@ -442,7 +442,7 @@ class Broker:
         """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
         if self.sessions.get(session.client_id) is session:
             del self.sessions[session.client_id]
-        self.ledger.accounts.ended(session)
+        self.accounting.accounts.ended(session)
         self._publish_will(session)
         session.ends_at = None
         # Each for itself: what is left of a session that has ended would be there for good.
@@ -486,7 +486,7 @@ class Broker:
         def give(delivery: Delivery) -> bool:
             message, _, _, _, share = delivery
             assert share is not None
-            if self.ledger.has_expired(message):
+            if self.accounting.has_expired(message):
                 return True
             members = known.get(share)
             if members is None:
@@ -511,7 +511,7 @@ class Broker:
             self._publish_late(will, session)
         except ProtocolError as error:  # the limits are not what they were at its CONNECT
             self.counters.publish_dropped += 1
-            self.complain(session, "its will cannot be published: %s", error)
+            self.log_rate_limited(session, "its will cannot be published: %s", error)
         except Exception as error:
             self.counters.publish_dropped += 1
             self.faults.caught("broker.will", error, session)
@@ -552,7 +552,7 @@ class Broker:
         """
         self.limits = limits
         self.features = features
-        self.ledger.use(limits)
+        self.accounting.use(limits)
         self.router.changed()  # topics that were too long may not be so any more
 
     def guards_changed(self) -> None:
@@ -577,14 +577,14 @@ class Broker:
             ProtocolError: the topic is not valid.
         """
         route = self.router.route(origin, message.topic_wire)
-        if not self.ledger.refusing:
+        if not self.accounting.refusing:
             return self.publish_to(route.targets, route, message, origin)
         # Who cannot be told would take it for kept: so it is, in memory, until the store can.
-        self.ledger.refusing = False
+        self.accounting.refusing = False
         try:
             return self.publish_to(route.targets, route, message, origin)
         finally:
-            self.ledger.refusing = True
+            self.accounting.refusing = True
 
     def publish_to(
         self, targets: list[Target], route: Fanout, message: Message, origin: Session
@@ -611,7 +611,7 @@ class Broker:
             if delivered:
                 taken = True
             elif qos:
-                if self.ledger.refusing and session.persistent:
+                if self.accounting.refusing and session.persistent:
                     kept = False  # who publishes has to try again, whoever else has got it
                 else:
                     self._tell_full(session, message)
@@ -623,7 +623,7 @@ class Broker:
                 taken = True
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
                 self.counters.publish_dropped += chosen is None
-                if self.ledger.refusing and any(m[1] and m[0].persistent for m in members):
+                if self.accounting.refusing and any(m[1] and m[0].persistent for m in members):
                     kept = False
                 else:
                     self._tell_full(asked, message)
@@ -748,13 +748,13 @@ class Broker:
         message, full, _ = held
         if age > LATE:
             message = Late(message, age + message.age)
-        if self.ledger.has_expired(message):
+        if self.accounting.has_expired(message):
             return
         try:
             route = self.router.route(origin, message.topic_wire)
         except ProtocolError as error:  # the limits are not what they were at its PUBREC
             self.counters.publish_dropped += 1
-            self.complain(origin, "its message cannot be published: %s", error)
+            self.log_rate_limited(origin, "its message cannot be published: %s", error)
             return
         self._count_looks(route)
         targets: list[Target] = []
@@ -787,21 +787,23 @@ class Broker:
         if self.observer is not None:
             self.observer.refused(session, message)
         self._tell_denied(session, Action.PUBLISH, route.topic, route.reason)
-        self.complain(session, "may not publish to %s: %s", quote(route.topic), route.reason)
+        self.log_rate_limited(
+            session, "may not publish to %s: %s", quote(route.topic), route.reason
+        )
 
     def _tell_denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
         if self.journal is not None and session.identity is not None:
             self.journal.denied(session, action, topic, reason)
 
-    def complain(self, session: Session, message: str, *args: object) -> None:
+    def log_rate_limited(self, session: Session, message: str, *args: object) -> None:
         """Log what a client does wrong, but not every time that it does it again."""
         key = session.client_id, message
-        self.complaints.tell(self.now, key, f"%s {message}", session, *args)
+        self.rate_limited_log.warning(self.now, key, f"%s {message}", session, *args)
 
     def _tell_full(self, session: Session, message: Message) -> None:
         if session.link is None:
             return  # that is told at the next tick, once: it is not slow, but away
-        self.complain(
+        self.log_rate_limited(
             session,
             "takes its messages too slowly, its queue is full: %s (it has %d messages, %d bytes)",
             session.shortage(message.size),
@@ -823,7 +825,7 @@ class Broker:
             code, reason = refusal
             name = quote(subscription.filter)
             self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
-            self.complain(session, "may not subscribe to %s: %s", name, reason)
+            self.log_rate_limited(session, "may not subscribe to %s: %s", name, reason)
             return code, reason
         topic_filter = subscription.filter
         if session.subscriptions.get(topic_filter) != subscription:
@@ -941,15 +943,15 @@ class Broker:
 
         Returns when a will or a session falls due next, infinity for never, and `now` when more is
         due than one turn is for: thousands of clients that fall silent together do not stop the
-        others, nor a hundred wills that are long to deliver. Between two ticks `ledger.now` may be
-        moved on, so that what begins then is not cut short.
+        others, nor a hundred wills that are long to deliver. Between two ticks `accounting.now` may
+        be moved on, so that what begins then is not cut short.
         """
         faults = self.faults
-        self.ledger.now = faults.now = now
-        faults.run("clock.complaints", self.complaints.tick, now, otherwise=None)
+        self.accounting.now = faults.now = now
+        faults.run("clock.rate_limited_log", self.rate_limited_log.tick, now, otherwise=None)
         end = self.counters.effort + EFFORT_A_TICK
         expires_more = faults.run("clock.retained", self.retained.expire, now, otherwise=False)
-        filled, self.ledger.filled = self.ledger.filled, []
+        filled, self.accounting.filled = self.accounting.filled, []
         for session, shortage in filled:
             faults.run("clock.full", self._tell_filled, session, shortage, otherwise=None)
         left = ENDINGS_A_TURN
@@ -1014,7 +1016,7 @@ class Broker:
 
         What depends on changes that the store has not committed waits: acknowledged means kept.
         """
-        overflowed = self.ledger.overflowed
+        overflowed = self.accounting.overflowed
         while overflowed:
             self.faults.run("flush.overflow", self._close_full, overflowed.pop(), otherwise=None)
         if not self.unflushed:
@@ -1067,11 +1069,11 @@ class Broker:
                         self._waiting[output] = None
                 except Exception as error:
                     self._abandon("commit.release", error, output)
-            if self.ledger.failing:
+            if self.accounting.failing:
                 self._recover()
         else:
-            if not self.ledger.failing:
-                self.ledger.failing = self.ledger.refusing = True
+            if not self.accounting.failing:
+                self.accounting.failing = self.accounting.refusing = True
                 for session in self.sessions.values():
                     session.hold_back()
             for output in waiting:
@@ -1082,7 +1084,7 @@ class Broker:
 
     def _recover(self) -> None:
         """What had to wait for the store can go on."""
-        self.ledger.failing = self.ledger.refusing = False
+        self.accounting.failing = self.accounting.refusing = False
         for client in tuple(self.clients):
             try:
                 client.resume()

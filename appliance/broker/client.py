@@ -88,7 +88,8 @@ LOOK_AGAIN = 0.01
 #: What may have to wait behind a message: a packet, or a PUBLISH that was only taken apart.
 Arrived: TypeAlias = "Packet | RawPublish"
 
-#: Lines about one host and one kind of mistake in `complaints.INTERVAL`: it may be many clients.
+#: Lines in one `rate_limited_log.INTERVAL` about one host and one kind of mistake: behind a host
+#: there may be many clients.
 HOST_BURST = 100
 
 
@@ -125,7 +126,7 @@ class Client:
         #: When what it publishes has come.
         self.inflow = Inflow()
         self._router = broker.router
-        self._ledger = broker.ledger
+        self._accounting = broker.accounting
         self._counters = broker.counters
         self._store = broker.store
         #: PUBRELs that wait until the store can keep what they release.
@@ -139,9 +140,9 @@ class Client:
         #: Whether the PUBLISH that is worked on has waited for such an answer.
         self._has_waited = False
         self._connect: Connect | None = None
-        self._held = 0  # bytes of the connection that are counted in the ledger
+        self._held = 0  # bytes of the connection that are counted in the accounting
         #: Who they are counted for: nobody in particular until the login.
-        self.account = broker.ledger.accounts.strangers
+        self.account = broker.accounting.accounts.strangers
         self._silence = 0.0  # seconds; 0 for none
         self._heard_at = 0.0
         self._method = ""  # of its enhanced authentication
@@ -165,7 +166,7 @@ class Client:
         #: For answers about who else may receive its messages.
         self._rights_allowance = Allowance(RIGHTS_PATIENCE)
         self._asked_at = 0.0
-        self._congested = broker.ledger.congested
+        self._congested = broker.accounting.congested
         self._hurries = False
         #: Whether `send_on` will be called anyway.
         self._later = False
@@ -180,7 +181,7 @@ class Client:
         """Take in what came from the network and do what it says."""
         counters = self._counters
         counters.bytes_received += len(data)
-        now = self._ledger.now
+        now = self._accounting.now
         connection = self.connection
         effort = counters.effort + EFFORT_A_TURN
         inflow = self.inflow
@@ -261,16 +262,16 @@ class Client:
 
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
-        ledger = self._ledger
+        accounting = self._accounting
         grown = self.connection.held + self._behind_size - self._held
         self._held += grown
-        ledger.take(self.account, grown)
-        ledger.input_bytes += grown
+        accounting.take(self.account, grown)
+        accounting.input_bytes += grown
         self.wire.holds(self._held)
         if (
             grown > 0
-            and self._held > max(ledger.reserve, SMALL_PACKET)
-            and not ledger.fits(self.account, 0)
+            and self._held > max(accounting.reserve, SMALL_PACKET)
+            and not accounting.fits(self.account, 0)
         ):
             self.fail(
                 ProtocolError(
@@ -364,7 +365,7 @@ class Client:
             self._refuse_payload(session, message, packet_id)
         elif packet.qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
-        elif self._came_at and route.allowed and self._ledger.has_expired(message):
+        elif self._came_at and route.allowed and self._accounting.has_expired(message):
             if packet.qos:  # it was received, and is for nobody any more [MQTT-3.3.2-5]
                 self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
@@ -380,7 +381,7 @@ class Client:
             return ""
         if code == ReasonCode.NOT_AUTHORIZED:
             return route.reason
-        if self._ledger.refusing:
+        if self._accounting.refusing:
             return CANNOT_KEEP
         return self.broker.shortage(route, message, session)
 
@@ -405,7 +406,7 @@ class Client:
         asked = self._router.asked
         if asked is None or self._has_waited or session is None:
             return False
-        allowance, now = self._rights_allowance, self._ledger.now
+        allowance, now = self._rights_allowance, self._accounting.now
         allowance.change((now - self._asked_at) * RIGHTS_SHARE)
         self._asked_at = now
         if allowance.used_up and not self._is_asked_about(route):
@@ -425,14 +426,14 @@ class Client:
 
         def work() -> Iterator[Step]:
             yield from answers(self.broker, own, self._wake, until)
-            since = self._ledger.now
+            since = self._accounting.now
             if not allowance.used_up and questions():
                 soon = since + allowance.left
                 for step in answers(self.broker, questions, self._wake, soon):
-                    self.wire.wait(max(soon - self._ledger.now, LOOK_AGAIN))
+                    self.wire.wait(max(soon - self._accounting.now, LOOK_AGAIN))
                     yield step
-                allowance.change(since - self._ledger.now)
-            self._asked_at = self._ledger.now
+                allowance.change(since - self._accounting.now)
+            self._asked_at = self._accounting.now
             self._has_waited = True
             self._came_at = came_at
             try:
@@ -454,11 +455,11 @@ class Client:
 
     def _is_old(self) -> bool:
         """Whether what had to wait did so for long: who does not carry out what is old is told."""
-        return self._ledger.now - self._came_at > LATE
+        return self._accounting.now - self._came_at > LATE
 
     def _age(self) -> float:
         """How old what is done now is: of what had to wait, nobody knows for how long it had."""
-        return self._ledger.now - self._came_at if self.inflow.unfinished else math.inf
+        return self._accounting.now - self._came_at if self.inflow.unfinished else math.inf
 
     def _wake(self) -> None:
         """Somebody has answered what a packet waits for."""
@@ -474,7 +475,7 @@ class Client:
         if not congestions or allowance.used_up or self._hurries:
             self._get_on()
             return False
-        self._waits_since = now = self._ledger.now
+        self._waits_since = now = self._accounting.now
         for congestion in self._awaited:
             if congestion not in congestions:
                 congestion.forget(self)
@@ -514,12 +515,15 @@ class Client:
 
         Nothing comes behind what is no PUBLISH, which may change what is to be done with it.
         """
-        ledger = self._ledger
+        accounting = self._accounting
         grown = self._behind_size + self.connection.held - self._held
         return (
-            self._behind_size < ledger.queue_bytes
+            self._behind_size < accounting.queue_bytes
             and isinstance(self._behind[-1][0], tuple | Publish)
-            and (ledger.queued_bytes + grown <= ledger.plenty or ledger.fits(self.account, grown))
+            and (
+                accounting.queued_bytes + grown <= accounting.plenty
+                or accounting.fits(self.account, grown)
+            )
         )
 
     def _passing(self, data: bytes, limit: int) -> Iterator[Event]:
@@ -535,8 +539,8 @@ class Client:
             if isinstance(event, int | Puback | Pubrec | Pubrel | Pubcomp | Pingreq):
                 yield event
                 continue
-            self._heard_at = self._ledger.now
-            self._behind.append((event, self._came_at or self._ledger.now))
+            self._heard_at = self._accounting.now
+            self._behind.append((event, self._came_at or self._accounting.now))
             self._behind_size += _size(event)
             counters.effort += 1 if isinstance(event, tuple) else PACKET_EFFORT + connection.effort
             if not self._has_place_behind():
@@ -553,11 +557,11 @@ class Client:
         limit = self._counters.effort + EFFORT_A_TURN
         if self._awaited:
             dawdled = sum(congestion.dawdled() for congestion in self._awaited)
-            waited = self._ledger.now - self._waits_since
+            waited = self._accounting.now - self._waits_since
             # All together cannot have kept it waiting for longer than it has waited.
             counted = min(max(dawdled - self._dawdled, waited * LEAST_COUNTED), waited)
             self._allowance.change(-counted)
-            self._waits_since, self._dawdled = self._ledger.now, dawdled
+            self._waits_since, self._dawdled = self._accounting.now, dawdled
         try:
             while behind and self._work is None:
                 if self._counters.effort > limit:
@@ -594,13 +598,15 @@ class Client:
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        came_at = self._came_at or self._ledger.now
+        came_at = self._came_at or self._accounting.now
         return came_at + interval if isinstance(interval, int) else None
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
         reason = "the payload is marked as UTF-8 text and is not"
-        self.broker.complain(session, "may not publish to %s: %s", quote(message.topic), reason)
+        self.broker.log_rate_limited(
+            session, "may not publish to %s: %s", quote(message.topic), reason
+        )
         if message.qos == 1:
             self.output.acknowledge(0x40, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
         elif message.qos:
@@ -614,7 +620,7 @@ class Client:
         code, reason = ReasonCode.SUCCESS, ""
         held = session.received.get(packet_id)
         if (
-            self._ledger.refusing
+            self._accounting.refusing
             and route.allowed
             and self.broker.must_store(route, message, session)
         ):
@@ -683,12 +689,12 @@ class Client:
             known = session.pubrec(packet_id, code)
             if not known:
                 log.debug("%s: PUBREC %d for nothing in flight", self, packet_id)
-            if code < 0x80 and not (self._ledger.failing and session.expiry):
+            if code < 0x80 and not (self._accounting.failing and session.expiry):
                 # An unknown id is answered too, or a client that missed our end would wait forever;
                 # without 0x92, which says nothing that it needs (and as mosquitto does).
                 self.output.acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
-            if self._ledger.failing and self._must_postpone(session, packet_id):
+            if self._accounting.failing and self._must_postpone(session, packet_id):
                 return
             held = session.unhold(packet_id)
             answer = ReasonCode.SUCCESS
@@ -756,7 +762,7 @@ class Client:
                 # What comes behind the packet waits for its end.
                 self._work = work
                 self._is_awaiting = answer is not None
-                self._awaits_since = self._awaits_since or self._came_at or self._ledger.now
+                self._awaits_since = self._awaits_since or self._came_at or self._accounting.now
                 self.connection.pause()
                 if answer is None:
                     self.later()
@@ -769,7 +775,7 @@ class Client:
     def _go_on(self, work: Iterator[Step]) -> None:
         """Go on with what the last turn was too short for."""
         self._is_awaiting = False
-        self._heard_at = self._ledger.now  # what it says meanwhile is not heard
+        self._heard_at = self._accounting.now  # what it says meanwhile is not heard
         try:
             self._begin(work)
         except ProtocolError as error:
@@ -898,7 +904,7 @@ class Client:
             return
         user = self._connect.username if self._connect else None
         name = self._connect.client_id if self._connect else ""
-        self._complain(
+        self._log_rate_limited(
             "client %s (%s) at %s refused: %s",
             quote(name),
             f"user {quote(user)}" if user is not None else "no user name",
@@ -928,7 +934,7 @@ class Client:
         identity = Identity(username, assigned or packet.client_id)
         try:
             agreement = agree(packet, self.broker.limits)
-            refusal = self.wire.admit(self._ledger.accounts.of(identity))
+            refusal = self.wire.admit(self._accounting.accounts.of(identity))
             if refusal:
                 raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, refusal)
             session, present = self.broker.connect(
@@ -979,14 +985,14 @@ class Client:
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
         session.reconnected()
         self.session = session
-        self._ledger.take(self.account, -self._held)
+        self._accounting.take(self.account, -self._held)
         self.account = session.account
-        self._ledger.take(self.account, self._held)
+        self._accounting.take(self.account, self._held)
         self.output.may_explain = agreement.explain
         explains = agreement.explain and self.broker.features.reason_strings
         self.output.open(session, agreement.aliases, explains=explains)
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
-        self._heard_at = self._ledger.now
+        self._heard_at = self._accounting.now
         self.connection.accept()
         counters = self._counters
         counters.connects += 1
@@ -1035,7 +1041,7 @@ class Client:
             return
         if self.session is None or isinstance(packet, Connack):
             # There is nothing to refuse it with [MQTT-3.14.0-1].
-            self._complain("%s: its Maximum Packet Size is too small for %s", self, packet)
+            self._log_rate_limited("%s: its Maximum Packet Size is too small for %s", self, packet)
             self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
         elif not isinstance(packet, Disconnect):
             reason = f"its Maximum Packet Size is too small for a {packet.TYPE.name}"
@@ -1045,7 +1051,7 @@ class Client:
 
     def fail(self, error: ProtocolError) -> None:
         """The client broke the protocol: tell it why, where it can be told, and close."""
-        self._complain("%s broke the protocol: %s (0x%02X)", self, error, error.code)
+        self._log_rate_limited("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
             if self.broker.journal is not None:
                 self.broker.journal.refused(self.wire.address, str(error), error.code)
@@ -1106,11 +1112,11 @@ class Client:
             self._send(Disconnect(reason, in_words(message) if self.output.explains else None))
         self._leave(message, publish_will=True)
 
-    def _complain(self, message: str, *args: object) -> None:
+    def _log_rate_limited(self, message: str, *args: object) -> None:
         """Log what came from the client's address, unless it is a flood."""
         host, _, _ = self.wire.address.rpartition(":")
-        now = self._ledger.now
-        self.broker.complaints.tell(now, (host, message), message, *args, burst=HOST_BURST)
+        now = self._accounting.now
+        self.broker.rate_limited_log.warning(now, (host, message), message, *args, burst=HOST_BURST)
 
     def lost(self) -> None:
         """The connection ended without a DISCONNECT."""
@@ -1151,8 +1157,8 @@ class Client:
         self._closed = True
         self._work = None
         try:
-            self._ledger.take(self.account, -self._held)
-            self._ledger.input_bytes -= self._held
+            self._accounting.take(self.account, -self._held)
+            self._accounting.input_bytes -= self._held
             self._held = 0
             self.broker.clients.discard(self)
             self._stop_waiting()

@@ -33,7 +33,7 @@ class Faults:
     place in the code, and it is its own affair how many there may be in all.
     """
 
-    def __init__(self, complaints: RateLimitedLog | None = None) -> None:
+    def __init__(self, rate_limited_log: RateLimitedLog | None = None) -> None:
         #: Seconds of the broker's clock.
         self.now = 0.0
         #: How many there were since the start; in all, and by entry.
@@ -44,7 +44,7 @@ class Faults:
         #: The last report that was written.
         self.reported = ""
         self.report: Callable[[BaseException, str], object] = _no_report
-        self._complaints = complaints or RateLimitedLog()
+        self._rate_limited_log = rate_limited_log or RateLimitedLog()
         self._places: set[str] = set()
 
     def caught(self, entry: str, error: BaseException, served: object = "") -> None:
@@ -63,7 +63,7 @@ class Faults:
     def _tell(self, entry: str, error: BaseException, what: str) -> None:
         place = f"{entry} {type(error).__name__} {_place(error)}"
         if place in self._places or len(self._places) >= PLACES:
-            self._complaints.tell(self.now, ("fault", entry), "%s", self.last)
+            self._rate_limited_log.warning(self.now, ("fault", entry), "%s", self.last)
             return
         self._places.add(place)
         written = self.report(error, what)

@@ -72,7 +72,7 @@ class Output:
         self.batch = 0
         self._waiting: deque[tuple[int, list[bytes]]] = deque()
         self._broker = broker
-        self._ledger = broker.ledger
+        self._accounting = broker.accounting
         self._counters = broker.counters
         self._heads = broker.heads
         #: None at the end: the two know each other, and nobody looks for such circles.
@@ -173,7 +173,7 @@ class Output:
         """
         session = self.session
         # With `keep` there is a queue, which nothing may pass.
-        if first & 0x06 or session is None or self._ledger.limits.keep or not self.is_behind():
+        if first & 0x06 or session is None or self._accounting.limits.keep or not self.is_behind():
             return False
         session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
         return True
@@ -211,7 +211,7 @@ class Output:
             ):
                 alias = aliases[message.topic] = len(aliases) + 1
         return message.encode_for(
-            first, packet_id, subscription_ids, self._ledger.now, alias, named=named
+            first, packet_id, subscription_ids, self._accounting.now, alias, named=named
         )
 
     def _is_refused(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
@@ -233,7 +233,7 @@ class Output:
         # A topic gets no new alias from a message that is near the limit, see `_encode`.
         alias = self._aliases.get(message.topic, 0) if self._aliases else 0
         packet = message.encode_for(
-            first, 1, subscription_ids, self._ledger.now, alias, named=not alias
+            first, 1, subscription_ids, self._accounting.now, alias, named=not alias
         )
         return len(packet) > limit
 
@@ -277,7 +277,7 @@ class Output:
                     self.send(_REFUSALS[first](packet_id, code, in_words(reason)))
                     return
                 packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
-            elif code == ReasonCode.QUOTA_EXCEEDED and self._ledger.refusing:
+            elif code == ReasonCode.QUOTA_EXCEEDED and self._accounting.refusing:
                 # 3.1.1 cannot refuse, and what is acknowledged must be kept.
                 raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
         out = self._out

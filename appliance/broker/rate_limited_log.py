@@ -1,4 +1,4 @@
-"""Log lines about what clients do wrong: as many as a reader needs, not as many as a flood has."""
+"""Rate limit for log lines that clients can cause: a flood of mistakes is not a flood of lines."""
 
 from __future__ import annotations
 
@@ -9,57 +9,59 @@ from dataclasses import dataclass
 
 log = logging.getLogger(__name__)
 
-#: Lines about the same thing that are logged in one interval, and its seconds.
+#: Lines that are logged for one key in one interval, and the length of an interval in seconds.
 BURST = 5
 INTERVAL = 10.0
 
-#: Things that are told apart; of more, those that were heard of least recently are forgotten.
-REMEMBERED = 1024
+#: Keys that are counted at the same time; above this the least recently used one is evicted.
+MAXIMUM_KEYS = 1024
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Entry:
+    """What was logged and suppressed for one key since the interval began."""
+
     since: float
-    told: int = 0
-    untold: int = 0
+    logged: int = 0
+    suppressed: int = 0
     last: str = ""
 
 
 class RateLimitedLog:
-    """Passes warnings on to the log, and counts those of one key that are too many.
+    """Logs warnings, at most BURST for a key in an interval.
 
-    What was left out is told as a number when the interval is over.
+    Suppressed warnings are counted; the count and the last text are logged when the interval ends.
     """
 
     def __init__(self) -> None:
-        self._heard: OrderedDict[Hashable, _Heard] = OrderedDict()
+        self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
 
-    def tell(
+    def warning(
         self, now: float, key: Hashable, message: str, *args: object, burst: int = BURST
     ) -> None:
-        """Log a warning, unless there were `burst` of them with this key in the last seconds."""
-        heard = self._heard.get(key)
-        if heard is None or now - heard.since >= INTERVAL:
-            if heard is not None:
-                self._tell_untold(heard)
-            heard = self._heard[key] = _Heard(now)
-            if len(self._heard) > REMEMBERED:
-                self._tell_untold(self._heard.popitem(last=False)[1])
-        self._heard.move_to_end(key)
-        if heard.told < burst:
-            heard.told += 1
+        """Log a warning, unless `burst` warnings were logged for this key in this interval."""
+        entry = self._entries.get(key)
+        if entry is None or now - entry.since >= INTERVAL:
+            if entry is not None:
+                self._log_suppressed(entry)
+            entry = self._entries[key] = _Entry(now)
+            if len(self._entries) > MAXIMUM_KEYS:
+                self._log_suppressed(self._entries.popitem(last=False)[1])
+        self._entries.move_to_end(key)
+        if entry.logged < burst:
+            entry.logged += 1
             log.warning(message, *args)
         else:
-            heard.untold += 1
-            heard.last = message % args
+            entry.suppressed += 1
+            entry.last = message % args
 
     def tick(self, now: float) -> None:
-        """Tell what was left out in intervals that are over."""
-        for key, heard in list(self._heard.items()):
-            if now - heard.since >= INTERVAL:
-                self._tell_untold(heard)
-                del self._heard[key]
+        """Log the counts of suppressed warnings of intervals that have ended."""
+        for key, entry in list(self._entries.items()):
+            if now - entry.since >= INTERVAL:
+                self._log_suppressed(entry)
+                del self._entries[key]
 
-    def _tell_untold(self, heard: _Heard) -> None:
-        if heard.untold:
-            log.warning("%d more of this kind, the last: %s", heard.untold, heard.last)
+    def _log_suppressed(self, entry: _Entry) -> None:
+        if entry.suppressed:
+            log.warning("%d more of this kind, the last: %s", entry.suppressed, entry.last)

@@ -46,14 +46,14 @@ class Retained:
 
     def __init__(
         self,
-        ledger: Accounting,
-        complaints: RateLimitedLog,
+        accounting: Accounting,
+        rate_limited_log: RateLimitedLog,
         changed: Callable[[Message, Account], None],
     ) -> None:
         #: Bytes of all of them, see `retained_size`.
         self.bytes = 0
-        self._ledger = ledger
-        self._complaints = complaints
+        self._accounting = accounting
+        self._rate_limited_log = rate_limited_log
         self._changed = changed
         self._messages: TopicTree[Message] = TopicTree()
         self._owners: dict[str, Account] = {}
@@ -90,9 +90,11 @@ class Retained:
 
     def keep(self, message: Message, owner: Account) -> bool:
         """Retain the message, or with an empty one none any more; False when there is no room."""
-        if self._ledger.refusing and message.qos:
+        if self._accounting.refusing and message.qos:
             return False
-        self._ledger.counters.effort += RETAIN_EFFORT + message.topic.count("/") // LEVELS_AN_EFFORT
+        self._accounting.counters.effort += (
+            RETAIN_EFFORT + message.topic.count("/") // LEVELS_AN_EFFORT
+        )
         old = self._messages.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
             if old is None:
@@ -103,7 +105,7 @@ class Retained:
             message.settle()
             shortage = self._shortage(message, old, owner)
             if shortage:
-                self._ledger.counters.publish_dropped += 1
+                self._accounting.counters.publish_dropped += 1
                 self._tell_full(message, owner, shortage)
                 return False
             self._put(message, owner)
@@ -116,7 +118,7 @@ class Retained:
 
     def delete(self, topic: str) -> None:
         """Retain nothing for the topic any more."""
-        self.keep(Message(topic, b"", retain=True), self._ledger.accounts.inside)
+        self.keep(Message(topic, b"", retain=True), self._accounting.accounts.inside)
 
     def _put(self, message: Message, owner: Account) -> None:
         old = self._messages.get(message.topic)
@@ -125,22 +127,22 @@ class Retained:
         size = retained_size(message)
         self.bytes += size
         self._owners[message.topic] = owner
-        self._ledger.accounts.retain(owner, 1, size)
+        self._accounting.accounts.retain(owner, 1, size)
         self._messages.set(message.topic, message)
         self._schedule_expiry(message)
 
     def _take_out(self, old: Message) -> None:
         size = retained_size(old)
         self.bytes -= size
-        self._ledger.accounts.retain(self._owners.pop(old.topic), -1, -size)
+        self._accounting.accounts.retain(self._owners.pop(old.topic), -1, -size)
         number = self._numbers.pop(old.topic, None)
         if number is not None:
             del self._topics[number]
 
     def _shortage(self, message: Message, old: Message | None, owner: Account) -> str:
         """Why it may not take the old one's place, which makes room for it whosever it is."""
-        ledger = self._ledger
-        accounts, limits, quotas = ledger.accounts, ledger.limits, ledger.quotas
+        accounting = self._accounting
+        accounts, limits, quotas = accounting.accounts, accounting.limits, accounting.quotas
         size = retained_size(message)
         before = self._owners[message.topic] if old is not None else None
         freed = retained_size(old) if old is not None else 0
@@ -161,11 +163,11 @@ class Retained:
         if not quotas.retained_bytes.allows(owner.retained_bytes - own, total, size):
             what, key = "room for retained bytes", "retained_bytes"
             return quotas.retained_bytes.shortage(total, size, what, f"limits.{key}", key)
-        return "" if ledger.may_store(owner, growth) else ledger.store_shortage(growth)
+        return "" if accounting.may_store(owner, growth) else accounting.store_shortage(growth)
 
     def _tell_full(self, message: Message, owner: Account, shortage: str) -> None:
-        self._complaints.tell(
-            self._ledger.now,
+        self._rate_limited_log.warning(
+            self._accounting.now,
             ("retained", owner.username),
             "no room to retain %s: %s; %s has %d retained messages with %d bytes, of %d with %d in "
             "all",
@@ -192,7 +194,7 @@ class Retained:
 
     def expire(self, now: float) -> bool:
         """Delete those whose time is over, as many as one turn is for; True when there are more."""
-        counters = self._ledger.counters
+        counters = self._accounting.counters
         end = counters.effort + EFFORT_A_TURN
         while self._expiring and self._expiring[0][0] <= now:
             if counters.effort > end:
@@ -201,5 +203,5 @@ class Retained:
             _, number = heapq.heappop(self._expiring)
             topic = self._topics.get(number)
             if topic is not None:
-                self._ledger.faults.run("clock.expiry", self.delete, topic, otherwise=None)
+                self._accounting.faults.run("clock.expiry", self.delete, topic, otherwise=None)
         return False

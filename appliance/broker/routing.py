@@ -62,7 +62,9 @@ class Router:
     `sessions` are all there are, by client id: what is known of topics is kept in them.
     """
 
-    def __init__(self, access: Access, ledger: Accounting, sessions: dict[str, Session]) -> None:
+    def __init__(
+        self, access: Access, accounting: Accounting, sessions: dict[str, Session]
+    ) -> None:
         #: The rules in force.
         self.access = access
         #: Those of them who may have to ask somebody else; None where nobody has to.
@@ -75,9 +77,9 @@ class Router:
         self.epoch = 0
         #: Shared subscriptions by their whole filter.
         self.shares: dict[str, Share] = {}
-        self._ledger = ledger
-        self._counters = ledger.counters
-        self._faults = ledger.faults
+        self._accounting = accounting
+        self._counters = accounting.counters
+        self._faults = accounting.faults
         self._sessions = sessions
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
             SubscriptionTree()
@@ -139,7 +141,7 @@ class Router:
 
     def _count_cached(self, size: int) -> None:
         self._cached += size
-        if self._cached > self._ledger.limits.memory * CACHED_IN_ALL:
+        if self._cached > self._accounting.limits.memory * CACHED_IN_ALL:
             self._clear_caches()
 
     def _clear_caches(self) -> None:
@@ -205,7 +207,7 @@ class Router:
 
     def excess(self, topic: str) -> str:
         """What the topic or filter has too much of, if anything."""
-        limits = self._ledger.limits
+        limits = self._accounting.limits
         if topic.count("/") >= limits.topic_levels:
             return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
         if len(topic) > limits.topic_length // 4 and len(topic.encode()) > limits.topic_length:

@@ -59,7 +59,7 @@ def restore(
     3.1.2.5, 5.0 section 3.1.2.5).
     """
     for entry in kept:
-        session = Session(entry.identity.client_id, entry.identity, broker.ledger)
+        session = Session(entry.identity.client_id, entry.identity, broker.accounting)
         entry.session = broker.sessions[session.client_id] = session
         session.expiry = entry.expiry
         session.set_will(entry.will)
@@ -75,7 +75,7 @@ def restore(
             broker.router.join(session, subscription)
     for entry in sorted(kept, key=_left_at):
         assert entry.session is not None
-        broker.ledger.accounts.left(entry.session)
+        broker.accounting.accounts.left(entry.session)
     for entry in kept:  # what is owed names sessions and groups, all of which are there now
         _restore_owed(broker, entry)
     broker.retained.restore(retained)

@@ -104,6 +104,7 @@ class Session:
         "_agreed_window",
         "_last_packet_id",
         "account",
+        "accounting",
         "batch",
         "bytes",
         "client_id",
@@ -118,7 +119,6 @@ class Session:
         "is_told_full",
         "large",
         "latest",
-        "ledger",
         "link",
         "link_for",
         "queue",
@@ -136,18 +136,18 @@ class Session:
         "window",
     )
 
-    def __init__(self, client_id: str, identity: Identity | None, ledger: Accounting) -> None:
+    def __init__(self, client_id: str, identity: Identity | None, accounting: Accounting) -> None:
         self.client_id = client_id
         self.identity = identity
-        self.ledger = ledger
+        self.accounting = accounting
         #: Of its user, whose memory it takes.
-        self.account = ledger.accounts.of(identity)
+        self.account = accounting.accounts.of(identity)
         self.link: Link | None = None
         #: For a session inside the appliance that wants to know who published what it receives.
         self.link_for: Callable[[Session], Link] | None = None
         self.expiry = 0
         #: When its connection began, in seconds of the broker's clock.
-        self.connected_at = ledger.now
+        self.connected_at = accounting.now
         #: Whether its last connection ended with a DISCONNECT that its will is not for.
         self.ended_well = False
         self.ends_at: float | None = None
@@ -161,7 +161,7 @@ class Session:
         #: Of those in flight, the ids that a new connection was not sent yet.
         self.resends: deque[int] = deque()
         #: Messages that may be in flight; none while those that are could not be kept.
-        self.window = self._agreed_window = ledger.limits.inflight
+        self.window = self._agreed_window = accounting.limits.inflight
         #: The batch of the store that what this session sends depends on.
         self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
@@ -197,7 +197,7 @@ class Session:
     @property
     def age(self) -> float:
         """Seconds since its connection began."""
-        return self.ledger.now - self.connected_at
+        return self.accounting.now - self.connected_at
 
     @property
     def persistent(self) -> bool:
@@ -210,7 +210,7 @@ class Session:
         """Itself, as it receives what `origin` publishes."""
         if self.link_for is None:
             return self
-        session = Session(self.client_id, None, self.ledger)
+        session = Session(self.client_id, None, self.accounting)
         session.link = self.link_for(origin)
         return session
 
@@ -245,10 +245,11 @@ class Session:
                 return True
             return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
         # `fits` and `_count`, written out here and in `_send`: two calls less a message.
-        ledger = self.ledger
+        accounting = self.accounting
         size = message.size
         if (
-            self.bytes + size <= ledger.half_queue and ledger.queued_bytes + size <= ledger.plenty
+            self.bytes + size <= accounting.half_queue
+            and accounting.queued_bytes + size <= accounting.plenty
         ) or self._fits_tightly(size):
             if (
                 link is not None
@@ -259,14 +260,14 @@ class Session:
             ):
                 self._send(link, cast(Delivery, (message, qos, retain, subscription_ids, share)))
                 return True
-            if len(self.queue) < ledger.limits.queue_messages:
+            if len(self.queue) < accounting.limits.queue_messages:
                 return self._enqueue(
                     cast(Delivery, (message, qos, retain, subscription_ids, share))
                 )
-        if ledger.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
+        if accounting.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
             return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
-        if ledger.limits.queue_full == "disconnect" and link is not None:
-            ledger.overflowed.append(self)
+        if accounting.limits.queue_full == "disconnect" and link is not None:
+            accounting.overflowed.append(self)
         self._is_full(size)
         self._drop(message)
         return False
@@ -278,12 +279,12 @@ class Session:
         publishers have between PUBREC and PUBREL.
         """
         if not self.deliver(*delivery):
-            self.ledger.counters.publish_dropped -= 1
+            self.accounting.counters.publish_dropped -= 1
             self._enqueue(delivery, promised=True)
 
     def has_room(self, message: Message) -> bool:
         """Whether a QoS 1 or 2 message would be kept."""
-        limits = self.ledger.limits
+        limits = self.accounting.limits
         if self.expiry and not self._may_store(message):
             return False
         return limits.queue_full == "drop-oldest" or (
@@ -291,40 +292,40 @@ class Session:
         )
 
     def _may_store(self, message: Message) -> bool:
-        ledger = self.ledger
-        return not ledger.refusing and ledger.may_store(self.account, message.size)
+        accounting = self.accounting
+        return not accounting.refusing and accounting.may_store(self.account, message.size)
 
     def _enqueue(self, delivery: Delivery, *, promised: bool = False) -> bool:
         """Let it wait; False when it had to be stored and cannot be, which is counted."""
         message = delivery[0]
         if self.expiry:
             if not promised and not self._may_store(message):
-                if not self.ledger.refusing:
+                if not self.accounting.refusing:
                     self._is_full(message.size)
-                self.ledger.counters.publish_dropped += 1
+                self.accounting.counters.publish_dropped += 1
                 return False
             self._staged()
-            self.ledger.store.queued(self, delivery)
+            self.accounting.store.queued(self, delivery)
         message.settle()
         self._count(message)
         self.queue.append(delivery)
-        if self.congestion is None and 2 * len(self.queue) > self.ledger.limits.queue_messages:
+        if self.congestion is None and 2 * len(self.queue) > self.accounting.limits.queue_messages:
             self._congest()
         return True
 
     def _staged(self) -> None:
         """What is sent from now on depends on what is about to be staged."""
-        self.batch = self.ledger.store.batch
+        self.batch = self.accounting.store.batch
 
     def _drop_oldest_for(self, message: Message) -> bool:
         """Make room at the old end of the queue; False when even then there is none."""
-        ledger = self.ledger
+        accounting = self.accounting
         if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
             return False
-        if self.expiry and self.ledger.refusing:
+        if self.expiry and self.accounting.refusing:
             return False
         while self.queue and not (
-            len(self.queue) < ledger.limits.queue_messages and self.fits(message.size)
+            len(self.queue) < accounting.limits.queue_messages and self.fits(message.size)
         ):
             self._is_full(message.size)
             oldest = self.queue.popleft()
@@ -394,10 +395,10 @@ class Session:
                 except StopIteration:
                     del self.replays[topic_filter]
                     if self.expiry and needs_window:
-                        self.ledger.store.subscribed(self, self.subscriptions[topic_filter])
+                        self.accounting.store.subscribed(self, self.subscriptions[topic_filter])
                     break
                 except Exception as error:
-                    self.ledger.faults.caught("session.replay", error, self)
+                    self.accounting.faults.caught("session.replay", error, self)
                     del self.replays[topic_filter]
                     break
                 if delivery is None:
@@ -422,7 +423,7 @@ class Session:
             delivery = self.queue.popleft()
             message = delivery[0]
             self._uncount(message)
-            if self.ledger.has_expired(message) or self._is_forbidden(message):
+            if self.accounting.has_expired(message) or self._is_forbidden(message):
                 self._settled(delivery)
                 # Its number is used up, as by mosquitto, which gives them out on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
@@ -447,7 +448,7 @@ class Session:
     def open_window(self, size: int) -> None:
         """Let so many messages be in flight, once it can be kept that they are."""
         self._agreed_window = size
-        self.window = 0 if self.ledger.failing and self.expiry else size
+        self.window = 0 if self.accounting.failing and self.expiry else size
 
     def hold_back(self) -> None:
         """Send nothing that would have to be stored until `go_on`, as it cannot be."""
@@ -487,7 +488,7 @@ class Session:
         for packet_id, delivery in self.inflight.items():
             if delivery is not None:
                 self.resends.append(packet_id)
-            elif not (self.expiry and self.ledger.failing):
+            elif not (self.expiry and self.accounting.failing):
                 link.pubrel(packet_id)
         if self.congestion is not None:
             self.congestion.resume()
@@ -505,13 +506,13 @@ class Session:
         size = message.size
         self.bytes += size
         self.account.bytes += size
-        self.ledger.queued_bytes += size
+        self.accounting.queued_bytes += size
         inflight[packet_id] = delivery
         if self.congestion is not None:
             self.congestion.sent(packet_id)
         if self.expiry:
             self._staged()
-            self.ledger.store.sent(self, delivery, packet_id)
+            self.accounting.store.sent(self, delivery, packet_id)
         try:
             link.publish(message, qos, packet_id, False, retain, subscription_ids)
         except Exception as error:
@@ -527,8 +528,8 @@ class Session:
 
     def _cannot_be_sent(self, error: Exception, packet_id: int = 0) -> None:
         """A fault: the message is given up, so that it stands in nobody's way, at no later try."""
-        self.ledger.counters.publish_dropped += 1
-        self.ledger.faults.caught("session.send", error, self)
+        self.accounting.counters.publish_dropped += 1
+        self.accounting.faults.caught("session.send", error, self)
         if packet_id:
             self.give_up(packet_id)
 
@@ -540,20 +541,20 @@ class Session:
             delivery = waiting.pop(oldest)
             message = delivery[0]
             self._uncount(message)
-            if not (self.ledger.has_expired(message) or self._is_forbidden(message)):
+            if not (self.accounting.has_expired(message) or self._is_forbidden(message)):
                 self._publish(link, delivery)
 
     def _is_forbidden(self, message: Message) -> bool:
         """Whether rules that have changed meanwhile no longer let the client have it; counted."""
-        if not self.unchecked or self.ledger.may_keep(self, message.topic):
+        if not self.unchecked or self.accounting.may_keep(self, message.topic):
             return False
-        self.ledger.counters.publish_dropped += 1
+        self.accounting.counters.publish_dropped += 1
         return True
 
     def keep_latest(self, delivery: Delivery) -> bool:
         """Let a QoS 0 message wait for a slow client; False when it was dropped, and counted."""
         message = delivery[0]
-        limits = self.ledger.limits
+        limits = self.accounting.limits
         replaced: Delivery | None = None
         key: str | int = message.topic
         if limits.keep:
@@ -586,11 +587,11 @@ class Session:
         """Have it told, once an absence: nobody else knows what its client is missing."""
         if self.link is None and not self.is_told_full:
             self.is_told_full = True
-            self.ledger.filled.append((self, self.shortage(size)))
+            self.accounting.filled.append((self, self.shortage(size)))
 
     def _drop(self, message: Message) -> None:
         """Count a message that the client was too slow for."""
-        self.ledger.counters.publish_dropped += 1
+        self.accounting.counters.publish_dropped += 1
         message.dropped()
 
     def _count(self, message: Message) -> None:
@@ -601,7 +602,7 @@ class Session:
 
     def _settled(self, delivery: Delivery) -> None:
         if self.expiry:
-            self.ledger.store.settled(self, delivery)
+            self.accounting.store.settled(self, delivery)
 
     # --- acknowledgements of the client --------------------------------------------------------
 
@@ -622,9 +623,9 @@ class Session:
         size = delivery[0].size
         self.bytes -= size
         self.account.bytes -= size
-        self.ledger.queued_bytes -= size
+        self.accounting.queued_bytes -= size
         if self.expiry:
-            self.ledger.store.settled(self, delivery)
+            self.accounting.store.settled(self, delivery)
         congestion = self.congestion
         if congestion is not None:
             congestion.acknowledged(packet_id, size)
@@ -659,7 +660,7 @@ class Session:
                 self._relieve(self.congestion)
             if self.expiry:
                 self._staged()
-                self.ledger.store.recorded(self, delivery, packet_id)
+                self.accounting.store.recorded(self, delivery, packet_id)
         return True
 
     def pubcomp(self, packet_id: int) -> bool:
@@ -676,7 +677,7 @@ class Session:
         if self.congestion is not None:
             self.congestion.settled(packet_id)
         if self.expiry:
-            self.ledger.store.completed(self, packet_id)
+            self.accounting.store.completed(self, packet_id)
         if self.queue or self.replays or self.resends:
             self.pump()
         return True
@@ -700,7 +701,7 @@ class Session:
         self.received[packet_id] = held
         self._take(held_size(held))
         if self.expiry:
-            self.ledger.store.held(self, packet_id, held)
+            self.accounting.store.held(self, packet_id, held)
         return True
 
     def reconnected(self) -> None:
@@ -714,7 +715,7 @@ class Session:
         if held is not None:
             self._take(-held_size(held))
             if self.expiry:
-                self.ledger.store.unheld(self, packet_id)
+                self.accounting.store.unheld(self, packet_id)
         return held
 
     # --- subscriptions and the will ------------------------------------------------------------
@@ -741,14 +742,14 @@ class Session:
 
     def fits(self, size: int) -> bool:
         """Whether the session may take so many bytes more."""
-        ledger = self.ledger
+        accounting = self.accounting
         held = self.bytes + size
-        return held <= ledger.queue_bytes and (
-            ledger.fits(self.account, size)
+        return held <= accounting.queue_bytes and (
+            accounting.fits(self.account, size)
             or (
                 self.link is not None
-                and held <= ledger.reserve
-                and ledger.is_reserved(self.account, size)
+                and held <= accounting.reserve
+                and accounting.is_reserved(self.account, size)
             )
         )
 
@@ -757,16 +758,16 @@ class Session:
 
         It names neither the client nor its user: a publisher may be told, too.
         """
-        ledger = self.ledger
-        limits = ledger.limits
+        accounting = self.accounting
+        limits = accounting.limits
         if len(self.queue) >= limits.queue_messages:
             return f"{len(self.queue)} messages wait already (broker.limits.queue_messages)"
-        if self.bytes + size > ledger.queue_bytes:
+        if self.bytes + size > accounting.queue_bytes:
             return f"{self.bytes} bytes wait already (broker.limits.queue_bytes)"
         if not self.fits(size):
-            return ledger.memory_shortage(size)
-        if self.expiry and not ledger.may_store(self.account, size):
-            return ledger.store_shortage(size)
+            return accounting.memory_shortage(size)
+        if self.expiry and not accounting.may_store(self.account, size):
+            return accounting.store_shortage(size)
         return "others wait for the room there is"
 
     # --- backpressure --------------------------------------------------------------------------
@@ -774,30 +775,33 @@ class Session:
     def is_full(self, size: int) -> bool:
         """Whether a QoS 1 or 2 message of so many bytes finds no room in the queue, or only such
         as others wait for."""
-        ledger = self.ledger
+        accounting = self.accounting
         if self.congestion is not None and self.congestion.awaited:
             return True
-        if len(self.queue) >= ledger.limits.queue_messages:
+        if len(self.queue) >= accounting.limits.queue_messages:
             return True
-        is_little = self.bytes + size <= ledger.half_queue
-        return not (is_little and ledger.queued_bytes + size <= ledger.plenty) and not self.fits(
-            size
-        )
+        is_little = self.bytes + size <= accounting.half_queue
+        return not (
+            is_little and accounting.queued_bytes + size <= accounting.plenty
+        ) and not self.fits(size)
 
     def _is_crowded(self) -> bool:
         """Whether the queue is more than half full."""
-        ledger = self.ledger
-        return 2 * len(self.queue) > ledger.limits.queue_messages or self.bytes > ledger.half_queue
+        accounting = self.accounting
+        return (
+            2 * len(self.queue) > accounting.limits.queue_messages
+            or self.bytes > accounting.half_queue
+        )
 
     def _fits_tightly(self, size: int) -> bool:
         """`fits`, for a message with which the session takes more than half of what it may."""
-        if self.congestion is None and self.bytes + size > self.ledger.half_queue:
+        if self.congestion is None and self.bytes + size > self.accounting.half_queue:
             self._congest()
         return self.fits(size)
 
     def _congest(self) -> None:
         if self.link is not None and self.identity is not None:
-            self.congestion = Congestion(self, self.ledger)
+            self.congestion = Congestion(self, self.accounting)
 
     def _relieve(self, congestion: Congestion) -> None:
         """Let publishers go on when half of the queue is free, and forget all when it is empty."""
@@ -811,7 +815,7 @@ class Session:
     def _take(self, size: int) -> None:
         self.bytes += size
         self.account.bytes += size
-        self.ledger.queued_bytes += size
+        self.accounting.queued_bytes += size
 
     def hand_over(
         self, shares: Collection[Share] | None, give: Callable[[Delivery], bool], *, sent: bool

@@ -90,7 +90,7 @@ class SysTopics:
             "store/messages/count": stored,
             "heap/current": self._heap(),
             "errors": broker.faults.count,
-            "store/messages/bytes": broker.retained.bytes + broker.ledger.queued_bytes,
+            "store/messages/bytes": broker.retained.bytes + broker.accounting.queued_bytes,
         }
         return {name: str(value) for name, value in values.items()} | self._load()
 

@@ -86,12 +86,12 @@ class ClientConnection:
         #: The part of it that all connections of one computer share; empty for a Unix socket.
         self.host = host
         #: Who is charged for what waits here: nobody in particular until the login.
-        self.account = network.broker.ledger.accounts.strangers
+        self.account = network.broker.accounting.accounts.strangers
         #: What was accepted, until there is a transport for it.
         self._accepted: socket.socket | None = None
         self._network = network
         self._broker = network.broker
-        self._ledger = network.broker.ledger
+        self._accounting = network.broker.accounting
         self._counters = network.broker.counters
         self._transport: asyncio.Transport | None = None
         self._entries = network.entries
@@ -101,7 +101,7 @@ class ClientConnection:
         self._is_lost = False
         # Input: what was received and waits, and what it waits for.
         self._held = _NOTHING
-        self._held_size = 0  # bytes of the chunk that it is the rest of, in the ledger
+        self._held_size = 0  # bytes of the chunk that it is the rest of, in the accounting
         self._frame = 0  # bytes of a WebSocket frame that is not complete
         self._is_record_cut = False  # the same of TLS
         self._below = 0  # bytes that TLS and WebSocket have not taken apart
@@ -130,7 +130,7 @@ class ClientConnection:
         self._unshared = 0  # bytes of the chunks that wait for this client only
         self._paused = False
         self._withheld: asyncio.TimerHandle | None = None  # paused until then, on purpose
-        self._counted = 0  # bytes in the ledger
+        self._counted = 0  # bytes in the accounting
         self._slow: asyncio.TimerHandle | None = None
         self._is_system_limited = False
         self._probe: Probe | None = None
@@ -242,7 +242,7 @@ class ClientConnection:
         """Tell the log, unless it is a flood of the same from the same host."""
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
-        self._broker.complaints.tell(now, (self.host, what), "%s", message)
+        self._broker.rate_limited_log.warning(now, (self.host, what), "%s", message)
         if self._broker.journal is not None:
             self._broker.journal.refused(self.address, f"{what}: {why}")
 
@@ -264,7 +264,7 @@ class ClientConnection:
         self._count_output()
         if self._slow is not None:
             self._slow.cancel()
-        self._ledger.now = self._loop.time()
+        self._accounting.now = self._loop.time()
         if self._waits is not None:
             self._waits.cancel()
         if self._looks is not None:
@@ -280,7 +280,7 @@ class ClientConnection:
         self._transport = None
         self.keep(0)
         self._let_go_of_held()
-        self._ledger.take(self.account, -self._below)
+        self._accounting.take(self.account, -self._below)
         self._below = 0
         if self._connection is not None:
             self._network.part(self._connection)
@@ -353,7 +353,7 @@ class ClientConnection:
                 data = self._receive_in_turn(data)
                 if not data:
                     return
-            self._ledger.now = self._loop.time()
+            self._accounting.now = self._loop.time()
             published = counters.publish_received
             self._client.receive(data)
             published -= counters.publish_received
@@ -396,7 +396,7 @@ class ClientConnection:
         """Let a publisher wait that is too fast, by its own limit or by everyone's."""
         network = self._network
         rate = network.publish_rate
-        now = self._ledger.now
+        now = self._accounting.now
         # What it may publish grows with time, and shrinks by what it has published since the last
         # check.
         allowed = min(self._allowed + (now - self._checked_at) * rate, PUBLISH_BURST * rate)
@@ -409,15 +409,15 @@ class ClientConnection:
             self._check_memory()
 
     def _check_memory(self) -> None:
-        if self._ledger.queued_bytes > self._network.short_of_memory and self._resting is None:
+        if self._accounting.queued_bytes > self._network.short_of_memory and self._resting is None:
             # Not for longer: it may be this client that has to acknowledge what takes the memory.
             self._rest(SHORT_OF_MEMORY_PAUSE)
-            self._broker.complaints.tell(
-                self._ledger.now,
+            self._broker.rate_limited_log.warning(
+                self._accounting.now,
                 "memory",
                 "%s is slowed: %d bytes are in use, of the %d allowed (broker.limits.memory)",
                 self._client,
-                self._ledger.queued_bytes,
+                self._accounting.queued_bytes,
                 self._broker.limits.memory,
             )
 
@@ -522,12 +522,12 @@ class ClientConnection:
     def _hold(self, data: bytes, begin: int) -> None:
         """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
         self._held = memoryview(data)[begin:]
-        self._ledger.take(self.account, len(data) - self._held_size)
+        self._accounting.take(self.account, len(data) - self._held_size)
         self._held_size = len(data)
 
     def _let_go_of_held(self) -> None:
         self._held = _NOTHING
-        self._ledger.take(self.account, -self._held_size)
+        self._accounting.take(self.account, -self._held_size)
         self._held_size = 0
 
     def _take_portion(self, data: bytes) -> None:
@@ -538,7 +538,7 @@ class ClientConnection:
 
     def _send_on(self) -> None:
         self._sends_on = self._stopped = False
-        self._ledger.now = self._loop.time()
+        self._accounting.now = self._loop.time()
         published = self._counters.publish_received
         self._client.send_on()
         self._countdown -= self._counters.publish_received - published
@@ -556,18 +556,18 @@ class ClientConnection:
     def set_apart(self, size: int) -> None:
         """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
         if not self._is_lost:
-            self._ledger.take(self.account, size - self._below)
+            self._accounting.take(self.account, size - self._below)
             self._below = size
 
     def keep(self, size: int) -> None:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""
-        ledger = self._ledger
+        accounting = self._accounting
         grown = size - self._frame
         if size or self._frame:
             self._note_part(size > 0 or self._is_record_cut)
         self._frame = size
-        ledger.take(self.account, grown)
-        if grown > 0 and size > ledger.reserve and not ledger.fits(self.account, 0):
+        accounting.take(self.account, grown)
+        if grown > 0 and size > accounting.reserve and not accounting.fits(self.account, 0):
             reason = (
                 f"no memory for {size} bytes of a WebSocket frame "
                 "(broker.limits.memory, broker.limits.user.memory)"
@@ -626,7 +626,7 @@ class ClientConnection:
         return self._waiting_size + (0 if transport is None else transport.get_write_buffer_size())
 
     def _count_output(self) -> None:
-        """Enter in the ledger what waits for this client, and tell it when that is too much."""
+        """Enter in the accounting what waits for this client, and tell it when that is too much."""
         network = self._network
         counted = self._unshared
         if self._paused and self._transport is not None:
@@ -642,7 +642,7 @@ class ClientConnection:
             self._slow = self._entries.later("connection.slow", SLOW_AFTER, self._tell_slow)
 
     def _tell_slow(self) -> None:
-        self._broker.complaints.tell(
+        self._broker.rate_limited_log.warning(
             self._loop.time(),
             "slow",
             "%s is slow: it does not read %d bytes, and is sent nothing more until it does",
@@ -737,8 +737,8 @@ class ClientConnection:
         self._network.count_output(self.account, -self._counted)
         self._network.count_output(account, self._counted)
         waits = self._frame + self._below + self._held_size
-        self._ledger.take(self.account, -waits)
-        self._ledger.take(account, waits)
+        self._accounting.take(self.account, -waits)
+        self._accounting.take(account, waits)
         self.account = account
         return ""
 
@@ -757,15 +757,15 @@ class ClientConnection:
         """Let the others have their turn, then let the client go on; it is not read before that."""
         self._sends_on = True
         self._read_later()
-        now = self._ledger.now
+        now = self._accounting.now
         if now - self._turned_at > 1.0:  # it was idle
             self._turns_taken = 0
         self._turned_at = now
         self._turns_taken += 1
         if self._turns_taken == MANY_TURNS:
             self._turns_taken = 0
-            self._broker.complaints.tell(
-                self._ledger.now,
+            self._broker.rate_limited_log.warning(
+                self._accounting.now,
                 "turns",
                 "%s asks for more than there is time for, and is read later",
                 self._client,
@@ -843,7 +843,7 @@ class ClientConnection:
         known = contact(self._transport.get_extra_info("socket"))
         has_unread = known.has_unread or bool(self._held) or self._sends_on
         has_unread = has_unread or bool(self._transport.get_extra_info("has_unread"))
-        now = self._ledger.now  # of the chunk that is being taken in, if one is
+        now = self._accounting.now  # of the chunk that is being taken in, if one is
         inflow = self._client.inflow
         held = inflow.held(now, has_unread=has_unread)
         flowing = inflow.flowing(now)

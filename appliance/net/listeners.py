@@ -208,7 +208,7 @@ class Listeners:
         if refusal:
             connection.close()
             counters.connections_refused += 1
-            self.broker.complaints.tell(now, refusal, "%s refused: %s", address, refusal)
+            self.broker.rate_limited_log.warning(now, refusal, "%s refused: %s", address, refusal)
             if self.broker.journal is not None:
                 self.broker.journal.refused(address, refusal)
             return
@@ -244,7 +244,9 @@ class Listeners:
         with most of them: as many strangers as may come from everywhere keep nobody out.
         """
         limit = self.admission.connections
-        if len(self.network.open) < max(limit, self.broker.ledger.accounts.connections + GUESTS):
+        if len(self.network.open) < max(
+            limit, self.broker.accounting.accounts.connections + GUESTS
+        ):
             return ""
         guest = self._addresses.oldest_guest()
         if guest is None:

@@ -110,7 +110,7 @@ class Scheduler:
         certificates: Certificates | None = None,
     ) -> None:
         self.broker = broker
-        self._spare = broker.ledger.spare = SpareClock()
+        self._spare = broker.accounting.spare = SpareClock()
         self.certificates = certificates
         self.authenticate = authenticate
         self.exchange = exchange
@@ -143,7 +143,7 @@ class Scheduler:
         self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
         #: Bytes that hold no more messages than may come at once: the smallest one takes five.
         self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
-        #: `Ledger.queued_bytes` from which on publishers are slowed.
+        #: `Accounting.queued_bytes` from which on publishers are slowed.
         self.short_of_memory = self.broker.limits.memory * 3 // 4
         #: Bytes in the output of all clients from which on less is allowed to each of them.
         self.much_output = self.broker.limits.memory // 4
@@ -243,7 +243,7 @@ class Scheduler:
 
     def _count_in_all(self, size: int) -> None:
         self.output += size
-        self.broker.ledger.queued_bytes += size
+        self.broker.accounting.queued_bytes += size
 
     def _count_for(self, account: Account, size: int) -> None:
         account.output += size
@@ -256,7 +256,7 @@ class Scheduler:
         """
         return (
             self.output > self.much_output
-            and account.output * len(self.broker.ledger.accounts) > self.much_output
+            and account.output * len(self.broker.accounting.accounts) > self.much_output
         )
 
     def share(self, account: Account, chunk: bytes) -> None:

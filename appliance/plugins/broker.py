@@ -443,7 +443,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             raise BrokerError(f"nothing can be retained for '{topic}': {error}") from error
         if data or self.broker.retained.get(topic) is not None:
             message = Message(topic, data, 2 if qos is None else qos, True)
-            self.broker.retained.keep(message, self.broker.ledger.accounts.inside)
+            self.broker.retained.keep(message, self.broker.accounting.accounts.inside)
             self.broker.flush()
 
     def _retain_quietly(self, topic: str, data: bytes, qos: int | None) -> None:

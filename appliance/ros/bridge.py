@@ -130,7 +130,7 @@ class Bridge:
         self._owners: Owners | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
-        self._turns = ConversionQueue(entries, broker.ledger)
+        self._turns = ConversionQueue(entries, broker.accounting)
         self._around = Surroundings(entries, self._post, broker, Leases(), self._turns, Arrivals())
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None

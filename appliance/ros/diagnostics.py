@@ -127,7 +127,7 @@ class Diagnostics:
             "clients connected": len(broker.clients),
             "subscriptions": broker.subscription_count,
             "retained messages": len(broker.retained),
-            "bytes queued": broker.ledger.queued_bytes,
+            "bytes queued": broker.accounting.queued_bytes,
             **counts,
         }
         text = f"clients: {len(broker.clients)}"

@@ -242,7 +242,7 @@ class SqliteStore:
             )
 
     def _adopt(self, broker: Broker, loaded: Loaded, rows: database.Rows) -> None:
-        accounts = broker.ledger.accounts
+        accounts = broker.accounting.accounts
         for key, (message, username, is_inside) in loaded.retained.items():
             before = self._retained.get(message.topic)
             if before is not None:

@@ -281,7 +281,7 @@ class Peer:
     def wait(self) -> None:
         """Let the time pass that what it published waits for its readers at most."""
         while self.wire.waits is not None:
-            self.broker.ledger.now += self.wire.waits
+            self.broker.accounting.now += self.wire.waits
             self.wire.waits = None
             self.go_on()
 
@@ -478,7 +478,7 @@ def waiting_bytes(broker: Broker) -> int:
         + (session.will.message.size if session.will is not None else 0)
         for session in broker.sessions.values()
     )
-    return broker.ledger.queued_bytes - rest - broker.ledger.input_bytes
+    return broker.accounting.queued_bytes - rest - broker.accounting.input_bytes
 
 
 def held_bytes(session: Session) -> int:
@@ -504,7 +504,7 @@ def check_accounts(
     for session in broker.sessions.values():
         assert session.bytes == held_bytes(session), session
         total += session.bytes
-    assert broker.ledger.queued_bytes == total + broker.ledger.input_bytes + wires
+    assert broker.accounting.queued_bytes == total + broker.accounting.input_bytes + wires
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
     assert broker.retained.bytes == sum(retained_size(message) for message in retained)
@@ -513,7 +513,7 @@ def check_accounts(
 
 def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Account, int]) -> None:
     """And each user's part of them is what that user holds."""
-    accounts = broker.ledger.accounts
+    accounts = broker.accounting.accounts
     sessions, queued, kept = Counter[Account](), Counter(wires_of), Counter[Account]()
     for session in broker.sessions.values():
         account = accounts.of(session.identity)
@@ -574,7 +574,7 @@ def broker(access: FakeAccess, store: FakeStore, limits: Limits) -> Iterator[Bro
     broker.tick(broker.now + 2 * broker.limits.session_expiry + 1)
     check_accounts(broker)
     if all(session.identity is None for session in broker.sessions.values()):
-        assert broker.ledger.queued_bytes == broker.ledger.input_bytes
+        assert broker.accounting.queued_bytes == broker.accounting.input_bytes
 
 
 @pytest.fixture(params=[4, 5], ids=["3.1.1", "5.0"])

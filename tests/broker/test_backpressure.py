@@ -123,7 +123,7 @@ def play(
     """Let them act until all are done, or so many steps; returns how many steps that took."""
     promised = sum(actor.window for actor in actors if actor.qos == 2)
     for step in range(steps):
-        broker.ledger.now += STEP
+        broker.accounting.now += STEP
         before = [len(actor.got) for actor in actors]
         for actor in actors:
             actor.act(step)
@@ -175,7 +175,7 @@ def test_a_flood_loses_nothing(join: Join, broker: Broker, version: int, qos: in
     assert slower.got == numbers(COUNT)
     assert publisher.codes == {0} and broker.counters.publish_dropped == 0
     assert broker.counters.publish_received == COUNT
-    assert not broker.ledger.congested and not publisher.peer.client._behind
+    assert not broker.accounting.congested and not publisher.peer.client._behind
 
 
 @pytest.mark.parametrize("limits", [Limits(queue_bytes=100_000, inflight=20)])
@@ -193,7 +193,7 @@ def test_a_wait_ends_with_the_congestion(join: Join, broker: Broker, rest: float
         publisher.send(*(Publish("a", bytes(30_000), 1, False, False, n) for n in range(1, 5)))
         assert client._awaited, f"burst {burst} was not waited for"
         congestions = client._awaited
-        broker.ledger.now += 0.02
+        broker.accounting.now += 0.02
         if ending == "leaves":
             reader.lose()
         else:
@@ -203,8 +203,8 @@ def test_a_wait_ends_with_the_congestion(join: Join, broker: Broker, rest: float
             assert acknowledge_all(reader) == 1, f"burst {burst} lost a message"
         assert len(publisher.received()) == 4
         assert not client._awaited and not any(each._waiting for each in congestions)
-        assert not broker.ledger.congested
-        broker.ledger.now += rest
+        assert not broker.accounting.congested
+        broker.accounting.now += rest
     assert client._allowance.left > PUBLISHER_PATIENCE / 2
     assert broker.counters.publish_dropped == 0 or ending == "leaves"
 
@@ -459,7 +459,7 @@ def test_who_stops_reading_is_waited_for_once(join: Join, broker: Broker):
     assert len(paused) == 1 and 0.2 < paused[0] * STEP <= PATIENCE
     assert steps * STEP < 20_000 / 50 * STEP + PATIENCE + 0.1
     assert broker.counters.publish_dropped == 20_000 - 1000 - 20
-    assert not broker.ledger.congested, "it costs others nothing more"
+    assert not broker.accounting.congested, "it costs others nothing more"
     # It reads again: all that was kept, and then it is waited for as before.
     publisher.count = 23_000
     receiver = Actor(reader)
@@ -500,7 +500,7 @@ def test_who_recovers_is_waited_for_again(join: Join, broker: Broker):
 
 def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: Broker):
     """With many floods at a time each reader gets its part of the processor only."""
-    broker.ledger.spare = lambda: 0.05 * broker.now
+    broker.accounting.spare = lambda: 0.05 * broker.now
     reader = join("reader", version=4)
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4), ["a"], COUNT)
@@ -513,7 +513,7 @@ def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: B
 def test_a_computer_under_load_is_not_the_readers_fault(join: Join, broker: Broker, load: int):
     """Where the broker has to wait for the processor, the reader has to as well."""
     clock = SpareClock()
-    broker.ledger.spare = lambda: clock.grow(
+    broker.accounting.spare = lambda: clock.grow(
         1 + broker.now, 0.1 * broker.now, load * 0.1 * broker.now, 0
     )
     reader = join("reader", version=4)
@@ -526,7 +526,7 @@ def test_a_computer_under_load_is_not_the_readers_fault(join: Join, broker: Brok
 
 def test_readers_that_conspire_cannot_stop_a_publisher(join: Join, broker: Broker):
     """Whatever they invent, to be waited for without end: each message gives it time back."""
-    broker.ledger.spare = lambda: 0.0  # and the time of none of them is counted
+    broker.accounting.spare = lambda: 0.0  # and the time of none of them is counted
     reader = join("reader", version=4)
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4), ["a"], ALL)
@@ -581,7 +581,7 @@ def test_who_leaves_is_not_waited_for(join: Join, broker: Broker):
     assert publisher.peer.wire.laters, "at once"
     play(broker, publisher)
     assert broker.counters.publish_dropped == 1100 - 1000 - 20
-    assert not broker.ledger.congested
+    assert not broker.accounting.congested
 
 
 def test_an_absent_reader_is_not_waited_for(join: Join, broker: Broker):
@@ -626,11 +626,11 @@ def test_to_look_for_readers_that_are_full_is_an_effort(
     for number in range(200):
         join(f"reader {number}", version=4).subscribe(topic_filter, 1)
     other = join("other", version=4)
-    (session,) = broker.ledger.congested
+    (session,) = broker.accounting.congested
     efforts = []
     for congested in ({}, {session: None}):
-        broker.ledger.congested.clear()
-        broker.ledger.congested.update(congested)
+        broker.accounting.congested.clear()
+        broker.accounting.congested.update(congested)
         for packet_id in (2 * len(efforts) + 1, 2 * len(efforts) + 2):  # the first finds the route
             begun = broker.counters.effort
             other.send(Publish("b", b"", 1, False, False, packet_id))
@@ -674,8 +674,8 @@ def test_what_may_change_the_message_waits_behind_it(waiting: Peer):
 
 def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
     """In bytes, as is what waits for the client: as many packets as that takes."""
-    ledger, client = broker.ledger, waiting.client
-    ledger.queue_bytes = 100_000
+    accounting, client = broker.accounting, waiting.client
+    accounting.queue_bytes = 100_000
     packets = [Publish("b", bytes(1000), 1, False, False, 10_001 + n) for n in range(100)]
     sent = 0
     while not waiting.wire.stopped:
@@ -684,10 +684,10 @@ def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
     assert 60 < sent < 70 and 100_000 <= client._behind_size < 102_000
     waiting.send(packets[sent], Pingreq())
     assert waiting.received() == [], "what comes all the same is kept as bytes"
-    assert ledger.input_bytes >= client._behind_size + 1000
+    assert accounting.input_bytes >= client._behind_size + 1000
     waiting.wait()
     assert len(waiting.received()) == sent + 3
-    assert ledger.input_bytes == 0
+    assert accounting.input_bytes == 0
 
 
 def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
@@ -695,11 +695,11 @@ def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
     broker.use(Limits(queue_messages=10, inflight=1), broker.features)
     reader, publisher = join("reader", version=4), join("publisher", version=4)
     reader.subscribe("a", 1)
-    client, before = publisher.client, broker.ledger.input_bytes
+    client, before = publisher.client, broker.accounting.input_bytes
     publisher.send(*(Publish("a", bytes(20_000), 1, False, False, n) for n in range(1, 41)))
-    assert broker.ledger.input_bytes - before > 20 * 20_000
+    assert broker.accounting.input_bytes - before > 20 * 20_000
     for _ in range(1000):
-        broker.ledger.now += STEP
+        broker.accounting.now += STEP
         acknowledge_all(reader)
         if publisher.wire.laters:
             publisher.go_on()
@@ -708,34 +708,34 @@ def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
         if not client._behind:
             break
     assert not client._behind and not client._held
-    assert broker.ledger.input_bytes == before
+    assert broker.accounting.input_bytes == before
 
 
 def test_what_waits_takes_no_memory_that_there_is_not(waiting: Peer, broker: Broker):
     """Nobody is disconnected for it: what does not fit is not read."""
-    ledger = broker.ledger
-    ledger.plenty = ledger.queued_bytes
-    ledger.quotas.memory = Quota.of(ledger.queued_bytes + 50_000, None)
+    accounting = broker.accounting
+    accounting.plenty = accounting.queued_bytes
+    accounting.quotas.memory = Quota.of(accounting.queued_bytes + 50_000, None)
     for number in range(100):
         waiting.send(Publish("b", bytes(1000), 1, False, False, 10_001 + number))
         if waiting.wire.stopped:
             break
     assert waiting.wire.stopped and not waiting.wire.closed
-    assert 0 < ledger.input_bytes < 20_000
+    assert 0 < accounting.input_bytes < 20_000
 
 
 def test_what_waits_is_counted_with_its_topic_and_properties(
     waiting: Peer, broker: Broker, join: Join
 ):
     waiting.send(Publish("b/" + "x" * 30_000, b"", 1, False, False, 10_001))
-    assert 60_000 < broker.ledger.input_bytes < 65_000, "the topic, and the head that it is in"
+    assert 60_000 < broker.accounting.input_bytes < 65_000, "the topic, and the head that it is in"
     other = join("other")
     pairs: Properties = {Property.USER_PROPERTY: [("k" * 1000, "v" * 29_000)]}
     other.send(
         Publish("a", b"", 1, False, False, 10_001),
         Publish("b", b"", 1, False, False, 10_002, pairs),
     )
-    assert broker.ledger.input_bytes > 90_000
+    assert broker.accounting.input_bytes > 90_000
 
 
 def test_much_that_comes_behind_it_is_taken_in_turns(waiting: Peer, broker: Broker):
@@ -796,11 +796,11 @@ def test_a_connection_lost_in_the_login_brings_nothing_in(broker: Broker):
 
 
 def test_a_publisher_that_is_cut_off_is_forgotten(waiting: Peer, broker: Broker):
-    (congested,) = broker.ledger.congested
+    (congested,) = broker.accounting.congested
     waiting.client.close(ReasonCode.ADMINISTRATIVE_ACTION, "")
     broker.flush()
     assert congested.congestion is not None and not congested.congestion._waiting
-    assert broker.ledger.input_bytes == 0
+    assert broker.accounting.input_bytes == 0
 
 
 def test_wrong_bytes_behind_it_end_the_connection(waiting: Peer, broker: Broker):

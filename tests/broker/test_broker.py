@@ -596,7 +596,7 @@ def test_a_session_expires(join: Join, broker: Broker, store: FakeStore):
 def test_a_session_that_has_expired_between_two_ticks_is_not_continued(broker: Broker, join: Join):
     peer = join(**lasting(5, 100))
     peer.lose()
-    broker.ledger.now += 100
+    broker.accounting.now += 100
     assert not Peer(broker).connect(**lasting(5)).session_present
 
 
@@ -1066,7 +1066,7 @@ def test_all_queues_together_are_bounded(join: Join, broker: Broker):
     publisher = join("publisher")
     for _ in range(3):
         publisher.publish("t", bytes(2000), 1)
-    assert broker.ledger.queued_bytes <= 12_000
+    assert broker.accounting.queued_bytes <= 12_000
     assert sum(len(session.queue) for session in broker.sessions.values()) == 3
     # QoS 2 that is held until its PUBREL counts as well.
     assert publisher.publish("t", bytes(3000), 2) == ReasonCode.QUOTA_EXCEEDED

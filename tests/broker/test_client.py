@@ -360,7 +360,7 @@ def test_unfinished_qos_2_messages_are_bounded_in_bytes(join: Join, broker: Brok
     for packet_id in range(1, 20):
         if not peer.wire.closed:
             peer.send(Publish("a", bytes(5000), 2, packet_id=packet_id))
-    assert broker.ledger.queued_bytes <= 20_000
+    assert broker.accounting.queued_bytes <= 20_000
     answers = [p.reason_code for p in peer.received() if isinstance(p, Pubrec)]
     assert len([code for code in answers if code < 0x80]) == 3
     if version == 5:
@@ -855,11 +855,11 @@ def test_a_packet_cut_in_two_is_as_old_as_its_first_byte(
         peer.send(Subscribe(1, [Subscription("x")]).encode(4) + command[:5])
     else:
         peer.send(command[:5])
-    broker.ledger.now += 3
+    broker.accounting.now += 3
     if waits:
         peer.go_on()
-    broker.ledger.now += 0.05
+    broker.accounting.now += 0.05
     peer.send(command[5:] + command[:5])
-    broker.ledger.now += 0.05
+    broker.accounting.now += 0.05
     peer.send(command[5:])
     assert ages == [pytest.approx(3.05), 0.0]

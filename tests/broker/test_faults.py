@@ -292,7 +292,7 @@ def test_an_expiry_beyond_what_a_packet_can_say(broker, ahead, qos):
         {Property.MESSAGE_EXPIRY_INTERVAL: 0xFFFF_FFFF},
         1000.0 + 0xFFFF_FFFF + ahead,
     )
-    broker.retained.restore([(message, broker.ledger.accounts.inside)])
+    broker.retained.restore([(message, broker.accounting.accounts.inside)])
     peer = join(broker, "late")
     peer.send(Subscribe(1, [Subscription("t", 1)]))
     publish = peer.received()[-1]
@@ -625,7 +625,7 @@ def test_who_waits_for_no_commit_is_written_to_when_the_store_cannot_be_hurried(
 
 def test_the_bytes_of_a_session_go_with_it_to_its_user(broker):
     """As of one that was made for a plugin before anybody had logged in."""
-    accounts = broker.ledger.accounts
+    accounts = broker.accounting.accounts
     session = broker.attach("claimed", InsideLink())
     broker.subscribe(session, Subscription("a/long/filter", 1))
     held = session.bytes

@@ -1,4 +1,4 @@
-"""What happens when a limit is reached: policies for full queues, memory, turns and complaints."""
+"""What happens when a limit is reached: full queues, memory, turns, and rate-limited log lines."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access
     for number in range(REPLAYED_A_TURN + 5):
         publisher.publish(f"r/{number}", b"", 0)
         message = Message(f"r/{number}", b"x", retain=True)
-        broker.retained.keep(message, broker.ledger.accounts.inside)
+        broker.retained.keep(message, broker.accounting.accounts.inside)
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
     assert subscriber.payloads() == [] and subscriber.wire.laters == 1
@@ -339,16 +339,16 @@ def test_what_has_come_in_is_counted(join: Join, broker: Broker):
     assert peers[2].farewell() == ReasonCode.QUOTA_EXCEEDED
     peers[0].send(bytes(20_100))
     peers[1].lose()
-    assert broker.ledger.input_bytes < 200
+    assert broker.accounting.input_bytes < 200
     alias = {Property.TOPIC_ALIAS: 1}
     peers[0].wire.closed or peers[0].lose()
     aliased = join("aliased")
     aliased.publish("x" * 10_000, properties=alias)
-    assert 10_000 < broker.ledger.input_bytes < 10_300
+    assert 10_000 < broker.accounting.input_bytes < 10_300
     aliased.publish("é" * 3_000 + "\U0001f916", properties=alias)
-    assert 12_000 < broker.ledger.input_bytes < 12_300, "four bytes a character"
+    assert 12_000 < broker.accounting.input_bytes < 12_300, "four bytes a character"
     aliased.publish("y", properties=alias)
-    assert broker.ledger.input_bytes < 300
+    assert broker.accounting.input_bytes < 300
 
 
 def user_properties(count: int) -> Properties:
@@ -470,7 +470,7 @@ def test_thousands_of_sessions_expire_in_turns(join: Join, broker: Broker):
     assert turns == 3 and not broker.sessions
 
 
-# --- complaints
+# --- the rate-limited log
 
 
 def test_a_flood_is_told_as_a_number(join: Join, broker: Broker, access: FakeAccess, caplog):

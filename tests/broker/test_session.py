@@ -382,7 +382,7 @@ class Conversations(RuleBasedStateMachine):
             assert known.peer is not None
             known.peer.disconnect()
         self.broker.tick(self.broker.now + self.broker.limits.session_expiry)
-        assert not self.broker.sessions and self.broker.ledger.queued_bytes == 0
+        assert not self.broker.sessions and self.broker.accounting.queued_bytes == 0
 
 
 TestConversations = Conversations.TestCase
@@ -452,13 +452,13 @@ def test_window_queue_and_drops(session: Session):
     taken = [session.deliver(Message("a", b"%d" % n), 1, False, None) for n in range(7)]
     assert taken == [True] * 5 + [False] * 2
     assert [sent[0] for sent in link.sent] == [b"0", b"1"]
-    assert session.ledger.counters.publish_dropped == 2
+    assert session.accounting.counters.publish_dropped == 2
     first, second = (sent[2] for sent in link.sent)
     assert session.puback(first) and not session.puback(first)
     assert [sent[0] for sent in link.sent] == [b"0", b"1", b"2"]
     assert session.puback(second)
     session.clear()
-    assert session.bytes == session.ledger.queued_bytes == 0
+    assert session.bytes == session.accounting.queued_bytes == 0
 
 
 def test_no_room_means_no_room_even_with_an_open_window(session: Session):
@@ -475,7 +475,7 @@ def test_a_message_that_is_released_twice_is_released_once(session: Session):
     assert session.hold(5, held)
     assert session.unhold(5) is held
     assert session.unhold(5) is None
-    assert session.ledger.queued_bytes == 0
+    assert session.accounting.queued_bytes == 0
 
 
 def test_an_absent_client_gets_no_qos_0(session: Session):
@@ -524,7 +524,7 @@ def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_
 def test_a_large_message_does_not_come_behind_a_newer_one_of_its_topic(
     broker: Broker, join: Join, version: int, keep: int | None
 ):
-    broker.ledger.limits = dataclasses.replace(broker.ledger.limits, keep=keep or 0)
+    broker.accounting.limits = dataclasses.replace(broker.accounting.limits, keep=keep or 0)
     peer, publisher = join(version=version), join("publisher")
     peer.subscribe("#")
     peer.wire.behind = True

@@ -127,7 +127,7 @@ def test_what_waits_is_counted_once_wherever_it_waits(
             publisher.publish("a", b"x", qos, properties={Property.CONTENT_TYPE: "text/plain"})
     figures = values(sys_topics)
     assert figures["messages/stored"] == figures["store/messages/count"] == "30"
-    assert int(figures["store/messages/bytes"]) == broker.ledger.queued_bytes
+    assert int(figures["store/messages/bytes"]) == broker.accounting.queued_bytes
 
 
 def test_a_session_inside_the_appliance_is_no_client(sys_topics: SysTopics, broker: Broker):

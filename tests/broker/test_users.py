@@ -84,7 +84,7 @@ def test_what_a_user_may_hold(whole, own, held, total, size, allowed):
 
 
 def test_accounts_that_hold_nothing_are_forgotten(broker: Broker):
-    accounts = broker.ledger.accounts
+    accounts = broker.accounting.accounts
     keeper = try_to_connect(broker, "keeper", "keeper")
     for number in range(5 * ACCOUNTS):
         try_to_connect(broker, "visitor", f"user-{number}").lose()
@@ -370,15 +370,17 @@ def hoard(broker: Broker, user: str, clients: int) -> None:
 @pytest.mark.parametrize("limits", [Limits(memory=1 << 20, connections=100)])
 def test_memory_is_shared(broker: Broker, join: Join, store: FakeStore):
     hoard(broker, "mallory", 20)
-    ledger = broker.ledger
-    held = ledger.accounts.of_user("mallory").bytes
-    assert 0.45 * ledger.memory < held <= 0.5 * ledger.memory, "half is lent to who is alone"
+    accounting = broker.accounting
+    held = accounting.accounts.of_user("mallory").bytes
+    assert 0.45 * accounting.memory < held <= 0.5 * accounting.memory, (
+        "half is lent to who is alone"
+    )
     absent = join("alice-absent", user="alice", **lasting(5))
     absent.subscribe("news", 1)
     absent.lose()
     alice = join("alice", user="alice")
-    share = ledger.memory // 4
-    while ledger.accounts.of_user("alice").bytes + 4000 < share:
+    share = accounting.memory // 4
+    while accounting.accounts.of_user("alice").bytes + 4000 < share:
         assert alice.publish("news", bytes(1000), 1) == 0
     assert alice.subscribe("x/y", 1) == 1
     mallory = join("m", user="mallory")
@@ -391,7 +393,7 @@ def test_memory_is_shared(broker: Broker, join: Join, store: FakeStore):
 @pytest.mark.parametrize("limits", [Limits(memory=1 << 20, user=UserLimits(memory=100_000))])
 def test_a_configured_memory_is_the_most(broker: Broker):
     hoard(broker, "mallory", 5)
-    assert 90_000 < broker.ledger.accounts.of_user("mallory").bytes <= 100_000
+    assert 90_000 < broker.accounting.accounts.of_user("mallory").bytes <= 100_000
 
 
 @pytest.mark.parametrize("limits", [Limits(memory=1 << 20, connections=1)])
@@ -434,7 +436,7 @@ def test_retained_bytes_are_shared(broker: Broker, join: Join):
 
 
 def test_a_retained_message_is_in_the_account_of_its_last_publisher(broker: Broker, join: Join):
-    accounts = broker.ledger.accounts
+    accounts = broker.accounting.accounts
     alice, mallory = join("alice", user="alice"), join("mallory", user="mallory")
     alice.publish("t", b"x", 0, retain=True)
     mallory.publish("t", b"xyz", 0, retain=True)
@@ -453,7 +455,7 @@ def test_the_appliance_itself_retains_whatever_users_have(broker: Broker, join: 
         peer = join(user, user=user)
         for number in range(4):
             peer.publish(f"{user}/{number}", b"x", 0, retain=True)
-    assert broker.ledger.accounts.retained == 4
+    assert broker.accounting.accounts.retained == 4
     inside = broker.attach("inside", FakeLink())
     for number in range(4):
         broker.publish(Message(f"state/{number}", b"online", retain=True), inside)
@@ -477,16 +479,16 @@ def test_the_store_is_shared(broker: Broker, store: FakeStore, join: Join):
         peer.lose()
     publisher = join("publisher", user="carol")
     store.bytes = 600_000  # as the real store would have counted
-    broker.ledger.accounts.of_user("mallory").stored = 500_000
+    broker.accounting.accounts.of_user("mallory").stored = 500_000
     assert publisher.publish("mallory", bytes(1000), 1) == FULL
     assert publisher.publish("alice", bytes(1000), 1) == 0
-    broker.ledger.accounts.of_user("alice").stored = 250_000
+    broker.accounting.accounts.of_user("alice").stored = 250_000
     assert publisher.publish("alice", bytes(1000), 1) == FULL
     assert join("eve", user="eve").publish("e", bytes(1000), 1, retain=True) != FULL
     store.bytes = 1_000_000
     assert join("eve", user="eve").publish("f", bytes(1000), 1, retain=True) == FULL
     for user in ("mallory", "alice"):
-        broker.ledger.accounts.of_user(user).stored = 0
+        broker.accounting.accounts.of_user(user).stored = 0
 
 
 # --- what is told: whose share is full, and which key says how much it is
@@ -601,7 +603,7 @@ def test_a_refused_message_says_whose_queue_has_no_room(
     publisher = join("publisher", user="alice")
     store.size = 1_000_000
     broker.use(limits, broker.features)
-    bob = broker.ledger.accounts.of_user("bob")
+    bob = broker.accounting.accounts.of_user("bob")
     for number in range(1, 6):
         got = answer(publisher, Publish("t", bytes(1000), qos, packet_id=number))
         if got.reason_code:
@@ -683,7 +685,7 @@ def test_a_session_that_a_plugin_made_is_in_the_account_of_who_takes_it_over(bro
     class Unclaimed(Identity):
         """As of amqtt's plugins."""
 
-    link, accounts = FakeLink(), broker.ledger.accounts
+    link, accounts = FakeLink(), broker.accounting.accounts
     session, _ = broker.connect(
         link, Unclaimed(None, "theirs"), clean_start=False, expiry=60, will=None
     )
@@ -818,7 +820,7 @@ def test_whatever_mallory_does_alice_has_her_share(broker: Broker, access: FakeA
         assert found == kept, turn
         broker.tick(broker.now + 1)
     assert broker.sessions["alice-absent"].persistent
-    used = broker.ledger.accounts.of_user("mallory")
+    used = broker.accounting.accounts.of_user("mallory")
     assert broker.counters.taken_back or used.sessions < 12, "mallory has tried hard"
 
 
@@ -829,4 +831,4 @@ def test_sessions_that_come_and_go_do_not_outgrow_the_memory(broker: Broker):
         peer = try_to_connect(broker, f"m-{number}", "mallory", **lasting(5))
         peer.send(Subscribe(1, [Subscription("a/b", 0)]))
         peer.lose()
-    assert broker.ledger.queued_bytes <= broker.limits.memory
+    assert broker.accounting.queued_bytes <= broker.limits.memory

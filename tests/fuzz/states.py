@@ -248,7 +248,7 @@ class World:
         )  # what was contained is found all the same
         limits = broker.limits
         # What there was room for at its PUBREC is delivered though there is none left at PUBREL.
-        assert broker.ledger.queued_bytes <= 2 * limits.memory
+        assert broker.accounting.queued_bytes <= 2 * limits.memory
         assert broker.retained.bytes <= limits.retained_bytes
         assert len(broker.sessions) <= limits.sessions
         for session in broker.sessions.values():

@@ -67,7 +67,7 @@ class Filling:
 
     @property
     def counted(self) -> int:
-        return self.broker.ledger.queued_bytes + self.broker.retained.bytes
+        return self.broker.accounting.queued_bytes + self.broker.retained.bytes
 
     def join(self, client_id: str, version: int = 5, **options: object) -> Peer:
         peer = Peer(self.broker, version)

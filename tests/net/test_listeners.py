@@ -1043,11 +1043,11 @@ async def test_the_output_of_slow_readers_is_counted(small_house: House, tls):
     for _ in range(150):
         await publisher.say(Publish("a", bytes(20_000)), Pingreq())
         assert isinstance(await publisher.hear(), Pingresp)
-    ledger = house.broker.ledger
+    accounting = house.broker.accounting
     protocols = [house.protocol(f"r{number}") for number in range(20)]
     waiting = sum(protocol._output_size() for protocol in protocols)
     assert house.network.output >= waiting > 0
-    assert ledger.queued_bytes >= waiting
+    assert accounting.queued_bytes >= waiting
     assert waiting < 3 * MIB
     for reader in readers:
         reader.hang_up()
@@ -1084,7 +1084,7 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: House, c
     house = small_house
     await house.start()
     publisher = await house.join("pub")
-    ledger = house.broker.ledger
+    accounting = house.broker.accounting
     loop = asyncio.get_running_loop()
 
     async def publish(count: int, size: int) -> float:
@@ -1095,7 +1095,7 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: House, c
         return loop.time() - began
 
     await publish(10, 20_000)
-    ledger.queued_bytes += 7 * MIB
+    accounting.queued_bytes += 7 * MIB
     try:
         assert await publish(10, 20_000) > 9 * wire.SHORT_OF_MEMORY_PAUSE
         assert await publish(5 * network.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
@@ -1107,7 +1107,7 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: House, c
             await reader.hear()
         assert loop.time() - began < 25 * wire.SHORT_OF_MEMORY_PAUSE
     finally:
-        ledger.queued_bytes -= 7 * MIB
+        accounting.queued_bytes -= 7 * MIB
 
 
 async def test_who_stays_slow_is_told_in_the_log(house: House, monkeypatch, caplog):

@@ -135,23 +135,23 @@ async def test_many_that_go_at_once_are_no_more_than_a_round(house: House):
 @pytest.mark.parametrize("end", ["taken in", "lost"])
 async def test_what_was_received_and_waits_is_counted_for_its_user(house: House, end: str):
     await house.start()
-    ledger = house.broker.ledger
+    accounting = house.broker.accounting
     there = await crowd(house)
     (caller, protocol), *_ = there
     await asyncio.sleep(0)
-    before = ledger.queued_bytes
+    before = accounting.queued_bytes
     chunk = Publish("a", bytes(1000)).encode(5) * 100
     house.network.is_round_over()
     house.broker.counters.effort += 2 * EFFORT_A_ROUND
     protocol.data_received(chunk)
-    assert protocol._held and ledger.queued_bytes - before >= len(chunk)
+    assert protocol._held and accounting.queued_bytes - before >= len(chunk)
     assert protocol.account.bytes >= len(chunk)
     if end == "lost":
         protocol.connection_lost(None)
         caller.hang_up()
     await until(
-        lambda: not protocol._held and ledger.queued_bytes == before,
-        lambda: f"{ledger.queued_bytes - before} bytes that are counted",
+        lambda: not protocol._held and accounting.queued_bytes == before,
+        lambda: f"{accounting.queued_bytes - before} bytes that are counted",
     )
 
 
@@ -163,7 +163,7 @@ async def test_what_came_behind_connect_is_the_users_once_it_is_known(house: Hou
     caller = await house.dial()
     begun = Publish("a", bytes(3000), 1, packet_id=1).encode(5)
     await caller.say(Connect("b", username="mallory"), begun[:2000])
-    strangers = house.broker.ledger.accounts.strangers
+    strangers = house.broker.accounting.accounts.strangers
     await until(lambda: strangers.bytes >= 2000, lambda: f"{strangers.bytes} bytes of strangers")
     check_network(house.network)
     house.gate.set()

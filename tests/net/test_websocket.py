@@ -453,19 +453,19 @@ async def test_frames_that_are_not_complete_are_counted(contexts):
     """They take memory; when there is no more of it, a connection is closed."""
     house = House(*contexts, Limits(packet_size=4 * MIB, memory=8 * MIB))
     await house.start()
-    ledger = house.broker.ledger
+    accounting = house.broker.accounting
     begun = b"\x82\xff" + (4 * MIB).to_bytes(8, "big") + bytes(4)
     try:
         talkers = [await join(house, f"c{n}") for n in range(4)]
-        before = ledger.queued_bytes
+        before = accounting.queued_bytes
         talkers[0].connection.transport.write(begun + bytes(3 * MIB))
-        await until(lambda: ledger.queued_bytes >= before + 3 * MIB)
+        await until(lambda: accounting.queued_bytes >= before + 3 * MIB)
         talkers[0].connection.transport.write(bytes(MIB))
-        await until(lambda: ledger.queued_bytes < before + MIB)
+        await until(lambda: accounting.queued_bytes < before + MIB)
         for talker in talkers[1:]:
             talker.connection.transport.write(begun + bytes(4 * MIB - 1))
         await until(lambda: len(house.network.open) < 3)
-        assert ledger.queued_bytes <= 8 * MIB
+        assert accounting.queued_bytes <= 8 * MIB
     finally:
         await house.close()
 
@@ -545,24 +545,24 @@ async def test_little_chunks_of_many_frames_take_turns(house: House):
     await join(house, "alice", username="alice")
     ends = {name: house.protocol(name) for name in ("alice", *(f"web-{n}" for n in range(30)))}
     alice: Any = ends.pop("alice")._transport
-    ledger = house.broker.ledger
+    accounting = house.broker.accounting
     account = ends["web-0"].account
     await until(lambda: not house.network.is_busy())
-    before, held, effort = ledger.queued_bytes, account.bytes, ledger.counters.effort
+    before, held, effort = accounting.queued_bytes, account.bytes, accounting.counters.effort
     chunk = frame(b"", Opcode.BINARY, fin=False) + frame(b"", Opcode.CONT, fin=False) * 339
     for end in ends.values():
         cast(Any, end._transport).data_received(chunk)
-    cost = ledger.counters.effort - effort
+    cost = accounting.counters.effort - effort
     assert cost < 3 * 340 * FRAME_EFFORT + EFFORT_A_ROUND, cost
     waiting = sum(bool(cast(Any, end._transport)._held) for end in ends.values())
     assert waiting >= 20
-    assert ledger.queued_bytes - before >= waiting * len(chunk)
+    assert accounting.queued_bytes - before >= waiting * len(chunk)
     assert account.bytes - held >= waiting * len(chunk)
-    received = ledger.counters.messages_received
+    received = accounting.counters.messages_received
     alice.data_received(frame(Pingreq().encode(5)))
-    assert ledger.counters.messages_received == received + 1
+    assert accounting.counters.messages_received == received + 1
     await until(lambda: not any(cast(Any, end._transport)._held for end in ends.values()))
-    await until(lambda: ledger.queued_bytes == before and account.bytes == held)
+    await until(lambda: accounting.queued_bytes == before and account.bytes == held)
     assert len(crowd) == len(house.network.open) - 1
 
 
@@ -572,12 +572,12 @@ async def test_what_waits_below_a_lost_connection_is_given_back(house: House):
     await caller.say(frame(Connect("web", username="mallory").encode()))
     await hear_frame(caller)
     end = house.protocol("web")
-    before = house.broker.ledger.queued_bytes
+    before = house.broker.accounting.queued_bytes
     cast(Any, end._transport).pause_reading()
     cast(Any, end._transport).data_received(frame(bytes(3000)))
     end.abort()
-    assert house.broker.ledger.queued_bytes >= before + 3000
-    await until(lambda: house.broker.ledger.queued_bytes == 0)
+    assert house.broker.accounting.queued_bytes >= before + 3000
+    await until(lambda: house.broker.accounting.queued_bytes == 0)
 
 
 async def test_packets_behind_connect_wait_for_the_login(house: House):
@@ -794,7 +794,7 @@ async def test_a_frame_in_two_segments_is_as_old_as_the_first(house: House, busy
     Watches(house, lambda message: ages.append(message.age))
     command = frame(Publish("x", bytes(size)).encode(5))
     begun = loop.time()
-    house.broker.ledger.now = begun - 60
+    house.broker.accounting.now = begun - 60
     await caller.say(command[: len(command) // 2])
     await until(lambda: wire._frame)
     noticed = loop.time()

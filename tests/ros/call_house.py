@@ -144,7 +144,7 @@ class House:
         self.node = node
         self.rules = Rules()
         self.broker = Broker(self.rules, MemoryStore())
-        self.broker.ledger.now = time.monotonic()
+        self.broker.accounting.now = time.monotonic()
         self.bridge = None
 
     def start(self, *routes, topics=(), **limits):

@@ -28,8 +28,8 @@ def others(house):
 
 
 async def test_at_the_start_what_an_earlier_run_has_left(house):
-    inside = house.broker.ledger.accounts.inside
-    alice = house.broker.ledger.accounts.of_user("alice")
+    inside = house.broker.accounting.accounts.inside
+    alice = house.broker.accounting.accounts.of_user("alice")
     for topic in ("r2d2/map", "r2d2/gone", "elsewhere/gone", "r2d2/camera/a", "r2d2/only_commands"):
         house.broker.retained.keep(of_route(topic), inside)
     house.broker.retained.keep(of_route("r2d2/alices"), alice)

@@ -565,7 +565,7 @@ async def test_whose_all_of_it_is_is_known_after_a_restart(house: House, tmp_pat
     await house.written()
 
     def figures(broker: Broker) -> dict[str, tuple[object, ...]]:
-        accounts = broker.ledger.accounts
+        accounts = broker.accounting.accounts
         users = [accounts.of_user(user) for user in ("alice", "mallory", None)]
         return {
             str(each): (
@@ -608,6 +608,6 @@ async def test_a_store_of_an_older_appliance_does_not_say_whose_a_message_is(
     again = House(older, house.limits, **house.options).start()
     message = again.broker.retained.get("t")
     assert message is not None and message.payload == b"kept"
-    assert again.broker.ledger.accounts.of_user(None).retained == 1
+    assert again.broker.accounting.accounts.of_user(None).retained == 1
     await again.written()
     await again.stop()

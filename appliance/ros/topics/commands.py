@@ -513,11 +513,11 @@ class Commands(ToRos):
     def _let_wait(self, command: _Command, cdr: bytes, origin: Session) -> Objection | None:
         """Keep a first command until it is known whether others are behind it."""
         message = command.message
-        ledger = self._around.broker.ledger
+        accounting = self._around.broker.accounting
         size = message.size + len(cdr)
-        if not ledger.fits(origin.account, size):
+        if not accounting.fits(origin.account, size):
             return self._object(message, "was refused: there is no memory for it to wait in")
-        ledger.take(origin.account, size)
+        accounting.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)
         waiting = _Waiting(message, command.number, cdr, size, command.at, due, timer)
@@ -538,7 +538,7 @@ class Commands(ToRos):
         waiting = self._waiting.pop(origin, None)
         if waiting is not None:
             waiting.timer.cancel()
-            self._around.broker.ledger.take(origin.account, -waiting.size)
+            self._around.broker.accounting.take(origin.account, -waiting.size)
         return waiting
 
     def drop_waiting(self, origin: Session, why: str) -> None:
@@ -562,7 +562,7 @@ class Commands(ToRos):
         """Nothing has followed the first command, unless it has come and was not read yet."""
         now = self._around.entries.time()
         waiting = self._waiting[origin]
-        self._around.broker.ledger.now = now
+        self._around.broker.accounting.now = now
         contact = HERE if origin.link is None else origin.link.contact()
         # What comes with it may be something else than commands.
         if contact.has_unread or contact.flowing >= now - waiting.came_at:

@@ -52,9 +52,9 @@ class _Work:
 class ConversionQueue:
     """Does what takes long, one thing a turn."""
 
-    def __init__(self, entries: Entries, ledger: Accounting) -> None:
+    def __init__(self, entries: Entries, accounting: Accounting) -> None:
         self._entries = entries
-        self._ledger = ledger
+        self._accounting = accounting
         #: What waits, by client; and the clients whose turn it is, by user.
         self._waiting: dict[Who, deque[_Work]] = {}
         self._users: OrderedDict[str | None, deque[Who]] = OrderedDict()
@@ -75,7 +75,7 @@ class ConversionQueue:
         own = self._bytes[who.account]
         # One alone needs no more than memory.
         is_share = not own or own + size <= WAITING_OF_USER
-        return is_share and self._ledger.fits(who.account, size)
+        return is_share and self._accounting.fits(who.account, size)
 
     def do(self, who: Who, size: int, work: Callable[[], None]) -> None:
         """Do the work, which is on a payload of so many bytes, now or when it is its turn. What it
@@ -107,7 +107,7 @@ class ConversionQueue:
         if who is None:
             return
         account = who.account
-        self._ledger.take(account, size)
+        self._accounting.take(account, size)
         self._bytes[account] += size
         if not self._bytes[account]:
             del self._bytes[account]
@@ -120,7 +120,7 @@ class ConversionQueue:
         try:
             return self._run(work)
         finally:
-            self._ledger.counters.effort += int((thread_time() - begun) * 1e6)
+            self._accounting.counters.effort += int((thread_time() - begun) * 1e6)
             # What came meanwhile is read in the next round, and is answered before the one after.
             if not was_busy:
                 self._entries.soon("turns.pause", self._pause, failed=self._pause)

@@ -170,7 +170,7 @@ async def test_who_cancels_much_keeps_nobody_from_cancelling(house):
 async def test_the_clients_without_a_user_are_one_user(house):
     slow = await begin(house, CallLimits(client=2, total=8))
     crowd = [house.client(f"nobody{number}") for number in range(3)]
-    nobody = house.broker.ledger.accounts.of(Identity(None, "nobody"))
+    nobody = house.broker.accounting.accounts.of(Identity(None, "nobody"))
     for client in crowd:
         client.session.account = nobody
     for client in crowd[:2]:
@@ -317,7 +317,7 @@ async def test_commands_and_calls_of_a_client_stay_in_order(house):
     alice.send(f"{CALL}/1", {"data": True})
     bob.send("r2d2/b", {"data": "little, too"})
     assert [len(peer.received) for peer in peers] == [0, 2]
-    assert house.broker.ledger.queued_bytes > 15_000
+    assert house.broker.accounting.queued_bytes > 15_000
     texts = CONVERTERS.get(STRING)
     await until(lambda: len(peers[0].received) == 4, "all commands")
     order = [texts.to_dict(cdr)["data"][:2] for cdr in peers[0].received]
@@ -405,8 +405,8 @@ LARGE = turns.LITTLE + 1
 
 def turn_house(memory=1 << 20):
     clock = Clock()
-    ledger = Accounting(Limits(memory=memory), MemoryStore())
-    return clock, turns.ConversionQueue(Entries(clock, Faults()), ledger)
+    accounting = Accounting(Limits(memory=memory), MemoryStore())
+    return clock, turns.ConversionQueue(Entries(clock, Faults()), accounting)
 
 
 def test_one_is_done_at_once_and_the_others_one_a_turn():
@@ -442,7 +442,7 @@ def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
         own = [text for text in done if text.startswith(name)]
         assert own[:3] == [f"{name} {number}" for number in range(3)]
     assert done[-1] == "first, little"
-    assert not queue.waits(first) and queue._ledger.queued_bytes == 0
+    assert not queue.waits(first) and queue._accounting.queued_bytes == 0
     assert first.account.bytes == 0
 
 
@@ -482,7 +482,7 @@ def test_what_waits_takes_memory_of_its_user(monkeypatch):
     while queue.has_room(a, 10_000):
         queue.do(a, 10_000, lambda: None)
         count += 1
-    assert a.account.bytes == count * (10_000 + turns.OVERHEAD) == queue._ledger.queued_bytes
+    assert a.account.bytes == count * (10_000 + turns.OVERHEAD) == queue._accounting.queued_bytes
     assert 10 < count < 60
     assert queue.has_room(b, 10_000)
     monkeypatch.setattr(turns, "WAITING_OF_USER", 30_000)
@@ -492,4 +492,4 @@ def test_what_waits_takes_memory_of_its_user(monkeypatch):
     assert b.account.bytes == 2 * (10_000 + turns.OVERHEAD)
     while clock.soon:
         clock.round()
-    assert a.account.bytes == queue._ledger.queued_bytes == 0
+    assert a.account.bytes == queue._accounting.queued_bytes == 0

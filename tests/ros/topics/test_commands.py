@@ -150,7 +150,7 @@ class Driver:
 
     def say(self, *packets):
         # As a connection does it, once for all that it has received.
-        self.broker.ledger.now = asyncio.get_running_loop().time()
+        self.broker.accounting.now = asyncio.get_running_loop().time()
         self.client.receive(b"".join(packet.encode(self.version) for packet in packets))
         self.broker.flush()
 
@@ -266,7 +266,7 @@ def asks(house, action):
     def answer(driver, seconds):
         plugin.has_answered = True
         house.broker.router.changed()
-        house.broker.ledger.now += seconds
+        house.broker.accounting.now += seconds
         driver.client.send_on()
         house.broker.flush()
 
@@ -361,7 +361,7 @@ async def test_what_two_clients_had_queued_is_old_of_both(house):
     house.start(CommandRules(expire=0.5))
     a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
     # At one moment, however long it takes here: a pause would be that of a stream that begins.
-    house.broker.ledger.now = asyncio.get_running_loop().time()
+    house.broker.accounting.now = asyncio.get_running_loop().time()
     for driver in (a, b):
         driver.client.receive(Publish(TOPIC, GO, qos=1, packet_id=7, dup=True).encode(5))
     for driver in (a, b):
@@ -1427,7 +1427,7 @@ async def test_a_client_id_that_is_taken_over(house, client):
 async def test_a_single_command_behind_connect(house, version, qos, leaves):
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "never seen", version)
-    before = house.broker.ledger.queued_bytes
+    before = house.broker.accounting.queued_bytes
     driver.drive(qos=qos)
     if qos == 2:
         driver.say(Pubrel(7))
@@ -1435,20 +1435,20 @@ async def test_a_single_command_behind_connect(house, version, qos, leaves):
         driver.leave()
         assert house.robot.received == [twist(0.5)]
     await until(lambda: house.robot.received == [twist(0.5)])
-    assert house.broker.ledger.queued_bytes == before
+    assert house.broker.accounting.queued_bytes == before
 
 
 async def test_a_single_command_and_a_cut(house):
     """It may have been the first of a queue."""
     house.start(CommandRules(expire=0.5))
-    before = house.broker.ledger.queued_bytes
+    before = house.broker.accounting.queued_bytes
     driver = Driver(house.broker, "a")
     driver.drive()
     driver.cut()
     await asyncio.sleep(0.2)
     assert house.robot.received == []
     assert house.counters().expired == 1
-    assert house.broker.ledger.queued_bytes == before
+    assert house.broker.accounting.queued_bytes == before
     assert house.commands._arrivals._paces == {}
 
 
@@ -1672,16 +1672,16 @@ async def test_what_waits_for_ever_behind_it(house):
 async def test_what_waits_takes_memory_that_is_counted(house, monkeypatch):
     house.start(CommandRules(expire=0.5))
     a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
-    ledger, account = house.broker.ledger, a.client.session.account
-    before, own = ledger.queued_bytes, account.bytes
+    accounting, account = house.broker.accounting, a.client.session.account
+    before, own = accounting.queued_bytes, account.bytes
     a.drive()
-    assert ledger.queued_bytes >= before + len(GO) + len(twist())
-    assert account.bytes - own == ledger.queued_bytes - before
+    assert accounting.queued_bytes >= before + len(GO) + len(twist())
+    assert account.bytes - own == accounting.queued_bytes - before
     with monkeypatch.context() as patch:
         patch.setattr(Accounting, "fits", lambda *_: False)
         b.drive()
     await until(lambda: house.robot.received == [twist(0.5)])
-    assert (ledger.queued_bytes, account.bytes) == (before, own)
+    assert (accounting.queued_bytes, account.bytes) == (before, own)
     assert "no memory" in house.counters().last_error
 
 
@@ -1907,7 +1907,7 @@ async def test_what_waits_does_not_outlive_its_route(house):
     bridge.replace([])
     await asyncio.sleep(0.2)
     assert house.robot.received == []
-    assert house.broker.ledger.queued_bytes == 0
+    assert house.broker.accounting.queued_bytes == 0
 
 
 async def test_who_commands_meanwhile_has_the_lease(house):
@@ -2355,7 +2355,7 @@ async def test_each_message_of_a_plugin_is_a_command_of_its_own(house, pace):
     house.start(CommandRules(expire=0.5))
     begun = asyncio.get_running_loop().time()
     for number in range(6):
-        house.broker.ledger.now = begun + number * pace
+        house.broker.accounting.now = begun + number * pace
         house.client.send(TOPIC, GO)
     assert len(house.robot.received) == (4 if pace else 0)
     await asyncio.sleep(0.2)  # longer than a first command waits
