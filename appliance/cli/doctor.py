@@ -13,6 +13,9 @@ from appliance.cli.console import ConfigOption
 
 _COLOURS = {"ok": "green", "warning": "yellow", "problem": "red"}
 
+#: The word that this command prints for each level of a finding.
+_WORDS = {"ok": "ok", "warning": "warning", "error": "problem"}
+
 
 def doctor(
     config: ConfigOption = None,
@@ -27,11 +30,12 @@ def doctor(
 
     counts: Counter[str] = Counter()
     for finding in examine(config):
-        counts[finding.level] += 1
+        level = _WORDS[finding.level]
+        counts[level] += 1
         if as_json:
-            typer.echo(json.dumps(asdict(finding), ensure_ascii=False))
+            typer.echo(json.dumps({**asdict(finding), "level": level}, ensure_ascii=False))
             continue
-        typer.secho(f"{finding.level:<8}", fg=_COLOURS[finding.level], nl=False)
+        typer.secho(f"{level:<8}", fg=_COLOURS[level], nl=False)
         typer.echo(f"{finding.subject}: {finding.text}")
         if finding.advice:
             typer.echo(f"{'':8}what to do: {finding.advice}")

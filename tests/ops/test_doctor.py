@@ -22,7 +22,7 @@ from appliance.cli import main as cli
 from appliance.config import Settings
 from appliance.ops.doctor import computer, examination, ports, ros, ros1, secrets
 from appliance.ops.doctor.examination import Part, examine
-from appliance.ops.doctor.finding import Finding
+from appliance.ops.finding import Finding
 from appliance.ros.ros2 import discovery, fastdds
 
 
@@ -140,7 +140,7 @@ def test_a_port_that_another_program_has(here: Path) -> None:
         port = taken.getsockname()[1]
         settings = write(here, broker={"listeners": [{"bind": f"0.0.0.0:{port}"}]})
         [finding] = ports.ports(settings, None)
-        assert finding.level == "problem" and f"(pid {os.getpid()})" in finding.text
+        assert finding.level == "error" and f"(pid {os.getpid()})" in finding.text
         assert "broker.listeners" in finding.advice
     [finding] = ports.ports(settings, None)
     assert (finding.level, finding.text) == ("ok", "free")
@@ -152,9 +152,9 @@ def test_places_where_nobody_can_listen(here: Path) -> None:
     settings = write(here, broker={"listeners": [{"bind": bind} for bind in binds]})
     texts = [(each.level, each.text) for each in ports.ports(settings, None)]
     assert texts == [
-        ("problem", "this computer does not have the address 203.0.113.7 now"),
-        ("problem", f"{here}/none is no folder that can be written"),
-        ("problem", "there is another file"),
+        ("error", "this computer does not have the address 203.0.113.7 now"),
+        ("error", f"{here}/none is no folder that can be written"),
+        ("error", "there is another file"),
     ]
 
 
@@ -178,7 +178,7 @@ def test_a_clock_that_is_not_set(here: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert computer.is_synchronised() in (True, False)
     monkeypatch.setattr(computer, "is_unset", lambda now: True)
     first = next(computer.clock(settings, None))
-    assert first.level == "problem" and "timedatectl" in first.advice
+    assert first.level == "error" and "timedatectl" in first.advice
     monkeypatch.undo()
     monkeypatch.setattr(computer, "is_synchronised", lambda: False)
     assert next(computer.clock(settings, None)).level == "warning"
@@ -187,10 +187,10 @@ def test_a_clock_that_is_not_set(here: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(
     ("changed", "level", "text"),
     [
-        ({"f_flag": os.ST_RDONLY}, "problem", "is read-only"),
-        ({"f_bavail": 10}, "problem", "MiB free"),
+        ({"f_flag": os.ST_RDONLY}, "error", "is read-only"),
+        ({"f_bavail": 10}, "error", "MiB free"),
         ({"f_bavail": 100_000}, "warning", "it may grow to 1 GiB"),
-        ({"f_favail": 3}, "problem", r"room for 3 more files"),
+        ({"f_favail": 3}, "error", r"room for 3 more files"),
         ({"f_files": 0, "f_favail": 0}, "ok", "MiB free"),  # as btrfs has it
     ],
 )
@@ -229,13 +229,13 @@ def test_a_control_group_that_is_too_small(here: Path, monkeypatch: pytest.Monke
     assert computer.group_limit(os.getpid(), here / "nothing") is None
     monkeypatch.setattr(computer, "group_limit", lambda pid: limit)
     *_, last = computer.memory(write(here), None)
-    assert last.level == "problem" and "MemoryMax" in last.advice
+    assert last.level == "error" and "MemoryMax" in last.advice
 
 
 def test_too_few_open_files(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(computer.resource, "getrlimit", lambda which: (100, 1024))
     [finding] = computer.files(write(here), None)
-    assert finding.level == "problem" and "LimitNOFILE=" in finding.advice
+    assert finding.level == "error" and "LimitNOFILE=" in finding.advice
     [finding] = computer.files(write(here), {"pid": os.getpid()})  # of the running one, its own
     assert "1024" not in finding.text
 
@@ -273,7 +273,7 @@ def test_days_that_are_left(here: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(certs.authority, "out_of_time", lambda *_: "")
     certs.renew(directory, "server")
     found = by_subject(secrets.certificates(config.load(here / "appliance.yaml"), None))
-    assert found["the server's certificate"].level == "problem"
+    assert found["the server's certificate"].level == "error"
     assert "it ran out on " in found["the server's certificate"].text
 
 
@@ -283,13 +283,13 @@ def test_days_that_are_left(here: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_without_ros(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros, "available", lambda: (False, "there is no ROS 2 here. Source one"))
     finding = ros.which_ros(is_needed=True)
-    assert finding == Finding("problem", "ROS", "there is no ROS 2 here", "Source one")
+    assert finding == Finding("error", "ROS", "there is no ROS 2 here", "Source one")
     assert ros.which_ros(is_needed=False).level == "warning"
     subjects = [each.subject for each in ros.ros(write(here, bridge={}), None)]
     assert "ROS nodes" not in subjects and "shared memory" in subjects
 
 
-@pytest.mark.parametrize(("domain", "level"), [("7", "ok"), ("150", "warning"), ("x", "problem")])
+@pytest.mark.parametrize(("domain", "level"), [("7", "ok"), ("150", "warning"), ("x", "error")])
 def test_domains(here: Path, monkeypatch: pytest.MonkeyPatch, domain: str, level: str) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -368,7 +368,7 @@ def test_ros_1_that_is_not_here(here: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("ROS_IP", "127.0.0.1")
     monkeypatch.setattr(ros1, "available", lambda: (False, "it is not here. Install it"))
     routes = {"topics": [{"ros": "/odom", "to": "mqtt"}]}
-    for bridge, level in ((routes, "problem"), ({}, "warning")):
+    for bridge, level in ((routes, "error"), ({}, "warning")):
         found = by_subject(ros.ros(write(here, bridge={"bus": "ros1", **bridge}), None))
         assert found["ROS"] == Finding(level, "ROS", "it is not here", "Install it")
         master = found["ROS Master"]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 from appliance.config import Settings
 from appliance.ops.check.commands import commands, stop_message
-from appliance.ops.check.finding import Finding
+from appliance.ops.finding import Finding
 from appliance.ros import settings as ros_settings
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.graph import CallRoutes

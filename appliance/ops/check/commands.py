@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from appliance.config import Settings, TopicRoute
-from appliance.ops.check.finding import Finding
+from appliance.ops.finding import Finding
 from appliance.ros.payload.converter import ConversionError, Converter
 from appliance.ros.topics.commands import check_rules
 from appliance.ros.topics.rules import CommandRules

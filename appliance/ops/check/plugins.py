@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from appliance.ops.check.finding import Finding
+from appliance.ops.finding import Finding
 from appliance.plugins import PluginSettingsError, check_plugin_settings
 
 

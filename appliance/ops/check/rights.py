@@ -9,7 +9,7 @@ from appliance.access import Acl
 from appliance.access.rules import Permission, Rule
 from appliance.broker.ports import Action, Identity
 from appliance.config import Settings
-from appliance.ops.check.finding import Finding
+from appliance.ops.finding import Finding
 
 _PLACEHOLDER = re.compile(r"\{[^/]*\}|%[A-Za-z]")
 

@@ -16,9 +16,9 @@ from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 from appliance.ops.check.bridge import bridge
-from appliance.ops.check.finding import Finding
 from appliance.ops.check.plugins import plugin_settings
 from appliance.ops.check.rights import rights
+from appliance.ops.finding import Finding
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
 

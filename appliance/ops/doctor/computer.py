@@ -15,7 +15,7 @@ import psutil
 from appliance.config import Settings, format_size
 from appliance.host.clock import RELEASED, is_unset
 from appliance.net.listeners import OTHER_FILES
-from appliance.ops.doctor.finding import Finding
+from appliance.ops.finding import Finding
 
 #: What the appliance needs beside `broker.limits.memory`: Python, the libraries, ROS.
 BASE_MEMORY = 160 << 20
@@ -46,10 +46,10 @@ def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
             f"({RELEASED:%Y-%m-%d}): logs have wrong dates, and certificates are not checked "
             "for being too early"
         )
-        yield Finding("problem", "clock", text, advice)
+        yield Finding("error", "clock", text, advice)
     elif now > FAST_DDS_ENDS:
         text = f"it says {now:%Y-%m-%d}: after 2038 Fast DDS, and with it ROS 2, publishes nothing"
-        yield Finding("problem", "clock", text, advice)
+        yield Finding("error", "clock", text, advice)
     elif is_synchronised() is False:
         text = f"{now:%Y-%m-%d %H:%M} UTC, and nothing keeps it right"
         yield Finding("warning", "clock", text, advice)
@@ -105,13 +105,13 @@ def _room(subject: str, path: Path, most: int) -> Iterator[Finding]:
     found = os.statvfs(folder)
     if found.f_flag & os.ST_RDONLY:
         advice = "mount it for writing (mount -o remount,rw), or set another path"
-        yield Finding("problem", subject, f"{folder} is read-only", advice)
+        yield Finding("error", subject, f"{folder} is read-only", advice)
         return
     free = found.f_bavail * found.f_frsize
     used = path.stat().st_size if path.is_file() else 0
     text = f"{folder}: {free // _MIB} MiB free"
     if free < LEAST_DISK:
-        yield Finding("problem", subject, text, "make room; what is full refuses messages")
+        yield Finding("error", subject, text, "make room; what is full refuses messages")
     elif free + used < most:
         text += f", and it may grow to {format_size(most)}"
         yield Finding("warning", subject, text, "make room, or set a smaller size")
@@ -119,7 +119,7 @@ def _room(subject: str, path: Path, most: int) -> Iterator[Finding]:
         yield Finding("ok", subject, text)
     if found.f_files and found.f_favail < LEAST_FILES:
         text = f"{folder}: room for {found.f_favail} more files (inodes)"
-        yield Finding("problem", subject, text, "delete files; df -i shows where they are")
+        yield Finding("error", subject, text, "delete files; df -i shows where they are")
     kind = _kind(folder)
     if kind in _IN_MEMORY:
         text = f"{folder} is in memory ({kind}): nothing there outlives a restart of the computer"
@@ -155,7 +155,7 @@ def memory(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findi
         if limit < wanted:
             advice = "a smaller broker.limits.memory, or a larger MemoryMax"
             text += f", the appliance {wanted // _MIB}: the kernel would kill it"
-            yield Finding("problem", "memory limit", text, advice)
+            yield Finding("error", "memory limit", text, advice)
         else:
             yield Finding("ok", "memory limit", text)
 
@@ -192,7 +192,7 @@ def files(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         yield Finding("ok", "open files", f"{most} allowed, {wanted} needed")
         return
     yield Finding(
-        "problem",
+        "error",
         "open files",
         f"{hard} allowed, {wanted} needed for broker.limits.connections",
         f"LimitNOFILE={wanted} in the systemd unit, or a smaller broker.limits.connections",

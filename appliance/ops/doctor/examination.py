@@ -11,10 +11,10 @@ from appliance.config import ConfigError, Settings
 from appliance.ops import check
 from appliance.ops.control import ControlError, NotRunningError, ask
 from appliance.ops.doctor.computer import clock, disk, files, memory
-from appliance.ops.doctor.finding import Finding, Level
 from appliance.ops.doctor.ports import ports
 from appliance.ops.doctor.ros import ros
 from appliance.ops.doctor.secrets import certificates, permissions
+from appliance.ops.finding import Finding
 from appliance.ros.ros2.fastdds import LOST_IN_ROS
 
 #: Seconds that the running appliance has to answer.
@@ -34,7 +34,7 @@ def examine(path: Path | None) -> Iterator[Finding]:
     except ConfigError as error:
         settings = None
         for problem in error.problems:
-            yield Finding("problem", "configuration", str(problem))
+            yield Finding("error", "configuration", str(problem))
         text = "what follows is with the defaults, and without the files that it would name"
         yield Finding("warning", "configuration", text)
     known = settings or config.load_control(path)
@@ -44,13 +44,11 @@ def examine(path: Path | None) -> Iterator[Finding]:
     except NotRunningError:
         yield Finding("ok", "appliance", "not running")
     except ControlError as error:
-        yield Finding("problem", "appliance", str(error), "its log says more")
+        yield Finding("error", "appliance", str(error), "its log says more")
     if running is not None:
         yield from _running(running)
     if settings is not None:
-        for found in check.check(settings):
-            level: Level = "problem" if found.level == "error" else found.level
-            yield Finding(level, found.subject, found.text)
+        yield from check.check(settings)
     parts: list[Part] = [ports, clock, disk, memory, files]
     if settings is not None:
         parts[2:2] = [certificates, permissions]

@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 
 from appliance.config import Bind, Settings
-from appliance.ops.doctor.finding import Finding
+from appliance.ops.finding import Finding
 
 _UNPRIVILEGED = Path("/proc/sys/net/ipv4/ip_unprivileged_port_start")
 _ANY = ("", "0.0.0.0", "::", "*")
@@ -56,10 +56,10 @@ def _port(
     if holders and pid in holders:
         return Finding("ok", subject, f"the running appliance (pid {pid}) listens there")
     if holders:
-        return Finding("problem", subject, f"taken by {_name(holders[0])}", _advice(bind, holders))
+        return Finding("error", subject, f"taken by {_name(holders[0])}", _advice(bind, holders))
     if not _is_here(bind.host):
         return Finding(
-            "problem",
+            "error",
             subject,
             f"this computer does not have the address {bind.host} now",
             "bind 0.0.0.0, or start the appliance when the network is there",
@@ -103,9 +103,9 @@ def _socket(subject: str, path: Path, running: dict[str, Any] | None) -> Finding
     folder = path.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         advice = f"make it, and give it to the appliance's user: install -d {folder}"
-        return Finding("problem", subject, f"{folder} is no folder that can be written", advice)
+        return Finding("error", subject, f"{folder} is no folder that can be written", advice)
     if path.exists() and not path.is_socket():
-        return Finding("problem", subject, "there is another file", "move it away")
+        return Finding("error", subject, "there is another file", "move it away")
     return Finding("ok", subject, "free")
 
 

@@ -15,8 +15,8 @@ import psutil
 
 from appliance.config import Settings
 from appliance.host.environment import of_service
-from appliance.ops.doctor.finding import Finding
 from appliance.ops.doctor.ros1 import ros1
+from appliance.ops.finding import Finding
 from appliance.ros.ros2 import discovery, fastdds, installation
 from appliance.ros.ros2.discovery import OPEN, OPEN_ADVICE, TWIN, TWIN_ADVICE
 from appliance.ros.ros2.node import Ros2Node, available
@@ -112,7 +112,7 @@ def which_ros(is_needed: bool) -> Finding:
     is_available, reason = available()
     if not is_available:
         what, _, advice = reason.partition(". ")
-        return Finding("problem" if is_needed else "warning", "ROS", what, advice)
+        return Finding("error" if is_needed else "warning", "ROS", what, advice)
     found = installation.find()
     python = ".".join(map(str, found.python))
     text = (
@@ -132,7 +132,7 @@ def _discovery(settings: Settings) -> Iterator[Finding]:
     number = str(domain) if domain is not None else environment.get("ROS_DOMAIN_ID") or "0"
     text = f"{rmw}, domain {number} ({said}), {_range(environment)}"
     if not number.isdigit() or int(number) > 232:
-        yield Finding("problem", "ROS network", text, "a domain is a number from 0 to 232")
+        yield Finding("error", "ROS network", text, "a domain is a number from 0 to 232")
     elif int(number) > 101:
         advice = "a domain up to 101: the ports of others may be taken by outgoing connections"
         yield Finding("warning", "ROS network", text, advice)
@@ -172,7 +172,7 @@ def _networks() -> Iterator[Finding]:
     up = [name for name in states if states[name].isup]
     if "lo" in states and "lo" not in up:
         text = "the loopback (lo) is down: not even nodes of this computer are seen"
-        yield Finding("problem", "network", text, "ip link set lo up")
+        yield Finding("error", "network", text, "ip link set lo up")
     working: list[str] = []
     broken: list[str] = []
     for name, addresses in psutil.net_if_addrs().items():
@@ -224,12 +224,12 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         node.stop()
     subject = "ROS nodes"
     if seen.problem:
-        yield Finding("problem", subject, f"ROS cannot be joined: {seen.problem}")
+        yield Finding("error", subject, f"ROS cannot be joined: {seen.problem}")
         return
     if ours is not None and ours not in seen.nodes:
         text = f"the running appliance, {ours}, is not seen: nodes do not find each other here"
         advice = "the same RMW_IMPLEMENTATION, ROS_DOMAIN_ID and discovery range for all of them"
-        yield Finding("problem", subject, text, advice)
+        yield Finding("error", subject, text, advice)
         return
     if seen.has_twin:
         yield Finding("warning", subject, f"{ours}: {TWIN}", TWIN_ADVICE)

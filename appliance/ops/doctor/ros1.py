@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from appliance.ops.doctor.finding import Finding, Level
+from appliance.ops.finding import Finding, Level
 from appliance.ros.node import BusError
 from appliance.ros.ros1.node import available, found, master_uri
 from appliance.ros.ros1.peers import Master
@@ -23,7 +23,7 @@ _ROSOUT = "/rosout"
 
 def ros1(running: dict[str, Any] | None, *, is_needed: bool) -> Iterator[Finding]:
     """Without ROS 1, or its Master, the broker works alone: where routes need it is a problem."""
-    missing: Level = "problem" if is_needed else "warning"
+    missing: Level = "error" if is_needed else "warning"
     is_available, reason = available()
     if not is_available:
         what, _, advice = reason.partition(". ")
@@ -83,7 +83,7 @@ def _nodes(graph: list[dict[str, list[str]]], running: dict[str, Any] | None) ->
     if ours is not None and ours not in nodes:
         text = f"the running appliance, {ours}, is not known to this Master"
         advice = "the same ROS_MASTER_URI here as it has; after a new start of the Master, a second"
-        return Finding("problem", subject, text, advice)
+        return Finding("error", subject, text, advice)
     others = sorted(nodes - {ours, _ROSOUT})
     if not others:
         none = "none" if ours is None else f"none but the running appliance ({ours})"

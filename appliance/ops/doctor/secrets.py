@@ -10,7 +10,7 @@ from typing import Any
 from appliance import certs
 from appliance.certs.settings import tls_files
 from appliance.config import Settings
-from appliance.ops.doctor.finding import Finding
+from appliance.ops.finding import Finding, Level
 
 _WHAT = {"server": "the server's certificate", "ca": "the CA", "crl": "the revocation list"}
 
@@ -37,7 +37,7 @@ def permissions(settings: Settings, running: dict[str, Any] | None) -> Iterator[
         if state.st_mode & bits and not state.st_mode & 0o1000:
             found = True
             mode = f"mode {state.st_mode & 0o777:04o}"
-            yield Finding("problem", str(path), f"{text} ({mode})", f"{command} {path}")
+            yield Finding("error", str(path), f"{text} ({mode})", f"{command} {path}")
         if os.geteuid() not in (0, state.st_uid):
             found = True
             text = "it belongs to another user: run this as the appliance's user, or as root"
@@ -55,12 +55,12 @@ def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator
         return
     if not files.certificate.exists():
         advice = "appliance init makes what is missing"
-        yield Finding("problem", str(files.certificate), "it is not there", advice)
+        yield Finding("error", str(files.certificate), "it is not there", advice)
         return
     try:
         found = certs.endings(files)
     except certs.CertificateError as error:
-        yield Finding("problem", "certificates", str(error))
+        yield Finding("error", "certificates", str(error))
         return
     directory = files.certificate.parent
     is_ours = (directory / "ca.key").exists()
@@ -69,7 +69,7 @@ def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator
     revoked = certs.server_revoked(files)
     if revoked:
         advice = "appliance cert renew server"
-        yield Finding("problem", "the server's certificate", revoked, advice)
+        yield Finding("error", "the server's certificate", revoked, advice)
     if (directory / "issued.jsonl").exists():
         yield from _clients(directory)
 
@@ -89,15 +89,15 @@ def _ending(each: certs.Ending, is_ours: bool) -> Finding:
         advice = "make a new CA in an empty folder, and give its ca.crt to all clients"
     else:
         advice = "get a new one from its CA"
-    level = "problem" if each.days < 0 and each.what != "crl" else "warning"
-    return Finding("problem" if level == "problem" else "warning", subject, text, advice)
+    level: Level = "error" if each.days < 0 and each.what != "crl" else "warning"
+    return Finding(level, subject, text, advice)
 
 
 def _clients(directory: Path) -> Iterator[Finding]:
     try:
         listed = certs.listed(directory)
     except certs.CertificateError as error:
-        yield Finding("problem", "clients' certificates", str(error))
+        yield Finding("error", "clients' certificates", str(error))
         return
     clients = [each for each in listed if each.purpose == "client" and each.usable]
     for each in clients:

@@ -148,7 +148,7 @@ async def test_the_doctor_sees_who_is_there(start, peer):
     assert [finding.text.partition(",")[0] for finding in found] == ["seen: 1 (/peer)"]
     running["ros"]["node"] = "/elsewhere"
     found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
-    assert [finding.level for finding in found] == ["problem"]
+    assert [finding.level for finding in found] == ["error"]
     assert "/elsewhere, is not seen" in found[0].text
 
 
