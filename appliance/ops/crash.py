@@ -28,8 +28,8 @@ import yaml
 
 from appliance.broker.faults import Faults
 from appliance.config import Settings, describe, secrets_in
+from appliance.config.redaction import redacted
 from appliance.ops import logs
-from appliance.plugins.guard import redacted
 
 log = logging.getLogger(__name__)
 

@@ -17,9 +17,10 @@ from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Access, Action, Decision, Identity, Question
+from appliance.config.redaction import redacted
 from appliance.net.callbacks import Entries
 from appliance.plugins.adapters import Sessions, Unclaimed
-from appliance.plugins.guard import Guard, name, redacted
+from appliance.plugins.guard import Guard, name
 from appliance.plugins.logins import Answers
 from appliance.plugins.threads import Threads, blocks
 

@@ -29,6 +29,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Access, Identity, InsideLink, Refusal
 from appliance.broker.session import Session
+from appliance.config.redaction import redacted
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -37,7 +38,7 @@ from appliance.net.callbacks import Entries, Repeated, shield
 from appliance.plugins.access import PluginAccess
 from appliance.plugins.adapters import RetainedMessages, Sessions, Unclaimed, login_of
 from appliance.plugins.events import PluginEvents
-from appliance.plugins.guard import PLUGIN_TIMEOUT, Guard, name, redacted
+from appliance.plugins.guard import PLUGIN_TIMEOUT, Guard, name
 from appliance.plugins.logins import Answers, Guesses, PluginLogins
 from appliance.plugins.threads import Threads
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
-import re
 import traceback
 from collections.abc import Coroutine, Iterable
 from typing import Any, TypeVar
+
+from appliance.config.redaction import redacted
 
 log = logging.getLogger(__name__)
 
@@ -18,9 +18,6 @@ PLUGIN_TIMEOUT = 8.0
 
 #: Failures that are told apart, so that each is told once.
 _FAILURES = 1000
-
-#: Characters: what is shorter is in every text.
-_SHORT_SECRET = 4
 
 _T = TypeVar("_T")
 
@@ -65,28 +62,6 @@ class Guard:
             self._told.add(failure)
             told = "".join(traceback.format_exception(error)).rstrip()
             log.error("%s failed; this is told once\n%s", what, redacted(told, hidden))
-
-
-def redacted(text: str, secrets: Iterable[str]) -> str:
-    """The text without the secrets, also as they stand in an address, in JSON or in a `repr`.
-
-    With one that is too short to be told from other text nothing is left.
-    """
-    for secret in sorted(filter(None, set(secrets)), key=len, reverse=True):
-        form = re.compile("".join(map(_form, secret)), re.IGNORECASE)
-        if len(secret) < _SHORT_SECRET and form.search(text):
-            return "(not shown: it may hold a secret)"
-        text = form.sub("********", text)
-    return text
-
-
-def _form(char: str) -> str:
-    """What a character may have become on its way into a message; each in its own way."""
-    encoded = "".join(f"%{byte:02x}" for byte in char.encode("utf-8", "surrogatepass"))
-    forms = {char, encoded, json.dumps(char)[1:-1], repr(char)[1:-1], ascii(char)[1:-1]}
-    if char == " ":
-        forms.add("+")
-    return f"(?:{'|'.join(map(re.escape, sorted(forms, key=len, reverse=True)))})"
 
 
 def name(plugin: object) -> str:

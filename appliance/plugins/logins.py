@@ -17,8 +17,9 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.ports import Identity, Refusal
+from appliance.config.redaction import redacted
 from appliance.mqtt.reason import ReasonCode
-from appliance.plugins.guard import Guard, name, redacted
+from appliance.plugins.guard import Guard, name
 from appliance.plugins.threads import Threads
 
 #: Logins that plugins are asked about at one time; others wait, as long as they may.

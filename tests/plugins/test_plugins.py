@@ -22,7 +22,6 @@ from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
 from appliance.plugins import Answers, PluginSettingsError
 from appliance.plugins import logins as logins_module
-from appliance.plugins.guard import redacted
 
 pytest.importorskip("sqlalchemy", reason="amqtt.contrib needs SQLAlchemy: pip install sqlalchemy")
 
@@ -287,12 +286,7 @@ async def test_a_password_is_in_no_error(
         assert "word%3F" not in text and "ss/word" not in text and "ss%2Fword" not in text
 
 
-def test_secrets_are_taken_out_in_every_form() -> None:
-    text = "url=http://h/?p=p%C3%A4ss+w%2Frd, 'p\\xe4ss', \"päss w/rd\""
-    assert redacted(text, ["päss w/rd"]).count("*" * 8) == 2
-    for written in ("p%C3%A4ss w/rd", "p%c3%a4ss+w%2Frd", "p\\u00e4ss%20w/rd", "p\\xe4ss w/rd"):
-        assert redacted(f"a {written} b", ["päss w/rd"]) == "a ******** b"
-    assert "abc" not in redacted("it said: abc", ["abc"])
+def test_secrets_of_plugin_settings_are_found() -> None:
     plugins = {"x.Y": {"secret_key": SECRET, "connection": f"sqlite://me:{SECRET}@h", "port": 1}}
     assert set(secrets_in(plugins)) == {SECRET}
 
