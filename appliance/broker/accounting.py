@@ -14,8 +14,8 @@ from appliance.broker.ports import Limits, Store
 if TYPE_CHECKING:
     from appliance.broker.session import Session
 
-#: What one client may cause in a turn of the loop, see `Counters.effort`: some milliseconds.
-EFFORT_A_TURN = 1000
+#: What one client may cause in a turn of the loop, see `Counters.cost`: some milliseconds.
+COST_PER_TURN = 1000
 
 
 @dataclass(slots=True)
@@ -38,7 +38,7 @@ class Counters:
     sockets: int = 0
     #: Work done, in units of some four microseconds, as one message takes; what takes long counts
     #: itself here, so that one client's turn can be ended without a look at the clock.
-    effort: int = 0
+    cost: int = 0
     sessions_expired: int = 0
     #: Connections and sessions that were ended as somebody needed the place, see
     #: `Broker._make_room`.

@@ -53,26 +53,26 @@ log = logging.getLogger(__name__)
 #: Seconds that a QoS 2 exchange may take before its message counts as late.
 LATE = 0.1
 
-#: Readers that are asked whether they are full for the effort to give a message to one of them.
+#: Readers that are asked whether they are full for the cost to give a message to one of them.
 LOOKS_FOR_ONE = 4
 
-#: Connections, wills and sessions that one tick ends, and the effort after which it ends no more:
+#: Connections, wills and sessions that one tick ends, and the cost after which it ends no more:
 #: some ten milliseconds of work.
 ENDINGS_A_TURN = 128
-EFFORT_A_TICK = 2600
+COST_PER_TICK = 2600
 
 
-#: The effort to refuse a message, to keep one of QoS 2 until its PUBREL and to take it out again,
+#: The cost to refuse a message, to keep one of QoS 2 until its PUBREL and to take it out again,
 #: and to give a client that has logged in its session.
-REFUSAL_EFFORT = 2
-HELD_EFFORT = 3
-CONNECT_EFFORT = 50
+REFUSAL_COST = 2
+HELD_COST = 3
+CONNECT_COST = 50
 
-#: The effort to end a connection or a session, and to take one of its subscriptions from the tree,
-#: of so many levels for one effort.
-ENDING_EFFORT = 10
-LEAVING_EFFORT = 3
-LEVELS_AN_EFFORT = 4
+#: The cost to end a connection or a session, and to take one of its subscriptions from the tree,
+#: of so many levels for one unit of cost.
+ENDING_COST = 10
+LEAVING_COST = 3
+LEVELS_PER_COST_UNIT = 4
 
 
 class Ticking(Protocol):
@@ -199,7 +199,7 @@ class Broker:
                 touched; 0x97, its user has as many connections or sessions as it may have, or its
                 will has no room.
         """
-        self.counters.effort += CONNECT_EFFORT
+        self.counters.cost += CONNECT_COST
         account = self.accounting.accounts.of(identity)
         if will is not None and not self.accounting.fits(account, will.message.size):
             reason = f"no room for its will: {self.accounting.memory_shortage(will.message.size)}"
@@ -391,7 +391,7 @@ class Broker:
         """
         if session.link is not link:
             return
-        self.counters.effort += ENDING_EFFORT
+        self.counters.cost += ENDING_COST
         faults = self.faults
         session.link = None
         session.is_told_full = False
@@ -447,11 +447,11 @@ class Broker:
         session.ends_at = None
         # Each for itself: what is left of a session that has ended would be there for good.
         faults = self.faults
-        effort = ENDING_EFFORT
+        cost = ENDING_COST
         for topic_filter in session.subscriptions:
             self._leave(session, topic_filter)
-            effort += LEAVING_EFFORT + topic_filter.count("/") // LEVELS_AN_EFFORT
-        self.counters.effort += effort
+            cost += LEAVING_COST + topic_filter.count("/") // LEVELS_PER_COST_UNIT
+        self.counters.cost += cost
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
         for _ in range(2):  # as `_leave`: nobody gives back later what it holds
             if faults.run("end.clear", _done, session.clear, otherwise=False):
@@ -491,13 +491,13 @@ class Broker:
             members = known.get(share)
             if members is None:
                 members = share.targets()
-                self.counters.effort += len(members) // LOOKS_FOR_ONE
+                self.counters.cost += len(members) // LOOKS_FOR_ONE
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
                 known[share] = members
             # Who may receive it is asked of those alone that it may go to: there may be thousands.
             target = share.choose(members, message, self.router.may_receive)
-            self.counters.effort += 1 + share.looked // LOOKS_FOR_ONE
+            self.counters.cost += 1 + share.looked // LOOKS_FOR_ONE
             return target is not None and self._deliver_shared(target, message, share)
 
         return give
@@ -599,7 +599,7 @@ class Broker:
         # Without room to keep it who is there still gets it.
         kept = not retain or self.retained.keep(message, origin.account)
         published_qos = message.qos
-        self.counters.effort += 1 + len(targets)
+        self.counters.cost += 1 + len(targets)
         taken = full = False
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
@@ -618,7 +618,7 @@ class Broker:
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
-            self.counters.effort += 1 + share.looked // LOOKS_FOR_ONE
+            self.counters.cost += 1 + share.looked // LOOKS_FOR_ONE
             if chosen is not None and self._deliver_shared(chosen, message, share):
                 taken = True
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
@@ -727,7 +727,7 @@ class Broker:
     def _count_looks(self, route: Fanout) -> None:
         """All receivers of a route are asked, each on its own."""
         looks = len(route.targets) + sum(len(members) for _, members in route.shares)
-        self.counters.effort += looks // LOOKS_FOR_ONE
+        self.counters.cost += looks // LOOKS_FOR_ONE
 
     def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""
@@ -744,7 +744,7 @@ class Broker:
 
         `age` is in seconds from its coming.
         """
-        self.counters.effort += HELD_EFFORT
+        self.counters.cost += HELD_COST
         message, full, _ = held
         if age > LATE:
             message = Late(message, age + message.age)
@@ -781,7 +781,7 @@ class Broker:
     def refuse_publish(self, session: Session, route: Fanout, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""
         self.counters.publish_refused += 1
-        self.counters.effort += REFUSAL_EFFORT
+        self.counters.cost += REFUSAL_COST
         for guard in self.guards.get(route.topic, ()):
             guard.refused(session)
         if self.observer is not None:
@@ -949,7 +949,7 @@ class Broker:
         faults = self.faults
         self.accounting.now = faults.now = now
         faults.run("clock.rate_limited_log", self.rate_limited_log.tick, now, otherwise=None)
-        end = self.counters.effort + EFFORT_A_TICK
+        end = self.counters.cost + COST_PER_TICK
         expires_more = faults.run("clock.retained", self.retained.expire, now, otherwise=False)
         filled, self.accounting.filled = self.accounting.filled, []
         for session, shortage in filled:
@@ -961,12 +961,12 @@ class Broker:
             except Exception as error:
                 self.fault("clock.keep_alive", error, client)
                 left -= 1
-            if left <= 0 or self.counters.effort > end:
+            if left <= 0 or self.counters.cost > end:
                 self.flush()
                 self.ticked_at = now
                 return now
         while self._deadlines and self._deadlines[0][0] <= now:
-            if left <= 0 or self.counters.effort > end:
+            if left <= 0 or self.counters.cost > end:
                 break
             left -= 1
             _, _, session = heapq.heappop(self._deadlines)

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.backpressure import (
     LEAST_COUNTED,
     MESSAGE_PATIENCE,
@@ -20,7 +20,7 @@ from appliance.broker.backpressure import (
     Allowance,
     Congestion,
 )
-from appliance.broker.broker import HELD_EFFORT, LATE, Broker
+from appliance.broker.broker import HELD_COST, LATE, Broker
 from appliance.broker.handshake import (
     Agreement,
     agree,
@@ -68,14 +68,14 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 log = logging.getLogger(__name__)
 
-#: The effort of a packet that is not of the data path.
-PACKET_EFFORT = 5
+#: The cost of a packet that is not of the data path.
+PACKET_COST = 5
 
 #: Bytes of an unfinished packet, such as a CONNECT before its login, that there is always room for.
 SMALL_PACKET = 1024
 
 #: And of the end of a connection that broke the protocol.
-FAILURE_EFFORT = 50
+FAILURE_COST = 50
 
 #: Seconds that a publisher waits at once for what others may receive, and the part of its time that
 #: it does in the long run: less than makes a command old, so that nobody who subscribes stops it.
@@ -183,16 +183,16 @@ class Client:
         counters.bytes_received += len(data)
         now = self._accounting.now
         connection = self.connection
-        effort = counters.effort + EFFORT_A_TURN
+        cost = counters.cost + COST_PER_TURN
         inflow = self.inflow
         if inflow.is_watched:
             inflow.came(data, now)
         try:
             events: Iterable[Event]
             if inflow.unfinished and now - inflow.unfinished > LATE:
-                events = self._completing(data, effort)
+                events = self._completing(data, cost)
             elif self._behind:
-                events = self._passing(data, effort)
+                events = self._passing(data, cost)
             else:
                 events = connection.receive_data(data)
             for event in events:
@@ -200,21 +200,21 @@ class Client:
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
-                    counters.effort += 1
+                    counters.cost += 1
                     if event < PUBREC and self.session is not None:  # PUBACK: most of them
                         counters.control_received += 1
                         self.session.puback(event & 0xFFFF)
                     else:
                         self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
-                    counters.effort += PACKET_EFFORT + connection.effort
+                    counters.cost += PACKET_COST + connection.cost
                     self._on_packet(event)  # type: ignore[arg-type]
-                if counters.effort > effort and not connection.paused:
+                if counters.cost > cost and not connection.paused:
                     # What is left of the chunk waits until the others have had their turn.
                     connection.pause()
                     self.later()
         except ProtocolError as error:
-            counters.effort += FAILURE_EFFORT + connection.effort
+            counters.cost += FAILURE_COST + connection.cost
             self.fail(error)
         if self._behind and connection.paused and not self._later and self._work is None:
             if self._has_place_behind():
@@ -246,11 +246,11 @@ class Client:
         elif not inflow.unfinished or has_completed:
             inflow.unfinished = came_at
 
-    def _completing(self, data: bytes, effort: int) -> Iterator[Event]:
+    def _completing(self, data: bytes, cost: int) -> Iterator[Event]:
         """What comes in; what has come in parts, slowly, is as old as the first of them."""
         came_at, self._came_at = self._came_at, self.inflow.unfinished
         connection = self.connection
-        for event in self._passing(data, effort) if self._behind else connection.receive_data(data):
+        for event in self._passing(data, cost) if self._behind else connection.receive_data(data):
             yield event
             self._came_at = came_at
         self._came_at = came_at
@@ -299,7 +299,7 @@ class Client:
                 return
         targets = route.targets
         if first == 0x30 and route.allowed and self.broker.observer is None:
-            counters.effort += 1 + len(targets)
+            counters.cost += 1 + len(targets)
             # A plain QoS 0 message to receivers of the same version leaves as it came: no message
             # object is made for it. Who cannot take it like this is left for the long way.
             targets = [
@@ -530,7 +530,7 @@ class Client:
         """What comes in while a message waits, and does not wait behind it.
 
         These are acknowledgements, for which others wait, and pings: all that the client may have
-        on its way is looked through for them. `limit` is the effort at which its turn ends.
+        on its way is looked through for them. `limit` is the cost at which its turn ends.
         """
         connection, counters = self.connection, self._counters
         if connection.paused and self._has_place_behind():
@@ -542,10 +542,10 @@ class Client:
             self._heard_at = self._accounting.now
             self._behind.append((event, self._came_at or self._accounting.now))
             self._behind_size += _size(event)
-            counters.effort += 1 if isinstance(event, tuple) else PACKET_EFFORT + connection.effort
+            counters.cost += 1 if isinstance(event, tuple) else PACKET_COST + connection.cost
             if not self._has_place_behind():
                 connection.pause()
-            elif counters.effort > limit:
+            elif counters.cost > limit:
                 connection.pause()
                 self.later()
 
@@ -554,7 +554,7 @@ class Client:
         behind = self._behind
         if not behind:
             return
-        limit = self._counters.effort + EFFORT_A_TURN
+        limit = self._counters.cost + COST_PER_TURN
         if self._awaited:
             dawdled = sum(congestion.dawdled() for congestion in self._awaited)
             waited = self._accounting.now - self._waits_since
@@ -564,7 +564,7 @@ class Client:
             self._waits_since, self._dawdled = self._accounting.now, dawdled
         try:
             while behind and self._work is None:
-                if self._counters.effort > limit:
+                if self._counters.cost > limit:
                     self.later()
                     break
                 left = len(behind) - 1
@@ -573,7 +573,7 @@ class Client:
                 if isinstance(arrived, tuple):
                     self._on_raw_publish(arrived)
                 else:
-                    self._counters.effort += PACKET_EFFORT
+                    self._counters.cost += PACKET_COST
                     self._on_packet(arrived)
                 if len(behind) > left:
                     break  # it waits again
@@ -616,7 +616,7 @@ class Client:
         self, session: Session, packet_id: int, message: Message, route: Fanout
     ) -> None:
         """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
-        self._counters.effort += HELD_EFFORT
+        self._counters.cost += HELD_COST
         code, reason = ReasonCode.SUCCESS, ""
         held = session.received.get(packet_id)
         if (

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from appliance.broker.accounting import EFFORT_A_TURN, Accounting
+from appliance.broker.accounting import COST_PER_TURN, Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.message import Message
 from appliance.broker.rate_limited_log import RateLimitedLog
@@ -15,9 +15,9 @@ from appliance.broker.session import LEVEL_SIZE
 from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
 
-#: The effort to retain a message, or no longer; and levels of its topic for one effort on top.
-RETAIN_EFFORT = 3
-LEVELS_AN_EFFORT = 2
+#: The cost to retain a message, or no longer; and levels of its topic for one unit of cost on top.
+RETAIN_COST = 3
+LEVELS_PER_COST_UNIT = 2
 
 
 #: What is kept of a retained message beside it, in bytes: whose it is, and when it expires.
@@ -92,8 +92,8 @@ class Retained:
         """Retain the message, or with an empty one none any more; False when there is no room."""
         if self._accounting.refusing and message.qos:
             return False
-        self._accounting.counters.effort += (
-            RETAIN_EFFORT + message.topic.count("/") // LEVELS_AN_EFFORT
+        self._accounting.counters.cost += (
+            RETAIN_COST + message.topic.count("/") // LEVELS_PER_COST_UNIT
         )
         old = self._messages.get(message.topic)
         if not message.payload:  # [MQTT-3.3.1-6], 3.1.1 [MQTT-3.3.1-10]
@@ -195,11 +195,11 @@ class Retained:
     def expire(self, now: float) -> bool:
         """Delete those whose time is over, as many as one turn is for; True when there are more."""
         counters = self._accounting.counters
-        end = counters.effort + EFFORT_A_TURN
+        end = counters.cost + COST_PER_TURN
         while self._expiring and self._expiring[0][0] <= now:
-            if counters.effort > end:
+            if counters.cost > end:
                 return True
-            counters.effort += 1
+            counters.cost += 1
             _, number = heapq.heappop(self._expiring)
             topic = self._topics.get(number)
             if topic is not None:

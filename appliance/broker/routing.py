@@ -30,10 +30,10 @@ CACHED_IN_ALL = 1 / 8
 #: Questions about one route that a message waits for at a time.
 UNDECIDED = 16
 
-#: The effort to find a route, see `Counters.effort`; each match comes on top, and what the search
-#: passed: so many levels and nodes are one effort.
-ROUTE_EFFORT = 20
-PASSED_AN_EFFORT = 4
+#: The cost to find a route, see `Counters.cost`; each match comes on top, and what the search
+#: passed: so many levels and nodes are one unit of cost.
+ROUTE_COST = 20
+PASSED_PER_COST_UNIT = 4
 
 _ALLOWED = Decision(True, "the appliance itself")
 _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
@@ -171,7 +171,7 @@ class Router:
                 for guard in self.guards[topic]
             ]
             decision = next((verdict for verdict in verdicts if not verdict), decision)
-        self._counters.effort += ROUTE_EFFORT
+        self._counters.cost += ROUTE_COST
         matches = self._match(topic) if decision else []
         targets, shares = self._targets(session, topic, matches)
         return Fanout(
@@ -180,7 +180,7 @@ class Router:
 
     def _match(self, topic: str) -> list[tuple[Session, Subscription] | Share]:
         found = self._subscriptions.match(topic)
-        self._counters.effort += len(found) + self._subscriptions.passed // PASSED_AN_EFFORT
+        self._counters.cost += len(found) + self._subscriptions.passed // PASSED_PER_COST_UNIT
         return found
 
     def _may_publish(self, session: Session, topic: str) -> Decision:
@@ -248,9 +248,9 @@ class Router:
         """The members of the group that may receive the topic.
 
         All are asked about, so that no message misses a group of which anybody may have it: what
-        that takes is effort, for which who published waits.
+        that takes is cost, for which who published waits.
         """
-        self._counters.effort += len(share.members)
+        self._counters.cost += len(share.members)
         return [
             as_target(session, subscription)
             for session, subscription in share.members.items()
@@ -269,7 +269,7 @@ class Router:
             session.readable_epoch = self.access.epoch
         allowed = readable.get(topic)
         if allowed is None:
-            self._counters.effort += 1
+            self._counters.cost += 1
             decision = self.decide(session.identity, Action.RECEIVE, topic)
             allowed = decision.allowed
             if len(topic) <= CACHED_TOPIC and not decision.pending:

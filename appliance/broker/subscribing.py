@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, TypeAlias
 
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import Broker
 from appliance.broker.output import in_words
 from appliance.broker.ports import Action, Question
@@ -22,12 +22,12 @@ from appliance.mqtt.topics import check_filter, parse_shared
 #: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE.
 MAXIMUM_LEVELS = 20_000
 
-#: The effort of a subscription, in and out; its levels come on top.
-SUBSCRIBE_EFFORT = 20
+#: The cost of a subscription, in and out; its levels come on top.
+SUBSCRIBE_COST = 20
 
-#: The effort to check a filter, and to look for its retained messages.
-CHECK_EFFORT = 3
-RETAINED_EFFORT = 3
+#: The cost to check a filter, and to look for its retained messages.
+CHECK_COST = 3
+RETAINED_COST = 3
 
 
 #: Filters about which somebody is asked at a time.
@@ -101,16 +101,16 @@ def subscribe(
             granted.append((subscription, is_new))
         elif explains and words is None:  # one string for all of them: the first is told
             words = in_words(f"{quote(subscription.filter)}: {reason}")
-        if turn.is_over(SUBSCRIBE_EFFORT + subscription.filter.count("/")):
+        if turn.is_over(SUBSCRIBE_COST + subscription.filter.count("/")):
             yield None
     yield Suback(packet.packet_id, codes, words)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
     for subscription, is_new in granted:
-        effort = RETAINED_EFFORT
+        cost = RETAINED_COST
         if subscription.filter in session.replays:  # the packet has it twice: so it is sent twice
-            effort += len(session.replays) // 10
+            cost += len(session.replays) // 10
             session.pump()
         broker.replay_retained(session, subscription, is_new)
-        if turn.is_over(effort):
+        if turn.is_over(cost):
             yield None
     session.pump()
 
@@ -141,25 +141,25 @@ def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterat
     codes: list[int] = []
     for name in packet.filters:
         codes.append(broker.unsubscribe(session, name))
-        if turn.is_over(SUBSCRIBE_EFFORT + name.count("/")):
+        if turn.is_over(SUBSCRIBE_COST + name.count("/")):
             yield None
     yield Unsuback(packet.packet_id, codes)  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
 
 
 class _Turn:
-    """Counts the effort, and says when it was as much as one turn is for."""
+    """Counts the cost, and says when it was as much as one turn is for."""
 
     def __init__(self, broker: Broker) -> None:
         self._counters = broker.counters
-        self._left = EFFORT_A_TURN
+        self._left = COST_PER_TURN
 
-    def is_over(self, effort: int) -> bool:
+    def is_over(self, cost: int) -> bool:
         """Count so much more; the next turn begins when this one is over."""
-        self._counters.effort += effort
-        self._left -= effort
+        self._counters.cost += cost
+        self._left -= cost
         if self._left > 0:
             return False
-        self._left = EFFORT_A_TURN
+        self._left = COST_PER_TURN
         return True
 
 
@@ -171,7 +171,7 @@ def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None
         )
     for name in filters:
         _check_filter(broker, name)
-        if turn.is_over(CHECK_EFFORT):
+        if turn.is_over(CHECK_COST):
             yield
 
 

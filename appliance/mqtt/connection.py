@@ -133,8 +133,8 @@ class Connection:
         self.maximum_packet_size = maximum_packet_size
         self.topic_alias_maximum = topic_alias_maximum
         self.user_properties = user_properties
-        #: What it took to check the properties of the last `Packet`, see `Counters.effort`.
-        self.effort = 0
+        #: What it took to check the properties of the last `Packet`, see `Counters.cost`.
+        self.cost = 0
         self.state = State.NEW
         self.version = 0
         #: Whether it is one of MQTT 3.1, where DUP and QoS may stand in any packet's first byte.
@@ -389,9 +389,9 @@ class Connection:
         if self._is_v31:
             first = first & 0xF0 | _FLAGS_OF_V311.get(first >> 4, 0)
         most = self.user_properties if self.state is State.CONNECTED else STRANGERS_PAIRS
-        self.effort = _effort(most, len(body))  # and so it stays for one that is refused
+        self.cost = _cost(most, len(body))  # and so it stays for one that is refused
         packet = decode_packet(first, body, self.version, most)
-        self.effort = _effort(most, _properties_size(first >> 4, body, self.version))
+        self.cost = _cost(most, _properties_size(first >> 4, body, self.version))
         if isinstance(packet, Connect):
             self._is_v31 = packet.version == V31
             self.version = V311 if self._is_v31 else packet.version
@@ -403,10 +403,10 @@ class Connection:
     def _publish(self, first: int, body: bytes) -> Publish:
         """The full decoder for a PUBLISH, with its alias resolved and its topic checked."""
         most = self.user_properties
-        self.effort = _effort(most, len(body))
+        self.cost = _cost(most, len(body))
         packet = decode_packet(first, body, self.version, most)
         assert isinstance(packet, Publish)
-        self.effort = _effort(most, len(packet.passed_on))
+        self.cost = _cost(most, len(packet.passed_on))
         properties = packet.properties
         if properties and Property.SUBSCRIPTION_IDENTIFIER in properties:  # [MQTT-3.3.4-6]
             raise ProtocolError(
@@ -437,8 +437,8 @@ class Connection:
         return packet
 
 
-def _effort(most: int, size: int) -> int:
-    """The effort to check properties of so many bytes, with no more User Properties than that."""
+def _cost(most: int, size: int) -> int:
+    """The cost to check properties of so many bytes, with no more User Properties than that."""
     return min(most, size // SHORTEST_PAIR) // 2 + (size >> 9)
 
 

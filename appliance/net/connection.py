@@ -348,7 +348,7 @@ class ClientConnection:
         try:
             counters = self._counters
             if (
-                len(data) > self._little or counters.effort > self._network.checkpoint
+                len(data) > self._little or counters.cost > self._network.checkpoint
             ) and not self._in_turn:
                 data = self._receive_in_turn(data)
                 if not data:
@@ -377,9 +377,9 @@ class ClientConnection:
             if not network.is_round_over():
                 return data
             if network.may_go_beyond(account):
-                begun = self._counters.effort
+                begun = self._counters.cost
                 self._take_portion(data)
-                network.went_beyond(account, self._counters.effort - begun)
+                network.went_beyond(account, self._counters.cost - begun)
             else:
                 self._hold(data, 0)
                 self._read_later()

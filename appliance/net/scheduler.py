@@ -26,13 +26,13 @@ FEW_MESSAGES = 64
 #: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
 LARGEST_PORTION = 256 * 1024
 
-#: What all clients may cause in one round of the event loop, see `Counters.effort`: some six
+#: What all clients may cause in one round of the event loop, see `Counters.cost`: some six
 #: milliseconds. And what each user may cause beyond that with little chunks: who sends little does
 #: not wait for who sends much, or are many.
-EFFORT_A_ROUND = 1500
-EFFORT_BEYOND = 100
+COST_PER_ROUND = 1500
+COST_BEYOND_ROUND = 100
 
-#: Effort after which it is looked where the round began.
+#: Cost after which the start of the round is taken anew.
 UNLOOKED = 300
 
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
@@ -126,7 +126,7 @@ class Scheduler:
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
         self._turns: deque[Turn] = deque()
-        #: `Counters.effort` from which on it is to be asked whether the round is over.
+        #: `Counters.cost` from which on it is to be asked whether the round is over.
         self.checkpoint = 0
         self._next_turns: asyncio.Handle | None = None
         self._counting = False
@@ -159,40 +159,40 @@ class Scheduler:
     def is_round_over(self) -> bool:
         """Whether as much was done in this round of the event loop as one round is for.
 
-        To be asked when `Counters.effort` is beyond the `checkpoint`, by who sends little.
+        To be asked when `Counters.cost` is beyond the `checkpoint`, by who sends little.
         """
-        effort = self.broker.counters.effort
+        cost = self.broker.counters.cost
         if not self._counting:
             self._counting = True
-            self.checkpoint = effort + EFFORT_A_ROUND
+            self.checkpoint = cost + COST_PER_ROUND
             self.entries.soon("network.round", self._new_round, failed=self._new_round)
-        return effort > self.checkpoint
+        return cost > self.checkpoint
 
     def _new_round(self) -> None:
         self._counting = False
-        self.checkpoint = self.broker.counters.effort + UNLOOKED
+        self.checkpoint = self.broker.counters.cost + UNLOOKED
         self._beyond.clear()
 
     def may_go_beyond(self, account: Account) -> bool:
         """Whether its clients have sent little since the round is over."""
-        return self._beyond.get(account, 0) < EFFORT_BEYOND
+        return self._beyond.get(account, 0) < COST_BEYOND_ROUND
 
-    def went_beyond(self, account: Account, effort: int) -> None:
+    def went_beyond(self, account: Account, cost: int) -> None:
         """So much was done for one of them nevertheless."""
-        self._beyond[account] = self._beyond.get(account, 0) + effort
+        self._beyond[account] = self._beyond.get(account, 0) + cost
 
-    def count(self, effort: int, charged: Charged) -> None:
-        """So much was done for it, see `Counters.effort`."""
+    def count(self, cost: int, charged: Charged) -> None:
+        """So much was done for it, see `Counters.cost`."""
         counters = self.broker.counters
-        counters.effort += effort
-        if self._counting and counters.effort > self.checkpoint:
-            self.went_beyond(charged.account, effort)
+        counters.cost += cost
+        if self._counting and counters.cost > self.checkpoint:
+            self.went_beyond(charged.account, cost)
 
     def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
         """Whether a chunk is to be taken apart in a turn, see `Turns`."""
         if not is_little:
             return self.is_busy()
-        if self.broker.counters.effort <= self.checkpoint or not self.is_round_over():
+        if self.broker.counters.cost <= self.checkpoint or not self.is_round_over():
             return False
         return not self.may_go_beyond(charged.account)
 
@@ -211,7 +211,7 @@ class Scheduler:
         )
 
     def _run_turns(self) -> None:
-        end = self.broker.counters.effort + EFFORT_A_ROUND
+        end = self.broker.counters.cost + COST_PER_ROUND
         left = len(self._turns)
         try:
             while left:
@@ -224,7 +224,7 @@ class Scheduler:
                 finally:
                     # After its turn, so that no entry meanwhile is the first, to be scheduled.
                     self._turns.popleft()
-                if self.broker.counters.effort > end:
+                if self.broker.counters.cost > end:
                     break
         finally:
             if self._turns:

@@ -29,9 +29,9 @@ RECORD_SIZE: Final = 16 * 1024
 PIECE = 2 * RECORD_SIZE
 
 #: Records that are read of one connection, then it is the turn of others: a chunk from the network
-#: may hold ten thousand, of a byte each. And the effort of one, where they are many.
+#: may hold ten thousand, of a byte each. And the cost of one, where they are many.
 RECORDS_A_TURN = 256
-RECORD_EFFORT = 1
+RECORD_COST = 1
 
 #: Bytes of a chunk that are little: it may be read although others have to be served.
 LITTLE = 4096
@@ -195,7 +195,7 @@ class TlsTransport:
         if self._rest or self._set_apart:
             self._count_rest()
         if len(parts) > 1:
-            self._turns.count(RECORD_EFFORT * len(parts), cast(Charged, self._protocol))
+            self._turns.count(RECORD_COST * len(parts), cast(Charged, self._protocol))
         if parts:
             self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
         if self._cut or self._has_told_cut:  # each time: what was told is over with what came

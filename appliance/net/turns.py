@@ -43,8 +43,8 @@ class Turns(Protocol):
 
     entries: Entries
 
-    def count(self, effort: int, charged: Charged) -> None:
-        """So much was done for it, see `Counters.effort`."""
+    def count(self, cost: int, charged: Charged) -> None:
+        """So much was done for it, see `Counters.cost`."""
 
     def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
         """Whether a chunk is to be taken apart in a turn, as so much else was done in this round.

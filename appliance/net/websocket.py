@@ -31,13 +31,13 @@ _OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
 #: Bytes that these may hold in all: the library takes a microsecond for each, and more.
 OWN_HEADERS_LIMIT = 1024
 
-#: The effort of a request for a WebSocket, see `Counters.effort`: it may have a hundred headers.
-HEAD_EFFORT = 100
+#: The cost of a request for a WebSocket, see `Counters.cost`: it may have a hundred headers.
+HEAD_COST = 100
 
 #: Bytes of frames that are little, and that are taken apart in one go: at worst, as frames may be
-#: empty, two milliseconds' work. And the effort of a frame, where they are many.
+#: empty, two milliseconds' work. And the cost of a frame, where they are many.
 PORTION = 2048
-FRAME_EFFORT = 3
+FRAME_COST = 3
 
 #: Frames of one connection in its turn.
 FRAMES_A_TURN = 256
@@ -213,7 +213,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if not head[:1].isupper():
             self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
         elif end > 3:
-            self._turns.count(HEAD_EFFORT, self._protocol)
+            self._turns.count(HEAD_COST, self._protocol)
             # The library would read frames before the answer to the request, so it gets the two
             # one after the other.
             self._frames.receive_data(bytes(head[:end]))
@@ -276,7 +276,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         events = frames.events_received()
         self._frames_left -= len(events)
         if len(events) > 1:
-            self._turns.count(FRAME_EFFORT * len(events), self._protocol)
+            self._turns.count(FRAME_COST * len(events), self._protocol)
         for frame in events:
             assert not isinstance(frame, Request | Response)
             if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]

@@ -619,7 +619,7 @@ def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
 
 
 @pytest.mark.parametrize("topic_filter", ["b", "$share/group/b"])
-def test_to_look_for_readers_that_are_full_is_an_effort(
+def test_to_look_for_readers_that_are_full_costs(
     waiting: Peer, broker: Broker, join: Join, topic_filter: str
 ):
     """While one reader is congested they are looked through for each message of anybody."""
@@ -627,15 +627,15 @@ def test_to_look_for_readers_that_are_full_is_an_effort(
         join(f"reader {number}", version=4).subscribe(topic_filter, 1)
     other = join("other", version=4)
     (session,) = broker.accounting.congested
-    efforts = []
+    costs = []
     for congested in ({}, {session: None}):
         broker.accounting.congested.clear()
         broker.accounting.congested.update(congested)
-        for packet_id in (2 * len(efforts) + 1, 2 * len(efforts) + 2):  # the first finds the route
-            begun = broker.counters.effort
+        for packet_id in (2 * len(costs) + 1, 2 * len(costs) + 2):  # the first finds the route
+            begun = broker.counters.cost
             other.send(Publish("b", b"", 1, False, False, packet_id))
-        efforts.append(broker.counters.effort - begun)
-    assert efforts[1] - efforts[0] == 200 // LOOKS_FOR_ONE
+        costs.append(broker.counters.cost - begun)
+    assert costs[1] - costs[0] == 200 // LOOKS_FOR_ONE
 
 
 @pytest.fixture
@@ -743,16 +743,16 @@ def test_much_that_comes_behind_it_is_taken_in_turns(waiting: Peer, broker: Brok
     packets = [Publish("b", b"", 1, False, False, 10_001 + n) for n in range(5000)]
     waiting.send(*packets)
     for _ in range(10):
-        begun = broker.counters.effort
+        begun = broker.counters.cost
         assert waiting.wire.laters
         waiting.go_on()
-        assert broker.counters.effort - begun < 1100
+        assert broker.counters.cost - begun < 1100
         if not waiting.wire.laters:
             break
     assert len(waiting.client._behind) == 5001
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     waiting.client.hurry()
-    assert broker.counters.effort - begun < 1100 and waiting.client._behind
+    assert broker.counters.cost - begun < 1100 and waiting.client._behind
     while waiting.wire.laters:
         waiting.go_on()
     assert not waiting.client._behind

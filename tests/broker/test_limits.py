@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import ENDINGS_A_TURN, Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
@@ -199,15 +199,15 @@ def test_long_topics(join: Join, broker: Broker):
 
 
 def take_turns(broker: Broker, peer: Peer, most: int = 1000) -> list[int]:
-    """Give the peer its turns until it wants no more; returns the effort of each."""
-    efforts: list[int] = []
-    while peer.wire.laters and len(efforts) < most:
+    """Give the peer its turns until it wants no more; returns the cost of each."""
+    costs: list[int] = []
+    while peer.wire.laters and len(costs) < most:
         peer.wire.laters -= 1
-        begun = broker.counters.effort
+        begun = broker.counters.cost
         peer.client.send_on()
         broker.flush()
-        efforts.append(broker.counters.effort - begun)
-    return efforts
+        costs.append(broker.counters.cost - begun)
+    return costs
 
 
 def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
@@ -241,7 +241,7 @@ def test_what_one_client_sends_takes_turns(join: Join, broker: Broker):
     """A chunk of thousands of packets is not worked on in one go."""
     subscriber, peer = join("subscriber"), join("peer")
     subscriber.subscribe("a")
-    count = 3 * EFFORT_A_TURN
+    count = 3 * COST_PER_TURN
     peer.send(Publish("a", b"x").encode(5) * count)
     heard = len(subscriber.payloads())
     assert 0 < heard < count and peer.client.connection.paused
@@ -258,12 +258,12 @@ def test_a_search_that_passes_many_filters_ends_the_turn_though_none_matches(
     for levels in product("a+", repeat=11):
         name = "/".join([*levels, "end"])
         broker.router.join(stranger.session, Subscription(name, 0))
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     topics = ["/".join(["a"] * 11 + [f"new{number}"]) for number in range(3)]
     peer.send(*(Publish(topic, b"x") for topic in topics))
     assert peer.client.connection.paused and peer.wire.laters  # the others have their turn
     assert broker.counters.publish_received == 1
-    assert broker.counters.effort - begun > EFFORT_A_TURN
+    assert broker.counters.cost - begun > COST_PER_TURN
     assert len(take_turns(broker, peer)) >= 2
     assert broker.counters.publish_received == 3
     assert not peer.client.connection.paused
@@ -280,14 +280,14 @@ def test_a_packet_of_thousands_of_filters_takes_turns(
     filters = [f"f/{number}" for number in range(MAXIMUM_FILTERS)]
     wanted = [Subscription(name, 1) for name in filters]
     packets = Subscribe(1, wanted), Pingreq(), Subscribe(2, [Subscription("f/7", 0)])
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     peer.send(*packets)
-    efforts = [broker.counters.effort - begun, *take_turns(broker, peer, 30)]
+    costs = [broker.counters.cost - begun, *take_turns(broker, peer, 30)]
     assert peer.received() == [] and 0 < len(peer.session.subscriptions) < MAXIMUM_FILTERS - 1
     publisher.publish("f/0", b"meanwhile")
     assert peer.payloads() == [b"meanwhile"]
-    efforts += take_turns(broker, peer)
-    assert len(efforts) > 80 and max(efforts) < 1.5 * EFFORT_A_TURN
+    costs += take_turns(broker, peer)
+    assert len(costs) > 80 and max(costs) < 1.5 * COST_PER_TURN
     answer, *rest = peer.received()
     assert isinstance(answer, Suback) and answer.packet_id == 1
     assert answer.reason_codes == [0x87 if name == "f/7" else 1 for name in filters]
@@ -395,18 +395,18 @@ def test_a_stranger_has_fewer_user_properties(broker: Broker):
 
 
 @pytest.mark.parametrize("limits", [Limits(user_properties=200)])
-def test_the_effort_of_a_packet_is_that_of_its_parts(join: Join, broker: Broker):
+def test_the_cost_of_a_packet_is_that_of_its_parts(join: Join, broker: Broker):
     peer = join("peer")
     for packet in [
         Publish("a", b"", properties=user_properties(200)),
         Subscribe(1, [Subscription("a")], user_properties(200)),
     ]:
-        before = broker.counters.effort
+        before = broker.counters.cost
         peer.send(packet)
-        assert 100 <= broker.counters.effort - before < 200, packet
-    before = broker.counters.effort
+        assert 100 <= broker.counters.cost - before < 200, packet
+    before = broker.counters.cost
     peer.send(Publish("a", b"", properties=user_properties(201)))
-    assert broker.counters.effort - before >= 100, "what was done in vain"
+    assert broker.counters.cost - before >= 100, "what was done in vain"
 
 
 def test_packets_of_countless_parts_are_refused(join: Join):

@@ -10,7 +10,7 @@ from time import thread_time
 import pytest
 
 from appliance.access import Acl
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Action, Decision, Identity, Limits
 from appliance.broker.routing import CACHED_TOPIC
@@ -236,20 +236,20 @@ def test_a_message_finds_the_one_of_a_large_group_who_has_room(join: Join):
 def test_who_has_the_rules_asked_about_many_members_waits_for_the_others(
     join: Join, broker: Broker, access: FakeAccess
 ):
-    """Each is asked about once for a topic, and all of that is the publisher's effort."""
+    """Each is asked about once for a topic, and all of that is the publisher's cost."""
     count = 600
-    assert count < EFFORT_A_TURN < 2 * count
+    assert count < COST_PER_TURN < 2 * count
     _crowd(join, count)
     access.allow_only("nobody")
     publisher = join("publisher")
     asked = _count_questions(access)
-    effort = broker.counters.effort
+    cost = broker.counters.cost
     publisher.send(*(Publish(f"a/{topic}", b"", 0) for topic in "bcd"))
     for topic in "bcd":
         assert asked == {f"a/{topic}": count}, "one topic a turn"
-        assert broker.counters.effort - effort >= 2 * count
+        assert broker.counters.cost - cost >= 2 * count
         asked.clear()
-        effort = broker.counters.effort
+        cost = broker.counters.cost
         publisher.go_on()
     publisher.send(Publish("a/b", b"again", 0))
     assert not asked

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from house import Caller, House, check_network, make_contexts
 
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -22,12 +22,12 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.net.connection import LITTLE, ClientConnection
-from appliance.net.scheduler import EFFORT_A_ROUND, EFFORT_BEYOND, UNLOOKED
+from appliance.net.scheduler import COST_BEYOND_ROUND, COST_PER_ROUND, UNLOOKED
 
 CROWD = 40
 
 #: What one round may come to: the last chunk of each of the three parts may be a whole turn's.
-MOST = UNLOOKED + EFFORT_A_ROUND + EFFORT_BEYOND + 3 * EFFORT_A_TURN
+MOST = UNLOOKED + COST_PER_ROUND + COST_BEYOND_ROUND + 3 * COST_PER_TURN
 
 
 async def until(holds: Callable[[], bool], what: Callable[[], object]) -> None:
@@ -73,10 +73,10 @@ async def test_little_chunks_of_many_are_no_more_than_a_round(house: House):
     others = house.protocol("other")
     there = await crowd(house)
     await asyncio.sleep(0)
-    begun, received = counters.effort, counters.publish_received
+    begun, received = counters.cost, counters.publish_received
     for number, (_, protocol) in enumerate(there):
         protocol.data_received(new_topics(number))
-    assert counters.effort - begun <= MOST
+    assert counters.cost - begun <= MOST
     others.data_received(Pingreq().encode(5))  # of another user: no turn of theirs comes before it
     assert isinstance(await other.hear(), Pingresp)
     sent = CROWD * (LITTLE // 60)
@@ -92,7 +92,7 @@ async def test_chunks_that_cost_little_do_not_wait_for_a_turn(house: House):
     there = await crowd(house)
     await asyncio.sleep(0)
     house.network.is_round_over()
-    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    house.broker.counters.cost += 2 * COST_PER_ROUND
     served = 0
     for _, protocol in there[:8]:
         protocol.data_received(Pingreq().encode(5))
@@ -115,13 +115,13 @@ async def test_many_that_go_at_once_are_no_more_than_a_round(house: House):
         await reader.hear()
     there = await crowd(house, Will("/".join("abcdefghij"), b"gone"))
     await asyncio.sleep(0)
-    begun = counters.effort
+    begun = counters.cost
     for caller, protocol in there:
         assert protocol._transport is not None
         protocol._transport.pause_reading()
         protocol.connection_lost(None)
         caller.hang_up()
-    assert counters.effort - begun <= MOST
+    assert counters.cost - begun <= MOST
     assert len(house.broker.clients) > 31
     await until(
         lambda: len(house.broker.clients) == 31,
@@ -142,7 +142,7 @@ async def test_what_was_received_and_waits_is_counted_for_its_user(house: House,
     before = accounting.queued_bytes
     chunk = Publish("a", bytes(1000)).encode(5) * 100
     house.network.is_round_over()
-    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    house.broker.counters.cost += 2 * COST_PER_ROUND
     protocol.data_received(chunk)
     assert protocol._held and accounting.queued_bytes - before >= len(chunk)
     assert protocol.account.bytes >= len(chunk)
@@ -191,7 +191,7 @@ async def test_the_last_byte_of_a_large_packet_is_not_little(house: House):
     await asyncio.sleep(0)
     received = house.broker.counters.publish_received
     house.network.is_round_over()
-    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    house.broker.counters.cost += 2 * COST_PER_ROUND
     for client, last in ((protocol, large), (others, small)):
         client.data_received(last[-1:])
     assert protocol._turn_over and protocol._held, "it waits for its turn"
@@ -199,7 +199,7 @@ async def test_the_last_byte_of_a_large_packet_is_not_little(house: House):
     for who in (caller, other):
         assert isinstance(await who.hear(), Puback)
     house.network.is_round_over()
-    house.broker.counters.effort += 2 * EFFORT_A_ROUND
+    house.broker.counters.cost += 2 * COST_PER_ROUND
     protocol.data_received(Pingreq().encode(5))
     assert not protocol._held, "what comes then is little again"
     assert isinstance(await caller.hear(), Pingresp)

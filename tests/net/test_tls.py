@@ -41,11 +41,11 @@ class Turns:
 
     def __init__(self) -> None:
         self.entries = Entries(asyncio.get_running_loop(), Faults())
-        self.effort = 0
+        self.cost = 0
         self.busy = False
 
-    def count(self, effort: int, charged: Charged) -> None:
-        self.effort += effort
+    def count(self, cost: int, charged: Charged) -> None:
+        self.cost += cost
 
     def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
         return self.busy and not is_little
@@ -392,7 +392,7 @@ async def test_many_records_in_one_chunk_take_turns(house: House):
     await served.ended()
     assert bytes(served.data) == text
     assert served.chunks >= len(text) / RECORDS_A_TURN
-    assert turns.effort >= len(text)
+    assert turns.cost >= len(text)
 
 
 async def test_while_others_have_to_be_served_a_chunk_waits(house: House):

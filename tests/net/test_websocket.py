@@ -45,8 +45,8 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.net.scheduler import EFFORT_A_ROUND
-from appliance.net.websocket import FRAME_EFFORT
+from appliance.net.scheduler import COST_PER_ROUND
+from appliance.net.websocket import FRAME_COST
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -548,12 +548,12 @@ async def test_little_chunks_of_many_frames_take_turns(house: House):
     accounting = house.broker.accounting
     account = ends["web-0"].account
     await until(lambda: not house.network.is_busy())
-    before, held, effort = accounting.queued_bytes, account.bytes, accounting.counters.effort
+    before, held, begun = accounting.queued_bytes, account.bytes, accounting.counters.cost
     chunk = frame(b"", Opcode.BINARY, fin=False) + frame(b"", Opcode.CONT, fin=False) * 339
     for end in ends.values():
         cast(Any, end._transport).data_received(chunk)
-    cost = accounting.counters.effort - effort
-    assert cost < 3 * 340 * FRAME_EFFORT + EFFORT_A_ROUND, cost
+    cost = accounting.counters.cost - begun
+    assert cost < 3 * 340 * FRAME_COST + COST_PER_ROUND, cost
     waiting = sum(bool(cast(Any, end._transport)._held) for end in ends.values())
     assert waiting >= 20
     assert accounting.queued_bytes - before >= waiting * len(chunk)
@@ -766,7 +766,7 @@ async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls,
 
 
 class Busy:
-    """Somebody who has much to do, for so many turns: each takes a round's effort."""
+    """Somebody who has much to do, for so many turns: each takes a round's cost."""
 
     def __init__(self, house: House, turns: int) -> None:
         self.house = house
@@ -775,7 +775,7 @@ class Busy:
 
     def take_turn(self) -> None:
         time.sleep(0.006)
-        self.house.broker.counters.effort += EFFORT_A_ROUND + 1
+        self.house.broker.counters.cost += COST_PER_ROUND + 1
         self.left -= 1
         if self.left > 0:
             self.house.network.queue_turn(self)

@@ -84,8 +84,8 @@ REPORT_INTERVAL = 60.0
 
 
 #: Bytes that are converted in a microsecond or so, and count for that in the broker's
-#: `Counters.effort`: who sends much then waits for the others.
-BYTES_AN_EFFORT = 16
+#: `Counters.cost`: who sends much then waits for the others.
+BYTES_PER_COST_UNIT = 16
 
 #: Bytes of a topic, as of every string in MQTT.
 LONGEST_TOPIC = 0xFFFF
@@ -380,7 +380,7 @@ class CallDispatcher:
 
     def receive(self, origin: Session, message: Message, identifier: int) -> None:
         """A message came through the subscription with that identifier."""
-        self._broker.counters.effort += len(message.payload) // BYTES_AN_EFFORT
+        self._broker.counters.cost += len(message.payload) // BYTES_PER_COST_UNIT
         receive = self._receivers.get(identifier)
         if receive is not None:
             receive(origin, message)

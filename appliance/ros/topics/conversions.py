@@ -120,7 +120,7 @@ class ConversionQueue:
         try:
             return self._run(work)
         finally:
-            self._accounting.counters.effort += int((thread_time() - begun) * 1e6)
+            self._accounting.counters.cost += int((thread_time() - begun) * 1e6)
             # What came meanwhile is read in the next round, and is answered before the one after.
             if not was_busy:
                 self._entries.soon("turns.pause", self._pause, failed=self._pause)

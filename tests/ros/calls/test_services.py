@@ -578,11 +578,11 @@ async def test_a_call_that_is_too_large(house):
     house.bridge.calls.board.limits = CallLimits(input=InputLimits(payload=100))
     switch = Switch(house)
     client = house.client("alice", "r2d2/ask/_request/+")
-    before = house.broker.counters.effort
+    before = house.broker.counters.cost
     code, text = await client.error(CALL, b'{"data": true}' + b" " * 87)
     assert (code, switch.asked) == ("too_large", [])
     assert "101 bytes" in text and "bridge.limits.payload" in text
-    assert house.broker.counters.effort > before + 101 // 16
+    assert house.broker.counters.cost > before + 101 // 16
     said = []
     house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
     await until(lambda: client.received[1:], "the request")

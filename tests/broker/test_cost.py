@@ -1,4 +1,4 @@
-"""What is done counts as effort, so that whoever causes much of it lets the others have a turn."""
+"""What is done counts as cost, so that whoever causes much of it lets the others have a turn."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from itertools import product
 
 import pytest
 
-from appliance.broker.accounting import EFFORT_A_TURN
+from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import (
-    EFFORT_A_TICK,
-    HELD_EFFORT,
-    LEVELS_AN_EFFORT,
+    COST_PER_TICK,
+    HELD_COST,
+    LEVELS_PER_COST_UNIT,
     LOOKS_FOR_ONE,
     Broker,
 )
@@ -21,51 +21,49 @@ from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
 from .conftest import FakeAccess, Join, Peer, lasting
 
 
-def effort_of(broker: Broker, peer: Peer, *packets: Publish | Pubrel) -> int:
+def cost_of(broker: Broker, peer: Peer, *packets: Publish | Pubrel) -> int:
     """What these packets add, their topic being known already."""
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     peer.send(*packets)
-    return broker.counters.effort - begun
+    return broker.counters.cost - begun
 
 
 def test_messages_of_qos_2_that_are_never_released_take_turns(join: Join, broker: Broker):
     """3.1.1, which knows no limit of these"""
     peer = join("peer", version=4)
-    count = 2 * EFFORT_A_TURN
+    count = 2 * COST_PER_TURN
     peer.send(*(Publish("a", b"", 2, packet_id=number + 1) for number in range(count)))
     held = len(peer.session.received)
-    assert 0 < held <= EFFORT_A_TURN and peer.client.connection.paused
+    assert 0 < held <= COST_PER_TURN and peer.client.connection.paused
     while peer.wire.laters:
         peer.go_on()
     assert len(peer.session.received) == count
 
 
 @pytest.mark.parametrize("shared", [False, True], ids=["plain", "shared"])
-def test_to_ask_many_readers_for_room_is_an_effort_with_qos_2(
-    join: Join, broker: Broker, shared: bool
-):
+def test_to_ask_many_readers_for_room_costs_with_qos_2(join: Join, broker: Broker, shared: bool):
     readers = 40 * LOOKS_FOR_ONE
     for number in range(readers):
         join(f"reader{number}").subscribe("$share/g/a" if shared else "a", 2)
     peer = join("peer")
     peer.publish("a", b"first", 2)  # which finds the route
     message, release = Publish("a", b"", 2, packet_id=7), Pubrel(7)
-    assert effort_of(broker, peer, message) >= HELD_EFFORT + readers // LOOKS_FOR_ONE
-    assert effort_of(broker, peer, message) >= HELD_EFFORT, "sent again"
+    assert cost_of(broker, peer, message) >= HELD_COST + readers // LOOKS_FOR_ONE
+    assert cost_of(broker, peer, message) >= HELD_COST, "sent again"
     given = 1 if shared else readers
-    assert effort_of(broker, peer, release) >= HELD_EFFORT + readers // LOOKS_FOR_ONE + given
+    assert cost_of(broker, peer, release) >= HELD_COST + readers // LOOKS_FOR_ONE + given
 
 
-def test_the_members_of_a_group_are_an_effort_where_they_are_visited(join: Join, broker: Broker):
+def test_the_members_of_a_group_cost_where_they_are_visited(join: Join, broker: Broker):
     count = 300
     for number in range(count):
         member = join(f"member{number}", **lasting(5))
         member.subscribe("$share/g/t/#", 1)
         member.lose()
     peer = join("peer")
-    assert effort_of(broker, peer, Publish("t/1", b"", 0)) >= count, "each may be allowed the topic"
+    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= count, "each may be allowed the topic"
     # Nobody is there, so as many are looked at as ever are for one message.
-    assert effort_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // LOOKS_FOR_ONE
+    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // LOOKS_FOR_ONE
 
 
 def test_what_a_member_leaves_is_offered_to_few_of_many(
@@ -85,9 +83,9 @@ def test_what_a_member_leaves_is_offered_to_few_of_many(
     asked: list[str] = []
     decide = access.decide
     monkeypatch.setattr(access, "decide", lambda *a: (asked.append(a[2]), decide(*a))[1])
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     join("leaving")  # anew: its session ends
-    assert broker.counters.effort - begun >= count * ASKED // LOOKS_FOR_ONE
+    assert broker.counters.cost - begun >= count * ASKED // LOOKS_FOR_ONE
     assert len(asked) == count
     heard = [message for n in range(30) for message in join(f"member{n}", **lasting(5)).drain()]
     assert len(heard) == count
@@ -139,9 +137,9 @@ def test_wills_that_are_due_at_once_come_in_several_ticks(join: Join, broker: Br
     now = broker.now + 16
     heard: list[int] = []
     while not heard or sum(heard) < count:
-        begun = broker.counters.effort
+        begun = broker.counters.cost
         due = broker.tick(now)
-        assert broker.counters.effort - begun < EFFORT_A_TICK + 500
+        assert broker.counters.cost - begun < COST_PER_TICK + 500
         heard.append(len(watcher.payloads()))
         assert heard[-1] and (due <= now) == (sum(heard) < count)
     assert len(heard) > 2
@@ -162,11 +160,11 @@ def test_retained_messages_that_expire_at_once_go_in_several_ticks(join: Join, b
     assert 3 < len(left) < 20
 
 
-def test_a_session_with_many_deep_filters_is_an_effort_at_its_end(join: Join, broker: Broker):
+def test_a_session_with_many_deep_filters_costs_at_its_end(join: Join, broker: Broker):
     peer = join("peer")
     deep = "/".join("x" * 100)
     for number in range(20):
         peer.subscribe(f"{number}/{deep}")
-    begun = broker.counters.effort
+    begun = broker.counters.cost
     peer.lose()
-    assert broker.counters.effort - begun > 20 * 100 // LEVELS_AN_EFFORT
+    assert broker.counters.cost - begun > 20 * 100 // LEVELS_PER_COST_UNIT
