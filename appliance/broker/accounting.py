@@ -7,53 +7,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from appliance.broker.accounts import Account, Accounts, Quotas
+from appliance.broker.counters import Counters
 from appliance.broker.faults import Faults
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits, Store
 
 if TYPE_CHECKING:
     from appliance.broker.session import Session
-
-#: What one client may cause in a turn of the loop, see `Counters.cost`: some milliseconds.
-COST_PER_TURN = 1000
-
-
-@dataclass(slots=True)
-class Counters:
-    """What the broker counts; `$SYS` and the metrics are made of it. All grow from its start."""
-
-    bytes_received: int = 0
-    bytes_sent: int = 0
-    control_received: int = 0
-    control_sent: int = 0
-    publish_received: int = 0
-    publish_sent: int = 0
-    publish_dropped: int = 0
-    publish_refused: int = 0
-    publish_bytes_received: int = 0
-    publish_bytes_sent: int = 0
-    connects: int = 0
-    connects_refused: int = 0
-    connections_refused: int = 0
-    sockets: int = 0
-    #: Work done, in units of some four microseconds, as one message takes; what takes long counts
-    #: itself here, so that one client's turn can be ended without a look at the clock.
-    cost: int = 0
-    sessions_expired: int = 0
-    #: Connections and sessions that were ended as somebody needed the place, see
-    #: `Broker._make_room`.
-    taken_back: int = 0
-    clients_maximum: int = 0
-
-    @property
-    def messages_received(self) -> int:
-        """Packets of all kinds that came in: `control_received` are those that are no PUBLISH."""
-        return self.publish_received + self.control_received
-
-    @property
-    def messages_sent(self) -> int:
-        """Packets of all kinds that went out."""
-        return self.publish_sent + self.control_sent
 
 
 @dataclass(slots=True)

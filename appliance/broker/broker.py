@@ -54,11 +54,11 @@ log = logging.getLogger(__name__)
 LATE = 0.1
 
 #: Readers that are asked whether they are full for the cost to give a message to one of them.
-LOOKS_FOR_ONE = 4
+CHECKS_PER_COST_UNIT = 4
 
 #: Connections, wills and sessions that one tick ends, and the cost after which it ends no more:
 #: some ten milliseconds of work.
-ENDINGS_A_TURN = 128
+ENDINGS_PER_TICK = 128
 COST_PER_TICK = 2600
 
 
@@ -253,11 +253,11 @@ class Broker:
         closing = self._connection_to_end(account) if needs_connection else None
         ending = self._session_to_end(account) if session is None else None
         if closing is not None:
-            self._take_back(closing, account, "connections")
+            self._evict(closing, account, "connections")
             # Its session may have ended with it, which may be room enough.
             ending = ending and self._session_to_end(account)
         if ending is not None:
-            self._take_back(ending, account, "sessions")
+            self._evict(ending, account, "sessions")
             if self.sessions.get(ending.client_id) is ending:
                 self._end(ending)
 
@@ -305,9 +305,9 @@ class Broker:
             return next(reversed(holder.present))
         raise _all_taken(account, account.sessions, "sessions", self.limits.sessions)
 
-    def _take_back(self, session: Session, account: Account, what: str) -> None:
+    def _evict(self, session: Session, account: Account, what: str) -> None:
         """End the connection of a session, if it has one, as the account needs the place."""
-        self.counters.taken_back += 1
+        self.counters.evicted += 1
         holder = session.account
         key = ("taken back", what, holder.username)
         if holder is account:
@@ -491,13 +491,13 @@ class Broker:
             members = known.get(share)
             if members is None:
                 members = share.targets()
-                self.counters.cost += len(members) // LOOKS_FOR_ONE
+                self.counters.cost += len(members) // CHECKS_PER_COST_UNIT
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
                 known[share] = members
             # Who may receive it is asked of those alone that it may go to: there may be thousands.
             target = share.choose(members, message, self.router.may_receive)
-            self.counters.cost += 1 + share.looked // LOOKS_FOR_ONE
+            self.counters.cost += 1 + share.looked // CHECKS_PER_COST_UNIT
             return target is not None and self._deliver_shared(target, message, share)
 
         return give
@@ -618,7 +618,7 @@ class Broker:
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
-            self.counters.cost += 1 + share.looked // LOOKS_FOR_ONE
+            self.counters.cost += 1 + share.looked // CHECKS_PER_COST_UNIT
             if chosen is not None and self._deliver_shared(chosen, message, share):
                 taken = True
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
@@ -727,7 +727,7 @@ class Broker:
     def _count_looks(self, route: Fanout) -> None:
         """All receivers of a route are asked, each on its own."""
         looks = len(route.targets) + sum(len(members) for _, members in route.shares)
-        self.counters.cost += looks // LOOKS_FOR_ONE
+        self.counters.cost += looks // CHECKS_PER_COST_UNIT
 
     def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
         """Whether the message, of QoS 1 or 2, would be kept in the store."""
@@ -954,7 +954,7 @@ class Broker:
         filled, self.accounting.filled = self.accounting.filled, []
         for session, shortage in filled:
             faults.run("clock.full", self._tell_filled, session, shortage, otherwise=None)
-        left = ENDINGS_A_TURN
+        left = ENDINGS_PER_TICK
         for client in tuple(self.clients):
             try:
                 left -= client.tick(now)

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
-from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.backpressure import (
     LEAST_COUNTED,
     MESSAGE_PATIENCE,
@@ -21,6 +20,7 @@ from appliance.broker.backpressure import (
     Congestion,
 )
 from appliance.broker.broker import HELD_COST, LATE, Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.handshake import (
     Agreement,
     agree,

@@ -7,8 +7,9 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from appliance.broker.accounting import COST_PER_TURN, Accounting
+from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.message import Message
 from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.session import LEVEL_SIZE

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, TypeAlias
 
-from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.output import in_words
 from appliance.broker.ports import Action, Question
 from appliance.broker.session import Session

@@ -21,7 +21,7 @@ from appliance.broker.backpressure import (
     PUBLISHER_PATIENCE,
     Allowance,
 )
-from appliance.broker.broker import LOOKS_FOR_ONE, Broker
+from appliance.broker.broker import CHECKS_PER_COST_UNIT, Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink, Limits
 from appliance.host.clock import SpareClock
@@ -635,7 +635,7 @@ def test_to_look_for_readers_that_are_full_costs(
             begun = broker.counters.cost
             other.send(Publish("b", b"", 1, False, False, packet_id))
         costs.append(broker.counters.cost - begun)
-    assert costs[1] - costs[0] == 200 // LOOKS_FOR_ONE
+    assert costs[1] - costs[0] == 200 // CHECKS_PER_COST_UNIT
 
 
 @pytest.fixture

@@ -6,14 +6,14 @@ from itertools import product
 
 import pytest
 
-from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import (
+    CHECKS_PER_COST_UNIT,
     COST_PER_TICK,
     HELD_COST,
     LEVELS_PER_COST_UNIT,
-    LOOKS_FOR_ONE,
     Broker,
 )
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.shared import ASKED
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
@@ -42,16 +42,16 @@ def test_messages_of_qos_2_that_are_never_released_take_turns(join: Join, broker
 
 @pytest.mark.parametrize("shared", [False, True], ids=["plain", "shared"])
 def test_to_ask_many_readers_for_room_costs_with_qos_2(join: Join, broker: Broker, shared: bool):
-    readers = 40 * LOOKS_FOR_ONE
+    readers = 40 * CHECKS_PER_COST_UNIT
     for number in range(readers):
         join(f"reader{number}").subscribe("$share/g/a" if shared else "a", 2)
     peer = join("peer")
     peer.publish("a", b"first", 2)  # which finds the route
     message, release = Publish("a", b"", 2, packet_id=7), Pubrel(7)
-    assert cost_of(broker, peer, message) >= HELD_COST + readers // LOOKS_FOR_ONE
+    assert cost_of(broker, peer, message) >= HELD_COST + readers // CHECKS_PER_COST_UNIT
     assert cost_of(broker, peer, message) >= HELD_COST, "sent again"
     given = 1 if shared else readers
-    assert cost_of(broker, peer, release) >= HELD_COST + readers // LOOKS_FOR_ONE + given
+    assert cost_of(broker, peer, release) >= HELD_COST + readers // CHECKS_PER_COST_UNIT + given
 
 
 def test_the_members_of_a_group_cost_where_they_are_visited(join: Join, broker: Broker):
@@ -63,7 +63,7 @@ def test_the_members_of_a_group_cost_where_they_are_visited(join: Join, broker: 
     peer = join("peer")
     assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= count, "each may be allowed the topic"
     # Nobody is there, so as many are looked at as ever are for one message.
-    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // LOOKS_FOR_ONE
+    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // CHECKS_PER_COST_UNIT
 
 
 def test_what_a_member_leaves_is_offered_to_few_of_many(
@@ -85,7 +85,7 @@ def test_what_a_member_leaves_is_offered_to_few_of_many(
     monkeypatch.setattr(access, "decide", lambda *a: (asked.append(a[2]), decide(*a))[1])
     begun = broker.counters.cost
     join("leaving")  # anew: its session ends
-    assert broker.counters.cost - begun >= count * ASKED // LOOKS_FOR_ONE
+    assert broker.counters.cost - begun >= count * ASKED // CHECKS_PER_COST_UNIT
     assert len(asked) == count
     heard = [message for n in range(30) for message in join(f"member{n}", **lasting(5)).drain()]
     assert len(heard) == count

@@ -7,8 +7,8 @@ from itertools import product
 
 import pytest
 
-from appliance.broker.accounting import COST_PER_TURN
-from appliance.broker.broker import ENDINGS_A_TURN, Broker
+from appliance.broker.broker import ENDINGS_PER_TICK, Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.rate_limited_log import BURST, INTERVAL
@@ -453,16 +453,16 @@ def test_who_holds_little_is_not_starved_by_who_holds_much(join: Join):
 
 
 def test_thousands_that_fall_silent_end_in_turns(join: Join, broker: Broker):
-    peers = [join(f"p{n}", keep_alive=10) for n in range(2 * ENDINGS_A_TURN + 1)]
+    peers = [join(f"p{n}", keep_alive=10) for n in range(2 * ENDINGS_PER_TICK + 1)]
     for turn in (1, 2):
         assert broker.tick(1020.0) == 1020.0
-        assert sum(peer.wire.closed for peer in peers) == turn * ENDINGS_A_TURN
+        assert sum(peer.wire.closed for peer in peers) == turn * ENDINGS_PER_TICK
     assert broker.tick(1020.0) > 1020.0
     assert all(peer.wire.closed for peer in peers)
 
 
 def test_thousands_of_sessions_expire_in_turns(join: Join, broker: Broker):
-    for number in range(2 * ENDINGS_A_TURN + 1):
+    for number in range(2 * ENDINGS_PER_TICK + 1):
         join(f"p{number}", **lasting(5, 60)).lose()
     turns = 1
     while broker.tick(1061.0) <= 1061.0:

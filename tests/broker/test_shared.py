@@ -10,8 +10,8 @@ from time import thread_time
 import pytest
 
 from appliance.access import Acl
-from appliance.broker.accounting import COST_PER_TURN
 from appliance.broker.broker import Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.ports import Action, Decision, Identity, Limits
 from appliance.broker.routing import CACHED_TOPIC
 from appliance.broker.shared import ASKED

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from house import Caller, House, check_network, make_contexts
 
-from appliance.broker.accounting import COST_PER_TURN
+from appliance.broker.counters import COST_PER_TURN
 from appliance.mqtt.packets import (
     Connack,
     Connect,
