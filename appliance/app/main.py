@@ -20,7 +20,7 @@ import uvloop
 
 from appliance.access import AccessFileError, FileAccess
 from appliance.app import status, wiring
-from appliance.app.reload import Parts, Reload, ReloadError
+from appliance.app.reload import Reload, ReloadError, ReloadParts
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
@@ -212,10 +212,10 @@ class App:
         self._stack.push_async_callback(frame.shutdown)
         self._start_bridge(loop)
         self._reload = Reload(
-            Parts(settings, access, tls, broker, listeners, self.bridge, self.audit)
+            ReloadParts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )
         self._status = status.Status(
-            status.Parts(
+            status.StatusParts(
                 version("ros-mqtt-appliance"),
                 broker,
                 listeners,

@@ -57,7 +57,7 @@ class ReloadError(Exception):
 
 
 @dataclass(slots=True)
-class Parts:
+class ReloadParts:
     """What a reload changes."""
 
     settings: Settings
@@ -70,7 +70,7 @@ class Parts:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ReloadOutcome:
     """How a reload went: when by the loop's clock, whether it was done, and what was said of it."""
 
     at: float
@@ -90,11 +90,11 @@ class _Read:
 class Reload:
     """Reloads the parts, one time after the other; belongs to the event loop's thread."""
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: ReloadParts) -> None:
         self._parts = parts
         self._turn = asyncio.Lock()
         #: Of the last one; None when there was none.
-        self.outcome: Outcome | None = None
+        self.outcome: ReloadOutcome | None = None
         #: What the last one that changed anything has changed, and when; empty when none did.
         self.last_change = ""
 
@@ -139,7 +139,7 @@ class Reload:
             return changed
 
     def _ended(self, done: bool, text: str) -> None:
-        self.outcome = Outcome(asyncio.get_running_loop().time(), done, text)
+        self.outcome = ReloadOutcome(asyncio.get_running_loop().time(), done, text)
 
     async def renewed(self) -> None:
         """Take over the server's certificate, which is a new one.
@@ -213,7 +213,7 @@ class Reload:
         return told + (["access rules"] if changes.rules_changed else [])
 
 
-def _read(parts: Parts) -> _Read:
+def _read(parts: ReloadParts) -> _Read:
     """Everything that a reload needs from files; raises what is wrong with them."""
     before = parts.settings
     settings = before if before.file is None else config.load(before.file)

@@ -35,7 +35,7 @@ HOLDERS = 3
 
 
 @dataclass(slots=True)
-class Parts:
+class StatusParts:
     """What is asked how it is."""
 
     version: str
@@ -52,7 +52,7 @@ class Parts:
 class Status:
     """Counts what comes and goes a second, and tells how everything is; the event loop's."""
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: StatusParts) -> None:
         self._parts = parts
         self._loop = asyncio.get_running_loop()
         self._started_at = self._loop.time()

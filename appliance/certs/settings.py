@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from appliance.certs.contexts import TlsFiles, TlsPolicy
-from appliance.config import Broker
+from appliance.config import BrokerSection
 
 
 def listener_name(index: int) -> str:
@@ -11,13 +11,13 @@ def listener_name(index: int) -> str:
     return f"broker.listeners[{index}]"
 
 
-def tls_files(broker: Broker) -> TlsFiles:
+def tls_files(broker: BrokerSection) -> TlsFiles:
     """The files of all listeners."""
     tls = broker.tls
     return TlsFiles(tls.certificate, tls.key, tls.ca, tls.crl)
 
 
-def tls_policies(broker: Broker) -> dict[str, TlsPolicy]:
+def tls_policies(broker: BrokerSection) -> dict[str, TlsPolicy]:
     """What each listener with TLS asks of its connections; empty when none has TLS."""
     return {
         listener_name(index): TlsPolicy(

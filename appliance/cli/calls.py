@@ -19,18 +19,18 @@ from appliance.cli.connection import CallTarget, connecting
 from appliance.cli.console import CommandError
 
 if TYPE_CHECKING:
-    from appliance.cli.rpc_client import Caller
+    from appliance.cli.rpc_client import RpcClient
 
 param_app = typer.Typer(no_args_is_help=True, help="Parameters of the robot's nodes, over MQTT.")
 
 
 @contextmanager
-def _caller(reach: CallTarget) -> Iterator[Caller]:
+def _caller(reach: CallTarget) -> Iterator[RpcClient]:
     from appliance.cli.mqtt_client import ClientError
-    from appliance.cli.rpc_client import Caller
+    from appliance.cli.rpc_client import RpcClient
 
     try:
-        caller = Caller(reach.target())
+        caller = RpcClient(reach.target())
         try:
             yield caller
         finally:

@@ -15,7 +15,7 @@ import typer
 from appliance.cli.console import CommandError, ConfigOption, load, read_password
 
 if TYPE_CHECKING:
-    from appliance.cli.mqtt_client import Target
+    from appliance.cli.mqtt_client import ConnectionSettings
 
 _HERE = "localhost"
 
@@ -70,11 +70,11 @@ class ConnectionOptions:
     ] = False
     config: ConfigOption = None
 
-    def target(self) -> Target:
+    def target(self) -> ConnectionSettings:
         """Where to connect and as whom; asks for the password if it has to. Raises CommandError."""
         from paho.mqtt.enums import MQTTProtocolVersion
 
-        from appliance.cli.mqtt_client import Target
+        from appliance.cli.mqtt_client import ConnectionSettings
 
         port, ca = self.port, self.ca
         # Of an appliance on this computer the configuration says the rest. Without one it is a
@@ -85,7 +85,7 @@ class ConnectionOptions:
             ports = [listener.bind.port for listener in broker.listeners if listener.is_mqtts]
             port = port or (ports[0] if ports else None)
             ca = ca or broker.tls.ca
-        return Target(
+        return ConnectionSettings(
             self.host,
             port or 8883,
             ca,

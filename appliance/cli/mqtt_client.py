@@ -42,7 +42,7 @@ class RefusedError(ClientError):
 
 
 @dataclass(frozen=True)
-class Answer:
+class BrokerReply:
     """What the broker said of a packet: a code and, in MQTT 5, perhaps why."""
 
     code: ReasonCode
@@ -64,7 +64,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Target:
+class ConnectionSettings:
     """Which broker to talk to, how its certificate is checked, and as whom.
 
     `certificate` is the client's own, with its key in the same file or in `key`.
@@ -86,9 +86,11 @@ class Target:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-def publish(target: Target, topic: str, payloads: Iterable[bytes], qos: int, retain: bool) -> None:
+def publish(
+    target: ConnectionSettings, topic: str, payloads: Iterable[bytes], qos: int, retain: bool
+) -> None:
     """Publishes each payload and waits for its acknowledgement. Raises ClientError."""
-    connection = Connection(target)
+    connection = MqttClient(target)
     try:
         for payload in payloads:
             connection.publish(topic, payload, qos, retain)
@@ -97,7 +99,7 @@ def publish(target: Target, topic: str, payloads: Iterable[bytes], qos: int, ret
 
 
 def subscribe(
-    target: Target,
+    target: ConnectionSettings,
     filters: list[str],
     qos: int,
     output: BinaryIO,
@@ -123,7 +125,7 @@ def subscribe(
         )
         write_line(output, line)
 
-    connection = Connection(target, show)
+    connection = MqttClient(target, show)
     try:
         connection.subscribe(filters, qos)
         deadline = None if timeout is None else time.monotonic() + timeout
@@ -141,28 +143,34 @@ def write_line(output: BinaryIO, line: bytes) -> None:
     output.flush()
 
 
-class Connection:
+class MqttClient:
     """One connection, driven by the caller's thread; every failure is a ClientError."""
 
     def __init__(
-        self, target: Target, on_message: Callable[[paho.MQTTMessage], None] = lambda message: None
+        self,
+        target: ConnectionSettings,
+        on_message: Callable[[paho.MQTTMessage], None] = lambda message: None,
     ) -> None:
         self._target = target
-        self._answer: Answer | None = None
-        self._granted: dict[int | None, list[Answer]] = {}
-        self._published: dict[int, Answer] = {}
-        self._ended: Answer | None = None
+        self._answer: BrokerReply | None = None
+        self._granted: dict[int | None, list[BrokerReply]] = {}
+        self._published: dict[int, BrokerReply] = {}
+        self._ended: BrokerReply | None = None
         self._client = client = paho.Client(
             CallbackAPIVersion.VERSION2, target.client_id, protocol=target.version
         )
         client.username_pw_set(target.username, target.password)
-        client.on_connect = lambda c, u, flags, code, p: setattr(self, "_answer", Answer(code, p))
-        client.on_disconnect = lambda c, u, flags, code, p: setattr(self, "_ended", Answer(code, p))
+        client.on_connect = lambda c, u, flags, code, p: setattr(
+            self, "_answer", BrokerReply(code, p)
+        )
+        client.on_disconnect = lambda c, u, flags, code, p: setattr(
+            self, "_ended", BrokerReply(code, p)
+        )
         client.on_subscribe = lambda c, u, mid, codes, p: self._granted.update(
-            {mid: [Answer(code, p) for code in codes]}
+            {mid: [BrokerReply(code, p) for code in codes]}
         )
         client.on_publish = lambda c, u, mid, code, p: self._published.update(
-            {mid: Answer(code, p)}
+            {mid: BrokerReply(code, p)}
         )
         client.on_message = lambda c, u, message: on_message(message)
         context = _tls(target)
@@ -284,7 +292,7 @@ def _reason(error: ssl.SSLError) -> str:
     return said.lower().replace("_", " ")
 
 
-def _tls(target: Target) -> ssl.SSLContext:
+def _tls(target: ConnectionSettings) -> ssl.SSLContext:
     if target.insecure:
         context = ssl.create_default_context()
         context.check_hostname = False

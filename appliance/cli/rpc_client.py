@@ -21,7 +21,13 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from appliance.cli.mqtt_client import ANSWER_TIMEOUT, ClientError, Connection, RefusedError, Target
+from appliance.cli.mqtt_client import (
+    ANSWER_TIMEOUT,
+    ClientError,
+    ConnectionSettings,
+    MqttClient,
+    RefusedError,
+)
 
 NO_MATCHING_SUBSCRIBERS = 0x10
 
@@ -37,24 +43,24 @@ class CallFailedError(ClientError):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class GoalOutcome:
     """How a goal ended, `succeeded`, `canceled` or `aborted`, and the JSON of its result."""
 
     status: str
     result: bytes
 
 
-class Caller:
+class RpcClient:
     """A connection for calls. Every failure is a ClientError; `close` ends it."""
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: ConnectionSettings) -> None:
         if not target.client_id:  # which has to be known: it is a level of the answers' topics
             target = replace(target, client_id=f"appliance-{secrets.token_hex(6)}")
         self._target = target
         self._is_v5 = target.version == MQTTProtocolVersion.MQTTv5
         self._received: list[paho.MQTTMessage] = []
         self._listening: set[str] = set()
-        self._connection = Connection(target, self._received.append)
+        self._connection = MqttClient(target, self._received.append)
 
     def close(self) -> None:
         self._connection.close()
@@ -150,7 +156,7 @@ class Caller:
         feedback: Callable[[bytes], None] | None,
         is_over: Callable[[], bool],
         timeout: float | None,
-    ) -> Outcome:
+    ) -> GoalOutcome:
         """Sends a goal to the action at that MQTT topic and follows it to its end.
 
         `accepted` is called with its id, `feedback` with each one's JSON. When `is_over()` or the
@@ -200,11 +206,11 @@ class Caller:
             from appliance.ros.payload.payloads import RAW, named_encoding
 
             wire = RAW[named_encoding(content_type(result)) or "cdr"]
-            return Outcome(status_of(bytes(result.payload), wire), shown(result))
+            return GoalOutcome(status_of(bytes(result.payload), wire), shown(result))
         value = decode(result)
         if "error" in value:
             raise CallFailedError(f"{value['error']['code']}: {value['error']['message']}")
-        return Outcome(value["status"], encode(value["result"]))
+        return GoalOutcome(value["status"], encode(value["result"]))
 
     def _cancel(self, action: str, id_: str) -> None:
         try:

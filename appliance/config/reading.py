@@ -27,7 +27,7 @@ from appliance.config.quantities import (
 )
 from appliance.config.settings import (
     ActionRoute,
-    Bridge,
+    BridgeSection,
     ParameterRoute,
     Route,
     ServiceRoute,
@@ -35,7 +35,7 @@ from appliance.config.settings import (
     TopicRoute,
 )
 from appliance.config.values import OF_NODE, InListError
-from appliance.config.yaml_document import Document, KeyPath, Problem
+from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument
 from appliance.host.environment import of_service
 
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
@@ -49,7 +49,7 @@ _MAX_SIZE = 1 << 20
 class ConfigError(Exception):
     """The configuration cannot be used; `problems` has everything that is wrong with it."""
 
-    def __init__(self, problems: list[Problem]) -> None:
+    def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("\n".join(map(str, problems)))
         self.problems = problems
 
@@ -61,13 +61,13 @@ def find(path: Path | None = None) -> Path:
             if candidate.is_file():
                 return candidate
             if candidate.exists():
-                raise ConfigError([Problem(candidate, 0, "", "is not a file")])
+                raise ConfigError([ConfigProblem(candidate, 0, "", "is not a file")])
         except PermissionError:
             text = "may not be looked at: run this as the appliance's user, or as root"
-            raise ConfigError([Problem(candidate, 0, "", text)]) from None
+            raise ConfigError([ConfigProblem(candidate, 0, "", text)]) from None
     missing = path or SEARCH_PATH[0]
     places = "no such file" if path else f"not found, nor {SEARCH_PATH[1]}"
-    raise ConfigError([Problem(missing, 0, "", f"{places}; `appliance init` writes one")])
+    raise ConfigError([ConfigProblem(missing, 0, "", f"{places}; `appliance init` writes one")])
 
 
 def load(path: Path | None = None) -> Settings:
@@ -81,10 +81,10 @@ def load(path: Path | None = None) -> Settings:
             text = opened.read(_MAX_SIZE + 1)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
-        raise ConfigError([Problem(file, 0, "", f"cannot be read: {reason}")]) from None
+        raise ConfigError([ConfigProblem(file, 0, "", f"cannot be read: {reason}")]) from None
     if len(text) > _MAX_SIZE:
         what = f"longer than {_MAX_SIZE >> 20} Mi characters: is it the right file?"
-        raise ConfigError([Problem(file, 0, "", what)])
+        raise ConfigError([ConfigProblem(file, 0, "", what)])
     return loads(text, file, {**of_service(file), **os.environ})
 
 
@@ -104,7 +104,7 @@ def load_control(path: Path | None = None) -> Settings:
 
 def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:
     """The settings in `text`; `file` names it in errors and is what paths are relative to."""
-    document = Document(text, file, os.environ if environment is None else environment)
+    document = YamlDocument(text, file, os.environ if environment is None else environment)
     problems = document.problems
     try:
         settings = Settings.model_validate(
@@ -165,7 +165,7 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     yield from _cross_check_bus(settings.bridge)
 
 
-def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+def _cross_check_bus(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
     """What ROS 1 and ROS 2 do not have in common."""
     is_ros1 = bridge.bus == "ros1"
     foreign, own = ("cdr", "ros1") if is_ros1 else ("ros1", "cdr")
@@ -189,7 +189,7 @@ def _cross_check_bus(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
             yield ("bridge", key), f"is for ROS 2 only; in ROS 1 it is {instead}"
 
 
-def _cross_check_routes(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+def _cross_check_routes(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
     """What holds for the routes of every section."""
     sections: dict[str, Sequence[Route]] = {
         "topics": bridge.topics,
@@ -214,7 +214,7 @@ def _cross_check_routes(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
                 yield (*path, "mqtt"), problem
 
 
-def _cross_check_called(bridge: Bridge) -> Iterator[tuple[KeyPath, str]]:
+def _cross_check_called(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
     sections: dict[str, Sequence[ServiceRoute | ActionRoute | ParameterRoute]] = {
         "services": bridge.services,
         "actions": bridge.actions,

@@ -121,7 +121,7 @@ class Listener(_Section):
         return tls
 
 
-class Tls(_Section):
+class TlsSection(_Section):
     """The server's certificate, whose client certificates are accepted, and what they are for.
 
     Without `crl` it is `ca.crl` beside `ca`, if there is one.
@@ -137,7 +137,7 @@ class Tls(_Section):
     ciphers: str | None = None
 
 
-class UserLimits(_Section):
+class UserLimitsSection(_Section):
     """What one user may have at most, of what all clients have; None is as others leave room."""
 
     connections: Count | None = None
@@ -148,7 +148,7 @@ class UserLimits(_Section):
     stored: Annotated[Size, Field(ge=0)] | None = None
 
 
-class Limits(_Section):
+class LimitsSection(_Section):
     """What one client, and all together, may use. Sizes in bytes, times in seconds."""
 
     connections: Count = 1000
@@ -175,10 +175,10 @@ class Limits(_Section):
     keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 65535.0
     topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
     user_properties: Annotated[int, Field(ge=0, le=10_000)] = 1000
-    user: UserLimits = _section()
+    user: UserLimitsSection = _section()
 
 
-class PluginAnswers(_Section):
+class PluginAnswersSection(_Section):
     """How long plugins may take, and for how long and how many of their answers hold."""
 
     timeout: Annotated[Duration, Field(gt=0)] = 5.0
@@ -187,7 +187,7 @@ class PluginAnswers(_Section):
     size: Count = 4096
 
 
-class AuditLog(_Section):
+class AuditSection(_Section):
     """Where is written who connected, was refused and changed what; None for nowhere."""
 
     path: OptionalPath = None
@@ -195,7 +195,7 @@ class AuditLog(_Section):
     keep: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
-class Store(_Section):
+class StoreSection(_Section):
     """Where sessions and retained messages are kept; `size` is in bytes, `age` in seconds."""
 
     path: FilePath = Path("state/store.db")
@@ -204,7 +204,7 @@ class Store(_Section):
     age: Annotated[Duration, Field(gt=0)] | None = None
 
 
-class Broker(_Section):
+class BrokerSection(_Section):
     """The MQTT broker: where it listens, who may come in, what may be used up."""
 
     listeners: list[Listener] = Field(
@@ -217,10 +217,10 @@ class Broker(_Section):
     users: FilePath = Path("users.passwd")
     acl: FilePath = Path("acl.conf")
     anonymous: bool = False
-    tls: Tls = _section()
-    limits: Limits = _section()
-    audit: AuditLog = _section()
-    store: Store = _section()
+    tls: TlsSection = _section()
+    limits: LimitsSection = _section()
+    audit: AuditSection = _section()
+    store: StoreSection = _section()
     check_payload_format: bool = False
     reason_strings: bool = False
     response_information: Annotated[str, AfterValidator(check_response_information)] | None = None
@@ -228,7 +228,7 @@ class Broker(_Section):
     plugins: Annotated[
         dict[str, dict[str, Any]], BeforeValidator(check_plugins), Field(repr=False)
     ] = {}
-    plugin_answers: PluginAnswers = _section()
+    plugin_answers: PluginAnswersSection = _section()
 
     def lets_in_anonymous(self, listener: Listener) -> bool:
         """Whether clients that give no user name come in by that listener."""
@@ -259,7 +259,7 @@ class RouteDefaults(_Section):
     keep: Keep = "latest"
 
 
-class OnSilence(_Section):
+class OnSilenceSection(_Section):
     """The stop message of a route to ROS, and when it is published; `after` in seconds."""
 
     after: Annotated[Duration, Field(gt=0)]
@@ -316,7 +316,7 @@ class TopicRoute(RouteDefaults, Route):
     take_retained: bool = False
     exclusive: bool = False
     lease: Annotated[Duration, Field(gt=0)] = 2.0
-    on_silence: OnSilence | None = None
+    on_silence: OnSilenceSection | None = None
     clamp: Annotated[dict[FieldPath, list[float]], BeforeValidator(check_clamp)] = {}
     allow: Annotated[
         dict[FieldPath, list[bool | int | float | str]], BeforeValidator(check_allow)
@@ -380,7 +380,7 @@ class ParameterRoute(_CalledRoute):
         return self.mqtt.replace("{robot}", robot)
 
 
-class BridgeLimits(_Section):
+class BridgeLimitsSection(_Section):
     """Calls and goals under way: of all together, of one user (None: a quarter of these) and of
     one client; and what one message for ROS may have: bytes of JSON or text, and items."""
 
@@ -391,7 +391,7 @@ class BridgeLimits(_Section):
     items: Count = 100_000
 
 
-class Bridge(_Section):
+class BridgeSection(_Section):
     """The way between the robot's bus and the broker; `diagnostics` in seconds, 0 for none."""
 
     bus: Literal["ros2", "ros1", "none"] = "ros2"
@@ -407,7 +407,7 @@ class Bridge(_Section):
     services: list[Annotated[ServiceRoute, BeforeValidator(from_names)]] = []
     actions: list[Annotated[ActionRoute, BeforeValidator(from_names)]] = []
     parameters: list[Annotated[ParameterRoute, BeforeValidator(from_names)]] = []
-    limits: BridgeLimits = _section()
+    limits: BridgeLimitsSection = _section()
 
     @field_validator("topics")
     @classmethod
@@ -424,7 +424,7 @@ class Bridge(_Section):
         return [route if route.is_exclusion else completed(route) for route in topics]
 
 
-class Log(_Section):
+class LogSection(_Section):
     """What is logged and how; `levels` has a level for each logger named, such as appliance.ros."""
 
     level: Level = "info"
@@ -436,9 +436,9 @@ class Settings(_Section):
     """All of appliance.yaml."""
 
     robot: Annotated[str, AfterValidator(check_robot)] = "robot"
-    broker: Broker = _section()
-    bridge: Bridge = _section()
-    log: Log = _section()
+    broker: BrokerSection = _section()
+    bridge: BridgeSection = _section()
+    log: LogSection = _section()
     control: FilePath = Path("state/control.sock")
     reload_on_change: bool = True
     crash_reports: OptionalPath = Field(Path("state/crashes"), validate_default=True)

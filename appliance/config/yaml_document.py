@@ -24,7 +24,7 @@ _VARIABLE = re.compile(r"\$?\$\{([A-Za-z_][A-Za-z0-9_]*)(?::-([^}]*))?\}")
 
 
 @dataclass(frozen=True)
-class Problem:
+class ConfigProblem:
     """One thing that is wrong: where (line 0: in the file as a whole), which key, and what."""
 
     file: Path
@@ -43,12 +43,12 @@ def dotted(path: KeyPath) -> str:
     return "".join(parts).removeprefix(".")
 
 
-class Document:
+class YamlDocument:
     """One YAML document: its values, and the problems of its form (`faulty`: the keys with one)."""
 
     def __init__(self, text: str, file: Path, environment: Mapping[str, str]) -> None:
         self.file = file
-        self.problems: list[Problem] = []
+        self.problems: list[ConfigProblem] = []
         self.faulty: set[KeyPath] = set()
         self._environment = environment
         self._lines: dict[KeyPath, int] = {}
@@ -66,9 +66,9 @@ class Document:
         """The value's own text, before environment variables; None for a list or a mapping."""
         return self._written.get(path)
 
-    def problem(self, path: KeyPath, what: str) -> Problem:
+    def problem(self, path: KeyPath, what: str) -> ConfigProblem:
         """A problem at that key, with its line; the caller says where it goes."""
-        return Problem(self.file, self.line(path), dotted(path), what)
+        return ConfigProblem(self.file, self.line(path), dotted(path), what)
 
     def _report(self, path: KeyPath, what: str) -> None:
         self.faulty.add(path)
@@ -86,7 +86,7 @@ class Document:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             what = ", ".join(part for part in (error.problem, error.context) if part)
-            self.problems.append(Problem(self.file, mark.line + 1 if mark else 0, "", what))
+            self.problems.append(ConfigProblem(self.file, mark.line + 1 if mark else 0, "", what))
             self.faulty.add(())
         except (yaml.YAMLError, RecursionError) as error:
             self._report((), str(error).splitlines()[0])
@@ -123,12 +123,14 @@ class Document:
         for key_node, value_node in node.value:
             line = key_node.start_mark.line + 1
             if not isinstance(key_node, yaml.ScalarNode):
-                self.problems.append(Problem(self.file, line, dotted(path), "a key must be text"))
+                self.problems.append(
+                    ConfigProblem(self.file, line, dotted(path), "a key must be text")
+                )
                 continue
             inner = (*path, key_node.value)
             if key_node.value in values:
                 what = f"is given twice; the first is on line {self._lines[inner]}"
-                self.problems.append(Problem(self.file, line, dotted(inner), what))
+                self.problems.append(ConfigProblem(self.file, line, dotted(inner), what))
                 continue
             self._lines[inner] = line
             values[key_node.value] = self._value(loader, value_node, inner, around)

@@ -151,7 +151,7 @@ def initialise(
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
 
 
-def call_topics(bridge: config.Bridge) -> list[str]:
+def call_topics(bridge: config.BridgeSection) -> list[str]:
     """The filters, in an ACL file's words, of all that is called on what is bridged, and of nothing
     else: one's own goals are cancelled, and answers are read with the rest of the robot."""
     found: list[str] = []

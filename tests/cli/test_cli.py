@@ -74,7 +74,7 @@ def test_no_help_is_cut_off_where_there_is_no_terminal(capsys: pytest.CaptureFix
 def test_a_command_loads_only_what_it_needs() -> None:
     code = """
 import sys
-from appliance import cli
+from appliance.cli import main as cli
 try: cli.main(["--help"])
 except SystemExit: pass
 heavy = {"amqtt", "asyncio", "cryptography", "paho", "pydantic", "rclpy", "uvloop", "yaml"}
@@ -324,12 +324,14 @@ def test_the_client_takes_what_is_not_said_from_the_configuration(
     def target(**options: str | int | Path | None) -> object:
         return connection.ConnectionOptions(host="h", user="alice", **options).target()  # type: ignore[arg-type]
 
-    from appliance.cli.mqtt_client import Target
+    from appliance.cli.mqtt_client import ConnectionSettings
 
-    assert target() == Target("h", 2, here / "certs/ca.crt", "alice", "secret")
-    assert target(port=3) == Target("h", 3, None, "alice", "secret")
+    assert target() == ConnectionSettings("h", 2, here / "certs/ca.crt", "alice", "secret")
+    assert target(port=3) == ConnectionSettings("h", 3, None, "alice", "secret")
     config = here / "appliance.yaml"
-    assert target(port=3, config=config) == Target("h", 3, here / "certs/ca.crt", "alice", "secret")
+    assert target(port=3, config=config) == ConnectionSettings(
+        "h", 3, here / "certs/ca.crt", "alice", "secret"
+    )
 
 
 def test_ros_arguments_stand_behind_ros_args() -> None:

@@ -214,7 +214,7 @@ bridge:
 """
     (route,) = loads(text).bridge.topics
     assert (route.expire, route.exclusive, route.lease) == (0.5, True, 1.0)
-    assert route.on_silence == config.OnSilence(after=0.25, publish={"linear": {"x": 0}})
+    assert route.on_silence == config.OnSilenceSection(after=0.25, publish={"linear": {"x": 0}})
     assert route.clamp == {"linear.x": [-0.5, 1.0]}
     assert route.allow == {"linear.z": [0, 1.5], "linear.y": ["a", True]}
     again = config.loads(yaml.safe_dump(config.describe(loads(text))), HERE)
@@ -497,7 +497,7 @@ def test_what_is_called_can_be_named_or_described() -> None:
         ("/**/use_*", True, False),
         ("!/arm/key", False, True),
     ]
-    assert bridge.limits == config.BridgeLimits(
+    assert bridge.limits == config.BridgeLimitsSection(
         calls=9, calls_per_user=5, calls_per_client=3, payload=2 << 20, items=500
     )
 
