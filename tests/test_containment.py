@@ -285,7 +285,7 @@ class Site:
         self.is_over = True
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
-        from ros.call_house import AllTypes
+        from ros.call_harness import AllTypes
 
         self.node = FakeNode(types=AllTypes())
         rules = CommandRules(on_silence=OnSilence(0.1, disconnect=False))

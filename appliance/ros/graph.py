@@ -78,18 +78,20 @@ class Calls:
         self._post = post
         self._announce = announce
         self._routes = CallRoutes()
-        self.board = CallDispatcher(broker, entries, turns)
+        self.dispatcher = CallDispatcher(broker, entries, turns)
         self._requests = Requests(node, entries.loop, post, self._follow)
-        self._services = ServiceRoutes(self.board, self._requests, converters, node, entries, post)
+        self._services = ServiceRoutes(
+            self.dispatcher, self._requests, converters, node, entries, post
+        )
         self._actions = ActionRoutes(
-            self.board, self._requests, converters, node, entries, post, mailbox
+            self.dispatcher, self._requests, converters, node, entries, post, mailbox
         )
         self._parameters: ParameterRoutes | ServerParameters
         if node.parameter_server is not None:
-            self._parameters = ServerParameters(self.board, node, entries.loop, post, announce)
+            self._parameters = ServerParameters(self.dispatcher, node, entries.loop, post, announce)
         else:
             self._parameters = ParameterRoutes(
-                self.board, self._requests, converters, node, entries, post
+                self.dispatcher, self._requests, converters, node, entries, post
             )
 
     @property
@@ -100,7 +102,7 @@ class Calls:
     def replace(self, routes: CallRoutes) -> None:
         """Have these routes from now on; one that was there before does not notice."""
         self._routes = routes
-        self.board.limits = routes.limits
+        self.dispatcher.limits = routes.limits
         self._services.replace(routes.services)
         self._actions.replace(routes.actions)
         self._parameters.replace(routes.parameters)
@@ -121,7 +123,7 @@ class Calls:
 
     def start(self) -> None:
         """Let calls come in."""
-        self.board.start()
+        self.dispatcher.start()
         self._actions.start()
         self._parameters.start()
         self._broker.departures.append(self._actions.departed)
@@ -137,7 +139,7 @@ class Calls:
         await self._actions.stop()
         await self._parameters.stop()
         self._services.stop()
-        await self.board.stop()
+        await self.dispatcher.stop()
 
     def status(self) -> list[CallStatus]:
         """Every route's state and counters."""

@@ -9,7 +9,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("std_srvs.srv")
-from call_house import AllTypes, House, action, call_routes, parameters, service
+from call_harness import AllTypes, CallHarness, action, call_routes, parameters, service
 
 from appliance.cli import main as cli
 from appliance.ops import control
@@ -40,7 +40,7 @@ class Bus(FakeNode):
 
 @pytest.fixture
 async def house():
-    house = House(Bus(types=AllTypes()))
+    house = CallHarness(Bus(types=AllTypes()))
     yield house
     await house.stop()
 

@@ -42,12 +42,12 @@ from appliance.ros.calls.dispatcher import (
     CallDispatcher,
     CallEndpoint,
     CallError,
+    ConcurrencyLimiter,
     ErrorCode,
-    Place,
-    Places,
+    Slot,
     error_payload,
 )
-from appliance.ros.calls.fair import FairTable
+from appliance.ros.calls.fair_cache import FairCache
 from appliance.ros.calls.goals import ALL, CANCEL, STATUS
 from appliance.ros.calls.requests import Key, Requests
 from appliance.ros.calls.services import from_ros, to_request
@@ -124,14 +124,14 @@ class _Goal:
 
     id: bytes
     owner: Session
-    place: Place
+    slot: Slot
     result: asyncio.Future[tuple[str, bytes]]
     is_accepted: bool = False
     is_orphan: bool = False
 
 
 @dataclass(eq=False, slots=True)
-class _Tasks:
+class _BackgroundTasks:
     """Tasks that nobody waits for, kept until they end."""
 
     entries: Entries
@@ -153,7 +153,7 @@ class ActionRoutes:
 
     def __init__(
         self,
-        board: CallDispatcher,
+        dispatcher: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,
@@ -161,28 +161,28 @@ class ActionRoutes:
         post: Callable[..., None],
         mailbox: Mailbox,
     ) -> None:
-        self._board = board
+        self._dispatcher = dispatcher
         self._requests = requests
         self._converters = converters
         self._node = node
         self._post = post
         self._mailbox = mailbox
         self._counters: dict[ActionSettings, CallCounters] = {}
-        self._actions: dict[str, Action] = {}
+        self._actions: dict[str, BridgedAction] = {}
         #: Those whose route has gone before their goals.
-        self._past: list[Action] = []
+        self._past: list[BridgedAction] = []
         #: Actions that patterns speak of and do not take.
         self._refused: list[Skip] = []
-        self._tasks = _Tasks(entries)
+        self._tasks = _BackgroundTasks(entries)
         #: Of the goals under way.
-        self.places = Places("goals")
+        self.slots = ConcurrencyLimiter("goals")
         #: Who has sent a goal that has ended since, by its id.
-        self.ended: FairTable[bytes, str] = FairTable(ENDED)
+        self.ended: FairCache[bytes, str] = FairCache(ENDED)
 
     def start(self) -> None:
         """Nothing is known of the bus yet."""
         for route in self._counters:
-            self._board.clear(route.mqtt, "{ros}", "_status")
+            self._dispatcher.clear(route.mqtt, "{ros}", "_status")
 
     def replace(self, routes: Sequence[ActionSettings]) -> None:
         """Have these routes from now on; one that was there before does not notice."""
@@ -215,7 +215,7 @@ class ActionRoutes:
                 self._past.append(action)
         for name, route in wanted.items():
             if name not in self._actions:
-                self._actions[name] = Action(name, route, self._counters[route], self)
+                self._actions[name] = BridgedAction(name, route, self._counters[route], self)
             fixed = route.type if route.type is not None and "*" not in route.type else None
             seen = found[name][0] if name in found else self._actions[name].type
             self._actions[name].type = fixed or seen
@@ -236,7 +236,7 @@ class ActionRoutes:
 
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
-        if session in self.places:
+        if session in self.slots:
             for action in self._all():
                 action.departed(session)
 
@@ -246,7 +246,7 @@ class ActionRoutes:
             if action.ros == ros:
                 action.check_goals()
 
-    def _all(self) -> list[Action]:
+    def _all(self) -> list[BridgedAction]:
         return [*self._actions.values(), *self._past]
 
     def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
@@ -346,7 +346,7 @@ def _misfit(route: ActionSettings, type_name: str) -> tuple[Why, str] | None:
     return "other_type", f"the route takes {route.type}"
 
 
-class Action:
+class BridgedAction:
     """One action that MQTT clients may use."""
 
     def __init__(
@@ -361,15 +361,15 @@ class Action:
         self._has_forgotten = False
         self._counters = counters
         self._routes = routes
-        self._board = routes._board
+        self._dispatcher = routes._dispatcher
         self._requests = routes._requests
         self._converters = routes._converters
         self._wire = routes._node.wire
         self._goals: dict[bytes, _Goal] = {}
         #: Goals that nobody waits for any more, should their server accept them yet.
-        self._unwanted: FairTable[bytes, None] = FairTable(UNWANTED)
+        self._unwanted: FairCache[bytes, None] = FairCache(UNWANTED)
         #: Topics of results that are retained, and until when; they all have the same time.
-        self._kept: FairTable[str, float] = FairTable(RESULTS, RESULT_BYTES)
+        self._kept: FairCache[str, float] = FairCache(RESULTS, RESULT_BYTES)
         # The ROS thread's.
         self._subscriptions: list[RosSubscription] = []
         self._subscribed: str | None = None
@@ -378,7 +378,7 @@ class Action:
         self._counted = FlowCounters()
         self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
         self._status_lane = Lane(1, self._counted)
-        self._offers = [
+        self._endpoints = [
             CallEndpoint(
                 f"{self.base}/{verb}",
                 f"{ros} {verb[1:]}",
@@ -392,8 +392,8 @@ class Action:
             )
             for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
         ]
-        for offer in self._offers:
-            self._board.offer(offer)
+        for endpoint in self._endpoints:
+            self._dispatcher.register(endpoint)
         self._is_told = False
 
     def see(self, is_there: bool) -> None:
@@ -422,8 +422,8 @@ class Action:
         type_name = self.type
         if type_name is None or not self.is_there:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
-        limits = self._board.limits
-        self._routes.places.check(call.caller, limits)
+        limits = self._dispatcher.limits
+        self._routes.slots.check(call.caller, limits)
         goal_cdr = to_request(
             self._converters, f"{type_name}_Goal", call.payload, call.encoding, limits.input
         )
@@ -431,7 +431,7 @@ class Action:
 
     async def _send_goal(self, call: Call, type_name: str, goal_cdr: bytes) -> Answer:
         routes = self._routes
-        routes.places.check(call.caller, self._board.limits)
+        routes.slots.check(call.caller, self._dispatcher.limits)
         if self.route.cancel_on_disconnect and call.caller.link is None:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         id_ = secrets.token_bytes(16)
@@ -439,7 +439,7 @@ class Action:
         goal = _Goal(
             id_,
             call.caller,
-            routes.places.take(call.caller),
+            routes.slots.acquire(call.caller),
             asyncio.get_running_loop().create_future(),
         )
         self._goals[id_] = goal
@@ -473,14 +473,14 @@ class Action:
 
     def _forget(self, goal: _Goal) -> None:
         if self._goals.pop(goal.id, None) is not None:
-            self._routes.places.give_back(goal.place)
+            self._routes.slots.release(goal.slot)
             if goal.is_accepted:
-                self._routes.ended.put(goal.place.user, goal.id, _owner(goal.owner))
+                self._routes.ended.put(goal.slot.user, goal.id, _owner(goal.owner))
 
     def _give_up(self, goal: _Goal) -> None:
         """Nobody waits for its acceptance any more: should it come, it is cancelled."""
         self._forget(goal)
-        self._unwanted.put(goal.place.user, goal.id, None)
+        self._unwanted.put(goal.slot.user, goal.id, None)
 
     async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
         """Wait for the result, as long as it takes, and publish it."""
@@ -491,7 +491,7 @@ class Action:
             encoding = self.route.encoding
             read = partial(goals.result, self._converters, type_name, cdr, encoding)
             try:
-                payload = await self._board.convert(goal.owner, len(cdr), read)
+                payload = await self._dispatcher.convert(goal.owner, len(cdr), read)
             except ConversionError as problem:
                 raise CallError("ros_error", f"the result cannot be read: {problem}") from None
         except CallError as error:
@@ -538,15 +538,15 @@ class Action:
     def _publish_result(self, goal: _Goal, payload: bytes, properties: Properties) -> None:
         keep = self.route.keep_result
         topic = f"{self.base}/_result/{goal.id.hex()}"
-        until = self._board.now() + keep if keep > 0 else None
-        self._board.publish(Message(topic, payload, 1, keep > 0, properties, until))
+        until = self._dispatcher.now() + keep if keep > 0 else None
+        self._dispatcher.publish(Message(topic, payload, 1, keep > 0, properties, until))
         if until is None:
             return
-        now = self._board.now()
+        now = self._dispatcher.now()
         for old in list(takewhile(lambda item: item[1] <= now, self._kept.items())):
             self._kept.remove(old[0])  # the broker has let go of it by itself
-        for dropped, _ in self._kept.put(goal.place.user, topic, until, len(payload)):
-            self._board.publish(Message(dropped, b"", 0, True))
+        for dropped, _ in self._kept.put(goal.slot.user, topic, until, len(payload)):
+            self._dispatcher.publish(Message(dropped, b"", 0, True))
 
     @property
     def has_goals(self) -> bool:
@@ -591,7 +591,7 @@ class Action:
         right = f"{self.base}/_cancel_any"
         if self.route.cancel == "any" or self._routes.owns(caller, id_):
             return
-        if not self._board.may_publish(caller, right):
+        if not self._dispatcher.may_publish(caller, right):
             what = f"goal {id_.hex()} is" if id_ != ALL else "these goals may be"
             raise CallError(
                 "not_authorized",
@@ -652,8 +652,8 @@ class Action:
 
     def stop(self) -> None:
         """The route was removed. Goals go on, and their results are published."""
-        for offer in self._offers:
-            self._board.withdraw(offer)
+        for endpoint in self._endpoints:
+            self._dispatcher.unregister(endpoint)
         self.forget()
         try:
             self._routes._node.call_soon(self._close)
@@ -662,7 +662,7 @@ class Action:
 
     def forget(self) -> None:
         """What is shown of the bus is not so any more."""
-        self._board.publish(Message(f"{self.base}/_status", b"", 0, True))
+        self._dispatcher.publish(Message(f"{self.base}/_status", b"", 0, True))
 
     # The ROS thread
 

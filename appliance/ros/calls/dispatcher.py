@@ -13,9 +13,9 @@ a way back or because the caller may not use it, is not carried out: the error i
 `r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
 
 A call may be JSON, CBOR or ROS's own bytes, as its content type says, else as the route does; its
-answer is the same. Both are converted when it is their turn, see turns.py.
+answer is the same. Both are converted when it is their turn, see conversions.py.
 
-How many are under way is bounded for each client, each user and all together. Cancelling has places
+How many are under way is bounded for each client, each user and all together. Cancelling has slots
 of its own, which nothing else takes and no other user: who has sent a goal can always stop it.
 Everything here is for the event loop's thread.
 """
@@ -132,22 +132,22 @@ class CallLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A place that is taken: by this client, of this user."""
+class Slot:
+    """A slot that is taken: by this client, of this user."""
 
     client: Session
     user: str | None
 
 
-class Places:
+class ConcurrencyLimiter:
     """Places for what is under way: `what` says what that is, in the plural.
 
-    Where a place is `sure`, what other users have never keeps it from anybody.
+    Where a slot is `sure`, what other users have never keeps it from anybody.
     """
 
-    def __init__(self, what: str, *, sure: bool = False) -> None:
+    def __init__(self, what: str, *, ignore_total: bool = False) -> None:
         self._what = what
-        self._is_sure = sure
+        self._ignores_total = ignore_total
         self._clients: Counter[Session] = Counter()
         self._users: Counter[str | None] = Counter()
         self._total = 0
@@ -156,14 +156,14 @@ class Places:
         return client in self._clients
 
     def check(self, client: Session, limits: CallLimits) -> None:
-        """Raises CallError when there is no place left for the client."""
+        """Raises CallError when there is no slot left for the client."""
         if self._clients[client] >= limits.client:
             raise self._full(limits.client, "this client", "calls_per_client")
         user = user_of(client)
         if self._users[user] >= limits.share:
             whose = "the clients without a user" if user is None else f"the user {quote(user)}"
             raise self._full(limits.share, whose, "calls_per_user")
-        if self._total >= limits.total and not self._is_sure:
+        if self._total >= limits.total and not self._ignores_total:
             raise self._full(limits.total, "all clients", "calls")
 
     def _full(self, count: int, whose: str, key: str) -> CallError:
@@ -173,19 +173,19 @@ class Places:
             f"(bridge.limits.{key})",
         )
 
-    def take(self, client: Session) -> Place:
-        """Take a place, which `check` has found."""
-        place = Place(client, user_of(client))
+    def acquire(self, client: Session) -> Slot:
+        """Take a slot, which `check` has found."""
+        slot = Slot(client, user_of(client))
         self._total += 1
-        self._clients[place.client] += 1
-        self._users[place.user] += 1
-        return place
+        self._clients[slot.client] += 1
+        self._users[slot.user] += 1
+        return slot
 
-    def give_back(self, place: Place) -> None:
+    def release(self, slot: Slot) -> None:
         """It is free again."""
         self._total -= 1
-        _take_off(self._clients, place.client, 1)
-        _take_off(self._users, place.user, 1)
+        _take_off(self._clients, slot.client, 1)
+        _take_off(self._users, slot.user, 1)
 
 
 @dataclass(eq=False, slots=True)
@@ -215,13 +215,13 @@ class Call:
     encoding: CallEncoding
     doubt: str = ""
     is_late: bool = False
-    place: Place | None = None
+    slot: Slot | None = None
     timer: asyncio.TimerHandle | None = None
     task: asyncio.Task[None] | None = None
 
 
 #: Takes in what a call asks for, at once, and gives what finds the answer. Both raise CallError.
-Handle: TypeAlias = Callable[[Call], Callable[[], Awaitable[Answer]]]
+Handler: TypeAlias = Callable[[Call], Callable[[], Awaitable[Answer]]]
 
 
 @dataclass(eq=False, slots=True)
@@ -230,21 +230,21 @@ class CallEndpoint:
 
     `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
     `encodings` are those that it takes, with `largest` bytes at most if that is said. What cancels
-    (`is_cancel`) has places of its own.
+    (`is_cancel`) has slots of its own.
     """
 
     topic: str
     name: str
     timeout: float
     counters: CallCounters
-    handle: Handle
+    handle: Handler
     encoding: CallEncoding = "json"
     encodings: tuple[CallEncoding, ...] = WITHOUT_RAW
     largest: int | None = None
     is_cancel: bool = False
 
 
-Receive: TypeAlias = Callable[[Session, Message], None]
+MessageHandler: TypeAlias = Callable[[Session, Message], None]
 
 
 class Ear(InsideLink):
@@ -271,22 +271,22 @@ class Ear(InsideLink):
 class CallDispatcher:
     """Takes calls from MQTT, has them handled, and answers each of them once."""
 
-    def __init__(self, broker: Broker, entries: Entries, turns: ConversionQueue) -> None:
+    def __init__(self, broker: Broker, entries: Entries, conversions: ConversionQueue) -> None:
         self.limits = CallLimits()
-        self.turns = turns
-        self._backlog = ReplayGuard()
+        self.conversions = conversions
+        self._replay_guard = ReplayGuard()
         self._broker = broker
         self._entries = entries
         self._loop = entries.loop
         self._session: Session | None = None
         #: Who gets what comes, by the identifier of the subscription it came through.
-        self._receivers: dict[int, Receive] = {}
+        self._receivers: dict[int, MessageHandler] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
         #: By topic, the first of those that were offered there; the others wait for it to go.
-        self._offers: dict[str, list[CallEndpoint]] = {}
-        self._places = Places("calls")
-        self._cancel_places = Places("calls that cancel goals", sure=True)
+        self._endpoints: dict[str, list[CallEndpoint]] = {}
+        self._slots = ConcurrencyLimiter("calls")
+        self._cancel_slots = ConcurrencyLimiter("calls that cancel goals", ignore_total=True)
         self._calls: dict[Call, CallEndpoint] = {}
         self._bytes: Counter[str | None] = Counter()
         self._report_at: dict[str, float] = {}
@@ -296,14 +296,14 @@ class CallDispatcher:
         self._session = self._broker.attach(
             CLIENT_ID, Ear(self, None), lambda origin: Ear(self, origin)
         )
-        self._broker.departures.append(self._backlog.departed)
+        self._broker.departures.append(self._replay_guard.departed)
         for topic_filter in self._identifiers:
             self._subscribe(topic_filter)
 
     async def stop(self) -> None:
         """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
-        for topic in list(self._offers):
-            del self._offers[topic]
+        for topic in list(self._endpoints):
+            del self._endpoints[topic]
             self._ignore_calls(topic)
         for call in list(self._calls):
             if call.task is None:  # it waits for its turn
@@ -315,12 +315,12 @@ class CallDispatcher:
         await asyncio.sleep(0)  # the answers go out
         session, self._session = self._session, None
         if session is not None:
-            self._broker.departures.remove(self._backlog.departed)
+            self._broker.departures.remove(self._replay_guard.departed)
             self._broker.detach(session)
 
     # Topics
 
-    def listen(self, topic_filter: str, receive: Receive) -> None:
+    def listen(self, topic_filter: str, receive: MessageHandler) -> None:
         """Hand what clients publish there to `receive`, with the session that published it."""
         self._last_identifier += 1
         self._identifiers[topic_filter] = self._last_identifier
@@ -343,36 +343,39 @@ class CallDispatcher:
         if self._session is not None:
             self._broker.unsubscribe(self._session, topic_filter)
 
-    def offer(self, offer: CallEndpoint) -> None:
-        """Let `offer.topic`, which may have a `+` in it, be called."""
-        offers = self._offers.setdefault(offer.topic, [])
-        offers.append(offer)
-        if len(offers) == 1:
-            self._listen_for(offer)
+    def register(self, endpoint: CallEndpoint) -> None:
+        """Let `endpoint.topic`, which may have a `+` in it, be called."""
+        endpoints = self._endpoints.setdefault(endpoint.topic, [])
+        endpoints.append(endpoint)
+        if len(endpoints) == 1:
+            self._listen_for(endpoint)
         else:
             text = "%s cannot be called: calls at %s are for %s"
-            log.warning(text, offer.name, offer.topic, offers[0].name)
+            log.warning(text, endpoint.name, endpoint.topic, endpoints[0].name)
 
-    def _listen_for(self, offer: CallEndpoint) -> None:
-        self.listen(offer.topic, lambda caller, message: self._take(offer, caller, message, False))
+    def _listen_for(self, endpoint: CallEndpoint) -> None:
         self.listen(
-            f"{offer.topic}/+", lambda caller, message: self._take(offer, caller, message, True)
+            endpoint.topic, lambda caller, message: self._take(endpoint, caller, message, False)
+        )
+        self.listen(
+            f"{endpoint.topic}/+",
+            lambda caller, message: self._take(endpoint, caller, message, True),
         )
 
-    def withdraw(self, offer: CallEndpoint) -> None:
+    def unregister(self, endpoint: CallEndpoint) -> None:
         """Offer it no longer; calls under way have their answers yet."""
-        offers = self._offers.get(offer.topic, [])
-        if offer not in offers:
+        endpoints = self._endpoints.get(endpoint.topic, [])
+        if endpoint not in endpoints:
             return  # `stop` has withdrawn all
-        was_first = offers[0] is offer
-        offers.remove(offer)
-        if not offers:
-            del self._offers[offer.topic]
-            self._report_at.pop(offer.topic, None)
+        was_first = endpoints[0] is endpoint
+        endpoints.remove(endpoint)
+        if not endpoints:
+            del self._endpoints[endpoint.topic]
+            self._report_at.pop(endpoint.topic, None)
         if was_first:
-            self._ignore_calls(offer.topic)
-            if offers:
-                self._listen_for(offers[0])
+            self._ignore_calls(endpoint.topic)
+            if endpoints:
+                self._listen_for(endpoints[0])
 
     def _ignore_calls(self, topic: str) -> None:
         self.ignore(topic)
@@ -420,55 +423,55 @@ class CallDispatcher:
     # Calls
 
     def _take(
-        self, offer: CallEndpoint, caller: Session, message: Message, has_token: bool
+        self, endpoint: CallEndpoint, caller: Session, message: Message, has_token: bool
     ) -> None:
-        offer.counters.calls += 1
+        endpoint.counters.calls += 1
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
         said = (message.properties or {}).get(Property.CONTENT_TYPE)
         named = named_encoding(said)
-        encoding = named or offer.encoding
+        encoding = named or endpoint.encoding
         try:
             reply = self._way_back(caller, message, own, token)
         except CallError as error:
             fallback = Message(own, b"", 1) if _is_own_topic(caller, own) else None
-            self._fail(offer, caller, fallback, encoding, error)
+            self._fail(endpoint, caller, fallback, encoding, error)
             return
         call = Call(caller, message.payload, topic, reply, encoding)
         if isinstance(said, str) and named is None:
             call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
         try:
-            self._admit(offer, call, message)
+            self._admit(endpoint, call, message)
         except CallError as error:
-            self._fail(offer, caller, reply, encoding, error)
+            self._fail(endpoint, caller, reply, encoding, error)
             return
-        self._enter(offer, call)
-        self.turns.do(caller, len(call.payload), partial(self._begin, offer, call))
+        self._enter(endpoint, call)
+        self.conversions.do(caller, len(call.payload), partial(self._begin, endpoint, call))
 
-    def _enter(self, offer: CallEndpoint, call: Call) -> None:
-        places = self._cancel_places if offer.is_cancel else self._places
-        call.place = places.take(call.caller)
-        offer.counters.under_way += 1
-        self._calls[call] = offer
-        self._bytes[call.place.user] += len(call.payload)
+    def _enter(self, endpoint: CallEndpoint, call: Call) -> None:
+        slots = self._cancel_slots if endpoint.is_cancel else self._slots
+        call.slot = slots.acquire(call.caller)
+        endpoint.counters.under_way += 1
+        self._calls[call] = endpoint
+        self._bytes[call.slot.user] += len(call.payload)
         call.timer = self._entries.later(
-            "calls.timeout", offer.timeout, self._expire, call, served=offer.name
+            "calls.timeout", endpoint.timeout, self._expire, call, served=endpoint.name
         )
 
-    def _begin(self, offer: CallEndpoint, call: Call) -> None:
+    def _begin(self, endpoint: CallEndpoint, call: Call) -> None:
         """It is the call's turn to be converted."""
         if call not in self._calls:  # it was given up
             return
         try:
-            find = offer.handle(call)
+            find = endpoint.handle(call)
         except CallError as error:
             self._end(call, error)
         except Exception as problem:  # a fault in here must not leave the caller without an answer
-            self._entries.faults.caught("calls.take", problem, offer.name)
+            self._entries.faults.caught("calls.take", problem, endpoint.name)
             self._end(call, CallError("ros_error", repr(problem)))
         else:
             call.task = self._entries.task(
-                "calls.call", self._run(offer, call, find), served=offer.name
+                "calls.call", self._run(endpoint, call, find), served=endpoint.name
             )
             self._entries.when_done("calls.end", call.task, self._leave, call)
 
@@ -484,7 +487,7 @@ class CallDispatcher:
             except Exception as error:
                 done.set_exception(error)
 
-        self.turns.do(caller, size, settle)
+        self.conversions.do(caller, size, settle)
         return await done
 
     def _way_back(self, caller: Session, message: Message, own: str, token: str) -> Message:
@@ -530,31 +533,31 @@ class CallDispatcher:
                 f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
             )
 
-    def _admit(self, offer: CallEndpoint, call: Call, message: Message) -> None:
+    def _admit(self, endpoint: CallEndpoint, call: Call, message: Message) -> None:
         """Raises CallError for a call that is not even looked at."""
         caller = call.caller
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
-        self._check_age(offer, caller, message)
+        self._check_age(endpoint, caller, message)
         size = len(call.payload)
         try:
             self.limits.input.check_size(size, call.encoding)
         except TooLargeError as error:
             raise CallError("too_large", str(error)) from None
-        if offer.largest is not None and size > offer.largest:
-            text = f"it has {size} bytes, {offer.name} takes {offer.largest} at most"
+        if endpoint.largest is not None and size > endpoint.largest:
+            text = f"it has {size} bytes, {endpoint.name} takes {endpoint.largest} at most"
             raise CallError("too_large", text)
-        if offer.is_cancel:
-            self._cancel_places.check(caller, self.limits)
+        if endpoint.is_cancel:
+            self._cancel_slots.check(caller, self.limits)
         else:
-            self._places.check(caller, self.limits)
+            self._slots.check(caller, self.limits)
             self._check_bytes(caller, size)
-        if call.encoding not in offer.encodings:
-            either = " or ".join(offer.encodings)
-            text = f"a call of {offer.name} may be {either}, not {call.encoding}"
+        if call.encoding not in endpoint.encodings:
+            either = " or ".join(endpoint.encodings)
+            text = f"a call of {endpoint.name} may be {either}, not {call.encoding}"
             raise CallError("bad_request", text)
 
-    def _check_age(self, offer: CallEndpoint, caller: Session, message: Message) -> None:
+    def _check_age(self, endpoint: CallEndpoint, caller: Session, message: Message) -> None:
         """Nobody waits for the answer of an old call any more, and what it would do nobody expects.
 
         To cancel is how an action is stopped: that is done whatever it says of its age, and only
@@ -564,14 +567,14 @@ class CallDispatcher:
         try:
             age = said_age(message.properties, time.time())
         except ValueError as error:
-            if not offer.is_cancel:
+            if not endpoint.is_cancel:
                 raise CallError("bad_request", str(error)) from None
             age = 0.0
         if age is None:
             # Asked also where it does not matter: what comes behind an old one is as old.
-            is_old = self._backlog.has(message, caller, offer.timeout, self._loop.time())
-            is_over |= is_old and not offer.is_cancel
-        elif age > offer.timeout and not offer.is_cancel:
+            is_old = self._replay_guard.has(message, caller, endpoint.timeout, self._loop.time())
+            is_over |= is_old and not endpoint.is_cancel
+        elif age > endpoint.timeout and not endpoint.is_cancel:
             raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")
         if is_over:
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
@@ -584,19 +587,19 @@ class CallDispatcher:
             raise CallError("too_many", f"{total} bytes of calls of all clients are under way")
 
     async def _run(
-        self, offer: CallEndpoint, call: Call, find: Callable[[], Awaitable[Answer]]
+        self, endpoint: CallEndpoint, call: Call, find: Callable[[], Awaitable[Answer]]
     ) -> None:
         try:
             answer = await find()
         except CallError as error:
-            self._tell(offer, call, error)
+            self._tell(endpoint, call, error)
         except asyncio.CancelledError:
-            self._tell(offer, call, _too_late(offer) if call.is_late else _stopping())
+            self._tell(endpoint, call, _too_late(endpoint) if call.is_late else _stopping())
         except Exception as problem:  # a fault in here must not leave the caller without an answer
-            self._entries.faults.caught("calls.handle", problem, offer.name)
-            self._tell(offer, call, CallError("ros_error", repr(problem)))
+            self._entries.faults.caught("calls.handle", problem, endpoint.name)
+            self._tell(endpoint, call, CallError("ros_error", repr(problem)))
         else:
-            offer.counters.answers += 1
+            endpoint.counters.answers += 1
             about = [("status", "ok")]
             if answer.type is not None:
                 about.append(("ros-type", answer.type))
@@ -616,38 +619,38 @@ class CallDispatcher:
         self._leave(call)
 
     def _leave(self, call: Call) -> None:
-        offer = self._calls.pop(call)
+        endpoint = self._calls.pop(call)
         if call.timer is not None:
             call.timer.cancel()
-        offer.counters.under_way -= 1
-        assert call.place is not None
-        _take_off(self._bytes, call.place.user, len(call.payload))
-        (self._cancel_places if offer.is_cancel else self._places).give_back(call.place)
+        endpoint.counters.under_way -= 1
+        assert call.slot is not None
+        _take_off(self._bytes, call.slot.user, len(call.payload))
+        (self._cancel_slots if endpoint.is_cancel else self._slots).release(call.slot)
         if call.task is not None and call.task.cancelled():  # before it had begun
-            self._tell(offer, call, _too_late(offer) if call.is_late else _stopping())
+            self._tell(endpoint, call, _too_late(endpoint) if call.is_late else _stopping())
 
-    def _tell(self, offer: CallEndpoint, call: Call, error: CallError) -> None:
+    def _tell(self, endpoint: CallEndpoint, call: Call, error: CallError) -> None:
         if error.code == "bad_request" and call.doubt:
             error = CallError(error.code, f"{error}{call.doubt}")
-        self._fail(offer, call.caller, call.reply, call.encoding, error)
+        self._fail(endpoint, call.caller, call.reply, call.encoding, error)
 
     def _fail(
         self,
-        offer: CallEndpoint,
+        endpoint: CallEndpoint,
         caller: Session,
         reply: Message | None,
         encoding: CallEncoding,
         error: CallError,
     ) -> None:
-        counters = offer.counters
+        counters = endpoint.counters
         counters.errors[error.code] += 1
         counters.last_error = f"{error.code}: {error}"
         now = self._loop.time()
-        if now >= self._report_at.get(offer.topic, 0.0):
-            self._report_at[offer.topic] = now + REPORT_INTERVAL
+        if now >= self._report_at.get(endpoint.topic, 0.0):
+            self._report_at[endpoint.topic] = now + REPORT_INTERVAL
             count = sum(counters.errors.values())
             text = "a call of %s by %s failed (%d so far): %s: %s"
-            log.warning(text, offer.name, caller, count, error.code, error)
+            log.warning(text, endpoint.name, caller, count, error.code, error)
         if reply is not None:
             # In a turn of its own: the caller's chunk is still being worked on.
             about = [("status", "error")]
@@ -691,8 +694,8 @@ def _take_off(counter: Counter[K], key: K, count: int) -> None:
         del counter[key]
 
 
-def _too_late(offer: CallEndpoint) -> CallError:
-    return CallError("timeout", f"no answer from {offer.name} within {offer.timeout:g} s")
+def _too_late(endpoint: CallEndpoint) -> CallError:
+    return CallError("timeout", f"no answer from {endpoint.name} within {endpoint.timeout:g} s")
 
 
 def _stopping() -> CallError:

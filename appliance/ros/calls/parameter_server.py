@@ -21,7 +21,7 @@ from typing import Any
 import pybase64
 
 from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
-from appliance.ros.calls.parameter_topics import Holder, ParameterTopics, shorten, to_bytes
+from appliance.ros.calls.parameter_topics import ParameterGroup, ParameterTopics, shorten, to_bytes
 from appliance.ros.node import BusError, ParameterServer, RosNode
 from appliance.ros.patterns import is_plain
 from appliance.ros.payload.payloads import dumps
@@ -38,7 +38,7 @@ DEEPEST = 16
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
-class ServerParameters(ParameterTopics[Holder]):
+class ServerParameters(ParameterTopics[ParameterGroup]):
     """The routes of parameters; for the loop's thread, where it does not say otherwise.
 
     What stands for a node is a namespace: parameters that are beside each other.
@@ -46,14 +46,14 @@ class ServerParameters(ParameterTopics[Holder]):
 
     def __init__(
         self,
-        board: CallDispatcher,
+        dispatcher: CallDispatcher,
         node: RosNode,
         loop: asyncio.AbstractEventLoop,
         post: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
         """`changed` is called when what `bridged` gives has changed."""
-        super().__init__(board)
+        super().__init__(dispatcher)
         self._node = node
         self._loop = loop
         self._post = post
@@ -84,15 +84,15 @@ class ServerParameters(ParameterTopics[Holder]):
         for full_name, value in values.items():
             space, _, name = full_name.rpartition("/")
             found.setdefault(space, {})[name] = value
-        for shown in list(self._holders.values()):
+        for shown in list(self._groups.values()):
             if shown.name not in found:
                 self._leave(shown)
                 has_changed = True
         for name, own in found.items():
-            namespace = self._holders.get(name) or self._find(name, Holder)
+            namespace = self._groups.get(name) or self._find(name, ParameterGroup)
             if namespace is None:  # the routes have changed meanwhile
                 continue
-            if name not in self._holders:
+            if name not in self._groups:
                 self._join(namespace)
                 log.info("the parameters of %s are at %s", name or "/", namespace.base)
                 has_changed = True
@@ -111,7 +111,7 @@ class ServerParameters(ParameterTopics[Holder]):
             self._is_blind, self._problem = False, problem
             self._changed()
 
-    def _show(self, namespace: Holder, name: str, value: Any) -> None:
+    def _show(self, namespace: ParameterGroup, name: str, value: Any) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
         encoding = namespace.route.encoding
         try:
@@ -125,8 +125,10 @@ class ServerParameters(ParameterTopics[Holder]):
             return
         self._publish(namespace, name, payload)
 
-    async def _set(self, holder: Holder, values: dict[str, Any], call: Call, at_once: bool) -> str:
-        full_names = {f"{holder.name}/{name}": value for name, value in values.items()}
+    async def _set(
+        self, group: ParameterGroup, values: dict[str, Any], call: Call, at_once: bool
+    ) -> str:
+        full_names = {f"{group.name}/{name}": value for name, value in values.items()}
         for full_name, value in full_names.items():
             if isinstance(value, dict) or not _is_value(value):
                 text = f"{full_name}: no parameter can have the value {shorten(value)}"
@@ -190,7 +192,7 @@ class ServerParameters(ParameterTopics[Holder]):
             while space:
                 space = space.rpartition("/")[0]
                 names.setdefault(space, [])
-        spaces = {space: self._find(space, Holder) for space in names}
+        spaces = {space: self._find(space, ParameterGroup) for space in names}
         wanted = [
             f"{space}/{name}"
             for space, found in names.items()

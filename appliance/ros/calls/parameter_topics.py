@@ -63,7 +63,7 @@ class ParameterSettings:
 
 
 @dataclass(eq=False, slots=True)
-class Holder:
+class ParameterGroup:
     """A node whose parameters are shown, or what stands for one: by name, what is retained."""
 
     name: str
@@ -71,32 +71,32 @@ class Holder:
     route: ParameterSettings
     wanted: list[Names]
     shown: dict[str, bytes] = field(default_factory=dict)
-    offers: list[CallEndpoint] = field(default_factory=list)
+    endpoints: list[CallEndpoint] = field(default_factory=list)
 
     def wants(self, parameter: str) -> bool:
         """Whether it is shown, and may be set."""
         return any(parameter in names for names in self.wanted)
 
 
-HolderT = TypeVar("HolderT", bound=Holder)
+GroupT = TypeVar("GroupT", bound=ParameterGroup)
 
 
-class ParameterTopics(ABC, Generic[HolderT]):
+class ParameterTopics(ABC, Generic[GroupT]):
     """The routes of parameters, and what they show now; for the loop's thread."""
 
     #: The type of a value on the bus, for who asks what is bridged.
     type_name = ""
 
-    def __init__(self, board: CallDispatcher) -> None:
-        self._board = board
+    def __init__(self, dispatcher: CallDispatcher) -> None:
+        self._dispatcher = dispatcher
         self._counters: dict[ParameterSettings, CallCounters] = {}
         self._routes: Sequence[ParameterSettings] = ()
-        self._holders: dict[str, HolderT] = {}
+        self._groups: dict[str, GroupT] = {}
 
     def start(self) -> None:
         """Nothing is known of the bus yet."""
         for route in self._counters:
-            self._board.clear(route.mqtt, "{node}", ".+")
+            self._dispatcher.clear(route.mqtt, "{node}", ".+")
 
     def replace(self, routes: Sequence[ParameterSettings]) -> None:
         """Have these routes from now on."""
@@ -112,13 +112,13 @@ class ParameterTopics(ABC, Generic[HolderT]):
         """Show what the routes want; nothing is shown now."""
 
     @abstractmethod
-    async def _set(self, holder: HolderT, values: dict[str, Any], call: Call, at_once: bool) -> str:
+    async def _set(self, group: GroupT, values: dict[str, Any], call: Call, at_once: bool) -> str:
         """Set parameters, all or none if `at_once`; returns what the bus says of it.
 
         Those that the routes do not want have been refused. Raises CallError.
         """
 
-    def _find(self, name: str, kind: type[HolderT]) -> HolderT | None:
+    def _find(self, name: str, kind: type[GroupT]) -> GroupT | None:
         """The node of that name as the routes want it; None when they do not."""
         wanted = {route: names for route in self._counters if (names := route.of(name))}
         if not wanted:
@@ -126,71 +126,71 @@ class ParameterTopics(ABC, Generic[HolderT]):
         route = next(iter(wanted))
         return kind(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
 
-    def _join(self, holder: HolderT) -> None:
+    def _join(self, group: GroupT) -> None:
         """Take calls for it from now on."""
-        self._holders[holder.name] = holder
+        self._groups[group.name] = group
 
         def set_one(call: Call) -> Callable[[], Awaitable[Answer]]:
-            values = {call.topic.split("/")[-2]: value_of(call, self._board.limits.input)}
-            return partial(self._check_and_set, holder, values, call, at_once=False)
+            values = {call.topic.split("/")[-2]: value_of(call, self._dispatcher.limits.input)}
+            return partial(self._check_and_set, group, values, call, at_once=False)
 
         def set_all(call: Call) -> Callable[[], Awaitable[Answer]]:
-            values = values_of(call, self._board.limits.input)
-            return partial(self._check_and_set, holder, values, call, at_once=True)
+            values = values_of(call, self._dispatcher.limits.input)
+            return partial(self._check_and_set, group, values, call, at_once=True)
 
-        route = holder.route
+        route = group.route
         for topic, handle in (("+/set", set_one), ("_set", set_all)):
-            offer = CallEndpoint(
-                f"{holder.base}/{topic}",
-                f"the parameters of {holder.name or '/'}",
+            endpoint = CallEndpoint(
+                f"{group.base}/{topic}",
+                f"the parameters of {group.name or '/'}",
                 route.timeout,
                 self._counters[route],
                 handle,
                 route.encoding,
                 largest=LARGEST_LENIENT,
             )
-            holder.offers.append(offer)
-            self._board.offer(offer)
+            group.endpoints.append(endpoint)
+            self._dispatcher.register(endpoint)
 
-    def _leave(self, holder: HolderT) -> None:
+    def _leave(self, group: GroupT) -> None:
         """It is gone, and its values are true no more."""
-        del self._holders[holder.name]
-        for offer in holder.offers:
-            self._board.withdraw(offer)
-        for parameter in list(holder.shown):
-            self._publish(holder, parameter, b"")
+        del self._groups[group.name]
+        for endpoint in group.endpoints:
+            self._dispatcher.unregister(endpoint)
+        for parameter in list(group.shown):
+            self._publish(group, parameter, b"")
 
     def _leave_all(self) -> None:
-        for holder in list(self._holders.values()):
-            self._leave(holder)
+        for group in list(self._groups.values()):
+            self._leave(group)
 
-    def _publish(self, holder: HolderT, name: str, payload: bytes) -> None:
+    def _publish(self, group: GroupT, name: str, payload: bytes) -> None:
         """Show a parameter as it is now; without a payload it is no more."""
-        topic = f"{holder.base}/{name}"
-        if payload == holder.shown.get(name, b"") or not _is_topic(name, topic):
+        topic = f"{group.base}/{name}"
+        if payload == group.shown.get(name, b"") or not _is_topic(name, topic):
             return
         if payload:
-            holder.shown[name] = payload
+            group.shown[name] = payload
         else:
-            del holder.shown[name]
-        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[holder.route.encoding]}
-        self._board.publish(Message(topic, payload, 1, True, properties))
+            del group.shown[name]
+        properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[group.route.encoding]}
+        self._dispatcher.publish(Message(topic, payload, 1, True, properties))
 
     async def _check_and_set(
-        self, holder: HolderT, values: dict[str, Any], call: Call, *, at_once: bool
+        self, group: GroupT, values: dict[str, Any], call: Call, *, at_once: bool
     ) -> Answer:
         for name in values:
-            if not holder.wants(name):
-                text = f"the parameter {holder.name}/{name} is not among bridge.parameters"
+            if not group.wants(name):
+                text = f"the parameter {group.name}/{name} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
-        reason = await self._set(holder, values, call, at_once)
+        reason = await self._set(group, values, call, at_once)
         said = {"successful": True, "reason": reason}
         return Answer(dumps(said, call.encoding), call.encoding)
 
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the nodes that it shows now."""
         return [
-            (route, counters, [name for name in self._holders if route.of(name)])
+            (route, counters, [name for name in self._groups if route.of(name)])
             for route, counters in self._counters.items()
         ]
 
@@ -198,13 +198,13 @@ class ParameterTopics(ABC, Generic[HolderT]):
         """Entries for `{robot}/_appliance/routes`."""
         return [
             {
-                "ros": holder.name or "/",
-                "mqtt": holder.base,
+                "ros": group.name or "/",
+                "mqtt": group.base,
                 "type": self.type_name,
                 "direction": "parameters",
-                "encoding": holder.route.encoding,
+                "encoding": group.route.encoding,
             }
-            for holder in self._holders.values()
+            for group in self._groups.values()
         ]
 
 

@@ -20,7 +20,13 @@ import pybase64
 
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
-from appliance.ros.calls.parameter_topics import Holder, ParameterTopics, shorten, to_bytes, unlike
+from appliance.ros.calls.parameter_topics import (
+    ParameterGroup,
+    ParameterTopics,
+    shorten,
+    to_bytes,
+    unlike,
+)
 from appliance.ros.calls.requests import Requests
 from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import is_plain
@@ -65,7 +71,7 @@ _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 
 @dataclass(eq=False, slots=True)
-class _Node(Holder):
+class _NodeParameters(ParameterGroup):
     """A node, and how its values are read."""
 
     is_loading: bool = False
@@ -75,21 +81,21 @@ class _Node(Holder):
     problem: str | None = None
 
 
-class ParameterRoutes(ParameterTopics[_Node]):
+class ParameterRoutes(ParameterTopics[_NodeParameters]):
     """The routes of parameters; for the loop's thread, where it does not say otherwise."""
 
     type_name = "rcl_interfaces/msg/ParameterValue"
 
     def __init__(
         self,
-        board: CallDispatcher,
+        dispatcher: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,
         entries: Entries,
         post: Callable[..., None],
     ) -> None:
-        super().__init__(board)
+        super().__init__(dispatcher)
         self._requests = requests
         self._converters = converters
         self._node = node
@@ -116,22 +122,22 @@ class ParameterRoutes(ParameterTopics[_Node]):
             for service, types in self._requests.services.items()
             if service.endswith(GET) and "rcl_interfaces/srv/GetParameters" in types
         }
-        for node in list(self._holders.values()):
+        for node in list(self._groups.values()):
             if node.name not in there:
                 self._leave(node)
-        for name in sorted(there - self._holders.keys() - {self._node.name}):
-            found = self._find(name, _Node)
+        for name in sorted(there - self._groups.keys() - {self._node.name}):
+            found = self._find(name, _NodeParameters)
             if found is not None:
                 self._join(found)
                 self._load(found)
 
     def _came_anew(self, names: Iterable[str]) -> None:
         for name in names:
-            node = self._holders.get(name)
+            node = self._groups.get(name)
             if node is not None:
                 self._load(node)
 
-    def _leave(self, node: _Node) -> None:
+    def _leave(self, node: _NodeParameters) -> None:
         node.is_gone = True
         super()._leave(node)
 
@@ -141,13 +147,13 @@ class ParameterRoutes(ParameterTopics[_Node]):
             return []
         skips = [
             Skip(node.name, "parameters", "", "problem", node.problem)
-            for node in self._holders.values()
+            for node in self._groups.values()
             if node.problem is not None
         ]
         named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
         return skips + [
             Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
-            for node in sorted(named - self._holders.keys())
+            for node in sorted(named - self._groups.keys())
             if is_plain(node)
         ]
 
@@ -161,7 +167,9 @@ class ParameterRoutes(ParameterTopics[_Node]):
 
     # Values
 
-    async def _ask(self, node: _Node, verb: str, kind: str, fields: object) -> dict[str, Any]:
+    async def _ask(
+        self, node: _NodeParameters, verb: str, kind: str, fields: object
+    ) -> dict[str, Any]:
         return await self._ask_for(node, verb, kind, self._write(kind, fields))
 
     def _write(self, kind: str, fields: object) -> bytes:
@@ -170,7 +178,9 @@ class ParameterRoutes(ParameterTopics[_Node]):
         except UnknownTypeError as error:
             raise CallError("unknown_type", str(error)) from None
 
-    async def _ask_for(self, node: _Node, verb: str, kind: str, request: bytes) -> dict[str, Any]:
+    async def _ask_for(
+        self, node: _NodeParameters, verb: str, kind: str, request: bytes
+    ) -> dict[str, Any]:
         type_name = f"rcl_interfaces/srv/{kind}"
         response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
         try:
@@ -178,7 +188,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
         except UnknownTypeError as error:
             raise CallError("unknown_type", str(error)) from None
 
-    def _load(self, node: _Node) -> None:
+    def _load(self, node: _NodeParameters) -> None:
         """Read a node's parameters, in the background, until nothing has changed meanwhile."""
         node.is_stale = True
         if not node.is_loading and not self._is_stopped:
@@ -190,13 +200,13 @@ class ParameterRoutes(ParameterTopics[_Node]):
         self._tasks.add(task)
         self._entries.when_done("parameters.end", task, self._tasks.discard, task)
 
-    async def _read(self, node: _Node) -> None:
+    async def _read(self, node: _NodeParameters) -> None:
         try:
             await self._read_all(node)
         finally:
             node.is_loading = False
 
-    async def _read_all(self, node: _Node) -> None:
+    async def _read_all(self, node: _NodeParameters) -> None:
         has_failed = False
         while node.is_stale and not node.is_gone:
             node.is_stale = False
@@ -220,7 +230,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
                     self._show(node, name, value)
                 log.info("%d parameters of %s are at %s", len(values), node.name, node.base)
 
-    async def _get_all(self, node: _Node) -> dict[str, Any]:
+    async def _get_all(self, node: _NodeParameters) -> dict[str, Any]:
         listed = await self._ask(node, "list_parameters", "ListParameters", {"depth": 0})
         names = [name for name in listed["result"]["names"] if node.wants(name)]
         values: dict[str, Any] = {}
@@ -235,12 +245,12 @@ class ParameterRoutes(ParameterTopics[_Node]):
             values.update(zip(chunk, got, strict=True))
         return values
 
-    async def _get(self, node: _Node, names: list[str]) -> list[Any]:
+    async def _get(self, node: _NodeParameters, names: list[str]) -> list[Any]:
         said = await self._ask(node, "get_parameters", "GetParameters", {"names": names})
         values: list[Any] = said["values"]
         return values
 
-    def _show(self, node: _Node, name: str, value: Mapping[str, Any] | None) -> None:
+    def _show(self, node: _NodeParameters, name: str, value: Mapping[str, Any] | None) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
         if node.wants(name):
             payload = b"" if value is None else _to_payload(value, node.route.encoding)
@@ -254,7 +264,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
         events = self._events
         if len(events) >= WAITING_EVENTS:
             events.clear()
-            for node in self._holders.values():
+            for node in self._groups.values():
                 self._load(node)
             return
         while events:
@@ -263,7 +273,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
             except (ConversionError, UnknownTypeError) as error:
                 log.warning("%s: a message cannot be read: %s", EVENTS, error)
                 continue
-            known = self._holders.get(said["node"])
+            known = self._groups.get(said["node"])
             if known is None:
                 continue
             if known.is_loading:
@@ -276,7 +286,9 @@ class ParameterRoutes(ParameterTopics[_Node]):
 
     # Setting
 
-    async def _set(self, node: _Node, values: dict[str, Any], call: Call, at_once: bool) -> str:
+    async def _set(
+        self, node: _NodeParameters, values: dict[str, Any], call: Call, at_once: bool
+    ) -> str:
         names = list(values)
         said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
         descriptors = {one["name"]: one for one in said["descriptors"]}
@@ -292,7 +304,7 @@ class ParameterRoutes(ParameterTopics[_Node]):
             return self._write(kind, {"parameters": parameters})
 
         try:
-            request = await self._board.convert(call.caller, len(call.payload), write)
+            request = await self._dispatcher.convert(call.caller, len(call.payload), write)
             said = await self._ask_for(node, verb, kind, request)
         except TooLargeError as error:
             raise CallError("too_large", str(error)) from None

@@ -20,7 +20,7 @@ LONGEST = 60.0
 
 
 @dataclass(slots=True)
-class _Behind:
+class _Replay:
     """A client that sends what it had queued, until some time, and how fast."""
 
     until: float
@@ -38,7 +38,7 @@ class ReplayGuard:
     """
 
     def __init__(self) -> None:
-        self._behind: dict[Session, _Behind] = {}
+        self._behind: dict[Session, _Replay] = {}
 
     def has(self, message: Message, origin: Session | None, oldest: float, now: float) -> bool:
         """Whether the message is older than `oldest`, in seconds, or comes behind such a one."""
@@ -48,7 +48,7 @@ class ReplayGuard:
         behind = self._behind.get(origin)
         if behind is None:
             if is_old:
-                self._behind[origin] = _Behind(now + oldest, now + max(LONGEST, oldest), now)
+                self._behind[origin] = _Replay(now + oldest, now + max(LONGEST, oldest), now)
             return is_old
         behind.in_a_row = behind.in_a_row + 1 if now - behind.last < BURST else 1
         behind.last = now

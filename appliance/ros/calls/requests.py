@@ -24,7 +24,7 @@ Key = tuple[str, str]
 
 
 @dataclass(eq=False, slots=True)
-class _Request:
+class _PendingCall:
     """A request under way; `cdr` is None once it was sent, or given up: a request may be empty."""
 
     cdr: bytes | None
@@ -33,13 +33,13 @@ class _Request:
 
 
 @dataclass(eq=False, slots=True)
-class _Remote:
+class _ServiceClient:
     """A service on the bus as it is seen from here; for the ROS thread."""
 
     client: RosClient
     was_ready: bool = False
-    waiting: list[_Request] = field(default_factory=list)
-    sent: set[_Request] = field(default_factory=set)
+    waiting: list[_PendingCall] = field(default_factory=list)
+    sent: set[_PendingCall] = field(default_factory=set)
     idle: int = 0
 
 
@@ -65,7 +65,7 @@ class Requests:
         self._pinned: frozenset[Key] = frozenset()
         # The ROS thread's.
         self._seen: dict[str, list[str]] = {}
-        self._remotes: dict[Key, _Remote] = {}
+        self._remotes: dict[Key, _ServiceClient] = {}
         #: What could not be made a client of, and why; it is tried anew when the graph changes.
         self._unusable: dict[Key, tuple[ErrorCode, str]] = {}
 
@@ -74,7 +74,7 @@ class Requests:
 
         Raises CallError: unavailable, vanished, unknown_type, ros_error.
         """
-        waiting = _Request(request, self._loop.create_future())
+        waiting = _PendingCall(request, self._loop.create_future())
         key = service, type_name
         try:
             self._node.call_soon(partial(self._begin, key, waiting))
@@ -134,7 +134,7 @@ class Requests:
         self.services = services
         self._changed()
 
-    def _follow(self, key: Key, remote: _Remote) -> None:
+    def _follow(self, key: Key, remote: _ServiceClient) -> None:
         is_ready = remote.client.is_ready()
         if remote.was_ready and not is_ready:
             text = f"{key[0]} went away before it answered"
@@ -167,18 +167,18 @@ class Requests:
             return "unavailable", text
         return "unavailable", f"there is no {service} on the bus"
 
-    def _remote(self, key: Key) -> _Remote | None:
+    def _remote(self, key: Key) -> _ServiceClient | None:
         remote = self._remotes.get(key)
         if remote is None and key not in self._unusable:
             try:
-                remote = self._remotes[key] = _Remote(self._node.create_client(*key))
+                remote = self._remotes[key] = _ServiceClient(self._node.create_client(*key))
             except UnknownTypeError as error:
                 self._unusable[key] = "unknown_type", str(error)
             except BusError as error:
                 self._unusable[key] = "ros_error", f"{key[0]}: {error}"
         return remote
 
-    def _begin(self, key: Key, request: _Request) -> None:
+    def _begin(self, key: Key, request: _PendingCall) -> None:
         if request.cdr is None:
             return
         if key not in self._remotes and not self._is_seen(key):
@@ -195,7 +195,7 @@ class Requests:
         else:
             self._fail(request, *self._unavailable(key))
 
-    def _send(self, remote: _Remote, request: _Request) -> None:
+    def _send(self, remote: _ServiceClient, request: _PendingCall) -> None:
         cdr, request.cdr = request.cdr, None
         if cdr is None:
             return
@@ -214,7 +214,7 @@ class Requests:
             remote.sent.discard(request)
             self._fail(request, "ros_error", str(error))
 
-    def _give_up(self, key: Key, request: _Request) -> None:
+    def _give_up(self, key: Key, request: _PendingCall) -> None:
         remote = self._remotes.get(key)
         if remote is None:
             return
@@ -224,7 +224,7 @@ class Requests:
             remote.sent.discard(request)
             request.give_up()
 
-    def _fail(self, request: _Request, code: ErrorCode, text: str) -> None:
+    def _fail(self, request: _PendingCall, code: ErrorCode, text: str) -> None:
         self._post(self._settle, request.answer, CallError(code, text))
 
     def lost(self) -> None:

@@ -124,14 +124,14 @@ class ServiceRoutes:
 
     def __init__(
         self,
-        board: CallDispatcher,
+        dispatcher: CallDispatcher,
         requests: Requests,
         converters: Converters,
         node: RosNode,
         entries: Entries,
         post: Post,
     ) -> None:
-        self._board = board
+        self._dispatcher = dispatcher
         self._requests = requests
         self._converters = converters
         self._node = node
@@ -139,8 +139,8 @@ class ServiceRoutes:
         self._post = post
         self._counters: dict[ServiceSettings, CallCounters] = {}
         #: What is offered to MQTT, by the service's name; what to ROS, by the route.
-        self._offered: dict[str, tuple[ServiceSettings, CallEndpoint]] = {}
-        self._provided: dict[ServiceSettings, Provided] = {}
+        self._endpoints: dict[str, tuple[ServiceSettings, CallEndpoint]] = {}
+        self._provided: dict[ServiceSettings, ProvidedService] = {}
         #: Services that patterns speak of and do not take.
         self._refused: list[Skip] = []
         #: The type that a service last had.
@@ -158,10 +158,10 @@ class ServiceRoutes:
                 del self._provided[route]
         for route in wanted:
             if route not in self._provided:
-                self._provided[route] = Provided(
+                self._provided[route] = ProvidedService(
                     route,
                     self._counters[route],
-                    self._board,
+                    self._dispatcher,
                     self._converters,
                     self._node,
                     self._entries,
@@ -175,18 +175,18 @@ class ServiceRoutes:
             if self._types.get(name) not in types:
                 self._types[name] = min(types)
         wanted = self._wanted()
-        for name, (route, offer) in list(self._offered.items()):
+        for name, (route, endpoint) in list(self._endpoints.items()):
             if wanted.get(name) != route:
-                self._board.withdraw(offer)
-                del self._offered[name]
+                self._dispatcher.unregister(endpoint)
+                del self._endpoints[name]
         for name, route in wanted.items():
-            if name not in self._offered:
-                self._offer(name, route)
+            if name not in self._endpoints:
+                self._add_endpoint(name, route)
         self._tell()
         self._types = {
             name: found
             for name, found in self._types.items()
-            if name in self._requests.services or name in self._offered
+            if name in self._requests.services or name in self._endpoints
         }
 
     def _wanted(self) -> dict[str, ServiceSettings]:
@@ -204,9 +204,9 @@ class ServiceRoutes:
         self._refused = refusals(routes, others, wanted, "service", misfit)
         return wanted
 
-    def _offer(self, name: str, route: ServiceSettings) -> None:
+    def _add_endpoint(self, name: str, route: ServiceSettings) -> None:
         topic = f"{route.base(name)}/_call"
-        offer = CallEndpoint(
+        endpoint = CallEndpoint(
             topic,
             name,
             route.timeout,
@@ -215,16 +215,16 @@ class ServiceRoutes:
             route.encoding,
             (*WITHOUT_RAW, self._node.wire.encoding),
         )
-        self._offered[name] = route, offer
-        self._board.offer(offer)
+        self._endpoints[name] = route, endpoint
+        self._dispatcher.register(endpoint)
         if name not in self._requests.services:
             log.info("%s: no node offers it yet; it will be called at %s", name, topic)
 
     def _tell(self) -> None:
         """Say which can be called, and which can no more: a route alone offers nothing."""
-        there = {name for name in self._offered if name in self._requests.services}
+        there = {name for name in self._endpoints if name in self._requests.services}
         for name in sorted(there - self._callable):
-            log.info("%s can be called at %s", name, self._offered[name][1].topic)
+            log.info("%s can be called at %s", name, self._endpoints[name][1].topic)
         for name in sorted(self._callable - there):
             log.info("%s cannot be called any more", name)
         self._callable = there
@@ -244,14 +244,14 @@ class ServiceRoutes:
             f"{type_name}_Request",
             call.payload,
             call.encoding,
-            self._board.limits.input,
+            self._dispatcher.limits.input,
         )
         return partial(self._ask, name, type_name, request, call)
 
     async def _ask(self, name: str, type_name: str, request: bytes, call: Call) -> Answer:
         response = await self._requests.ask(name, type_name, request)
         response_type = f"{type_name}_Response"
-        payload = await self._board.convert(
+        payload = await self._dispatcher.convert(
             call.caller,
             len(response),
             partial(from_ros, self._converters, response_type, response, call.encoding),
@@ -260,7 +260,7 @@ class ServiceRoutes:
 
     def keys(self) -> Iterable[Key]:
         """The services that a client should be ready for."""
-        for name, (route, _) in self._offered.items():
+        for name, (route, _) in self._endpoints.items():
             type_name = self._type(name, route)
             if type_name is not None:
                 yield name, type_name
@@ -271,7 +271,7 @@ class ServiceRoutes:
             (
                 route,
                 counters,
-                [name for name, (of, _) in self._offered.items() if of is route]
+                [name for name, (of, _) in self._endpoints.items() if of is route]
                 + (list(route.names) if route in self._provided else []),
             )
             for route, counters in self._counters.items()
@@ -280,8 +280,8 @@ class ServiceRoutes:
     def bridged(self) -> list[dict[str, str]]:
         """Entries for `{robot}/_appliance/routes`."""
         entries = [
-            _entry("service", name, offer.topic, self._type(name, route), route)
-            for name, (route, offer) in self._offered.items()
+            _entry("service", name, endpoint.topic, self._type(name, route), route)
+            for name, (route, endpoint) in self._endpoints.items()
             if name in self._requests.services
         ]
         return entries + [
@@ -293,7 +293,7 @@ class ServiceRoutes:
     def skips(self) -> list[Skip]:
         """The services that routes speak of and cannot be called, or are not offered."""
         skips = list(self._refused)
-        for name, (route, _) in self._offered.items():
+        for name, (route, _) in self._endpoints.items():
             type_name = self._type(name, route) or ""
             problem = self._requests.problem(name, type_name)
             if problem is not None:
@@ -309,7 +309,7 @@ class ServiceRoutes:
         for provided in self._provided.values():
             provided.stop()
         self._provided.clear()
-        self._offered.clear()
+        self._endpoints.clear()
         self._refused.clear()
 
     # The ROS thread
@@ -350,21 +350,21 @@ def _entry(
 
 
 @dataclass(eq=False, slots=True)
-class _Asked:
+class _PendingRequest:
     """A request from ROS that MQTT has not answered yet."""
 
     respond: Respond
     timer: asyncio.TimerHandle
 
 
-class Provided:
+class ProvidedService:
     """One ROS service that MQTT clients answer."""
 
     def __init__(
         self,
         route: ServiceSettings,
         counters: CallCounters,
-        board: CallDispatcher,
+        dispatcher: CallDispatcher,
         converters: Converters,
         node: RosNode,
         entries: Entries,
@@ -373,7 +373,7 @@ class Provided:
         assert route.type is not None
         self._route = route
         self._counters = counters
-        self._board = board
+        self._dispatcher = dispatcher
         self._converters = converters
         self._node = node
         self._entries = entries
@@ -382,11 +382,11 @@ class Provided:
         self._base = route.base(self._ros)
         self._request_type = f"{route.type}_Request"
         self._response_type = f"{route.type}_Response"
-        self._asked: dict[str, _Asked] = {}
+        self._asked: dict[str, _PendingRequest] = {}
         self._report_at = 0.0
         #: Why ROS does not have it.
         self._problem: str | None = None
-        self._board.listen(f"{self._base}/_response/+", self._on_response)
+        self._dispatcher.listen(f"{self._base}/_response/+", self._on_response)
         # The ROS thread's.
         self._service: RosService | None = None
         self._is_tried = False
@@ -434,7 +434,7 @@ class Provided:
     def _ask(self, payload: bytes, respond: Respond) -> None:
         route = self._route
         self._counters.calls += 1
-        if len(self._asked) >= self._board.limits.total:
+        if len(self._asked) >= self._dispatcher.limits.total:
             count = len(self._asked)
             self._fail(respond, f"too_many: {count} requests are under way (bridge.limits.calls)")
             return
@@ -449,15 +449,15 @@ class Provided:
                 Property.CORRELATION_DATA: token.encode(),
                 Property.USER_PROPERTY: [("ros-type", self._request_type)],
             },
-            expires_at=self._board.now() + route.timeout,
+            expires_at=self._dispatcher.now() + route.timeout,
         )
         late = f"timeout: no MQTT client answered within {route.timeout:g} s"
         timer = self._entries.later(
             "services.timeout", route.timeout, self._give_up, token, late, served=self._ros
         )
-        self._asked[token] = _Asked(respond, timer)
+        self._asked[token] = _PendingRequest(respond, timer)
         self._counters.under_way += 1
-        if self._board.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
+        if self._dispatcher.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
             self._give_up(
                 token, f"unavailable: no MQTT client subscribes to {self._base}/_request/+"
             )
@@ -475,10 +475,10 @@ class Provided:
             return
         # Their number is that of the requests: each has one response.
         take = partial(self._take_response, asked.respond, message.payload, encoding)
-        self._board.turns.do(origin, len(message.payload), take)
+        self._dispatcher.conversions.do(origin, len(message.payload), take)
 
     def _take_response(self, respond: Respond, payload: bytes, encoding: CallEncoding) -> None:
-        limits = self._board.limits.input
+        limits = self._dispatcher.limits.input
         try:
             cdr = to_request(self._converters, self._response_type, payload, encoding, limits)
         except CallError as error:
@@ -492,7 +492,7 @@ class Provided:
         self._counters.answers += 1
         self._respond(respond, cdr)
 
-    def _forget(self, token: str) -> _Asked | None:
+    def _forget(self, token: str) -> _PendingRequest | None:
         asked = self._asked.pop(token, None)
         if asked is not None:
             asked.timer.cancel()
@@ -538,7 +538,7 @@ class Provided:
 
     def stop(self) -> None:
         """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
-        self._board.ignore(f"{self._base}/_response/+")
+        self._dispatcher.ignore(f"{self._base}/_response/+")
         for token in list(self._asked):
             self._give_up(token, "stopping: the service is offered no longer")
         try:

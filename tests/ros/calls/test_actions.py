@@ -9,7 +9,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, call_routes
+from call_harness import AllTypes, CallHarness, action, call_routes
 
 from appliance.ros.calls import actions as module
 from appliance.ros.calls import requests
@@ -26,8 +26,8 @@ GOAL, STOP = "r2d2/walk/_goal", "r2d2/walk/_cancel"
 class Walks:
     """An action's server, which answers when it is told to."""
 
-    def __init__(self, house):
-        self.house = house
+    def __init__(self, harness):
+        self.harness = harness
         self.accepting = True
         self.late = []
         self.cancelled = []
@@ -37,7 +37,7 @@ class Walks:
             self._serve("get_result", f"{FIBONACCI}_GetResult", self.on_result),
             self._serve("cancel_goal", CANCEL, self.on_cancel),
         ]
-        self.status = house.node.add_publisher("/walk/_action/status", STATUS)
+        self.status = harness.node.add_publisher("/walk/_action/status", STATUS)
 
     def _serve(self, name, type_name, handle):
         def on_request(cdr, respond):
@@ -48,7 +48,7 @@ class Walks:
 
             handle(request, answer)
 
-        return self.house.node.add_service(f"/walk/_action/{name}", type_name, on_request)
+        return self.harness.node.add_service(f"/walk/_action/{name}", type_name, on_request)
 
     def on_goal(self, request, answer):
         if self.accepting:
@@ -77,19 +77,19 @@ class Walks:
 
 
 @pytest.fixture
-async def house():
-    house = House(FakeNode(types=AllTypes()))
-    yield house
-    await house.stop()
-    assert house.node.clients == [] and house.node.subscriptions == []
+async def harness():
+    harness = CallHarness(FakeNode(types=AllTypes()))
+    yield harness
+    await harness.stop()
+    assert harness.node.clients == [] and harness.node.subscriptions == []
 
 
-async def begin(house, **route):
-    house.start(action("/walk", **route))
-    walks = Walks(house)
+async def begin(harness, **route):
+    harness.start(action("/walk", **route))
+    walks = Walks(harness)
     await asyncio.sleep(0)
-    house.node.spin()
-    client = house.client("alice", "r2d2/walk/_result/+")
+    harness.node.spin()
+    client = harness.client("alice", "r2d2/walk/_result/+")
     return walks, client
 
 
@@ -97,32 +97,32 @@ def results(client):
     return [m for m in client.received if m.topic.startswith("r2d2/walk/_result/")]
 
 
-async def test_a_goal_that_is_accepted_too_late_is_cancelled(house):
-    walks, client = await begin(house, timeout=0.05)
+async def test_a_goal_that_is_accepted_too_late_is_cancelled(harness):
+    walks, client = await begin(harness, timeout=0.05)
     walks.accepting = False
     assert (await client.error(GOAL, {"order": 3}))[0] == "timeout"
     await until(lambda: walks.cancelled, "the goal is cancelled")
     walks.late.pop()({"accepted": True})
     await asyncio.sleep(0.01)
     assert walks.results == {}
-    assert house.counters().under_way == 0
+    assert harness.counters().under_way == 0
 
 
-async def test_a_client_that_leaves_right_behind_its_goal(house):
-    walks, client = await begin(house, cancel_on_disconnect=True)
+async def test_a_client_that_leaves_right_behind_its_goal(harness):
+    walks, client = await begin(harness, cancel_on_disconnect=True)
     client.send(f"{GOAL}/1", {"order": 3})
     client.leave()
     await asyncio.sleep(0.02)
-    assert walks.results == {} and house.counters().errors["rejected"] == 1
+    assert walks.results == {} and harness.counters().errors["rejected"] == 1
 
 
-async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
-    walks, client = await begin(house)
+async def test_a_server_that_was_replaced_does_not_know_the_goal(harness):
+    walks, client = await begin(harness)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await until(lambda: walks.results, "the result is asked for")
     walks.results.clear()
     # Another takes its place at once: its services were never seen to be away.
-    house.node.add_publisher("/walk/_action/status", STATUS)
+    harness.node.add_publisher("/walk/_action/status", STATUS)
     await until(lambda: walks.results, "the other is asked")
     walks.finish(status=0)
     await until(lambda: results(client), "the result")
@@ -130,77 +130,77 @@ async def test_a_server_that_was_replaced_does_not_know_the_goal(house):
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
 
 
-async def test_a_server_that_ends_before_it_could_be_asked_for_the_result(house):
-    walks, client = await begin(house)
+async def test_a_server_that_ends_before_it_could_be_asked_for_the_result(harness):
+    walks, client = await begin(harness)
     walks.accepting = False
     calling = asyncio.create_task(client.call(GOAL, {"order": 3}))
     await until(lambda: walks.late, "the goal")
     walks.services[1].remove()
     walks.late.pop()({"accepted": True})
     goal = (await calling)[1]["goal_id"]
-    house.node.spin()
+    harness.node.spin()
     await until(lambda: results(client), "the result")
     (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "vanished")
 
 
 @pytest.mark.parametrize("part", ["send_goal", "get_result", "cancel_goal"])
-async def test_an_action_is_there_when_all_of_it_is(house, part):
-    walks, client = await begin(house)
+async def test_an_action_is_there_when_all_of_it_is(harness, part):
+    walks, client = await begin(harness)
     (missing,) = (service for service in walks.services if service.name.endswith(part))
     missing.remove()
     await asyncio.sleep(0)
     code, why = await client.error(GOAL, {"order": 3})
     assert (code, why) == ("unavailable", "there is no action /walk on the bus")
-    house.node.add_service(missing.name, missing.type, missing.handler)
+    harness.node.add_service(missing.name, missing.type, missing.handler)
     await asyncio.sleep(0)
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_again(house):
-    walks, _ = await begin(house)
+async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_again(harness):
+    walks, _ = await begin(harness)
     said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
-    status = house.node.add_publisher("/walk/_action/status", STATUS, latched)
+    status = harness.node.add_publisher("/walk/_action/status", STATUS, latched)
     status.publish(CONVERTERS.get(STATUS).from_dict(said))
 
     def shown():
-        return house.broker.retained.get("r2d2/walk/_status")
+        return harness.broker.retained.get("r2d2/walk/_status")
 
     await until(shown, "the status")
     missing = walks.services[1]
     missing.remove()
     await until(lambda: shown() is None, "the action is not whole")
-    house.node.add_service(missing.name, missing.type, missing.handler)
+    harness.node.add_service(missing.name, missing.type, missing.handler)
     await asyncio.sleep(0)
-    house.node.spin()
+    harness.node.spin()
     await until(shown, "the status, which its publisher does not send again")
-    subscriptions = list(house.node.subscriptions)
-    house.node.spin()
-    assert house.node.subscriptions == subscriptions
+    subscriptions = list(harness.node.subscriptions)
+    harness.node.spin()
+    assert harness.node.subscriptions == subscriptions
 
 
 @pytest.mark.parametrize("is_lost", [True, False], ids=["the bus ends", "the route is removed"])
-async def test_a_status_that_still_waits_is_not_left_behind(house, is_lost):
-    await begin(house)
+async def test_a_status_that_still_waits_is_not_left_behind(harness, is_lost):
+    await begin(harness)
     said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
-    status = house.node.add_publisher("/walk/_action/status", STATUS, latched)
+    status = harness.node.add_publisher("/walk/_action/status", STATUS, latched)
     status.publish(CONVERTERS.get(STATUS).from_dict(said))
-    assert house.broker.retained.get("r2d2/walk/_status") is None, "it waits for its turn"
+    assert harness.broker.retained.get("r2d2/walk/_status") is None, "it waits for its turn"
     if is_lost:
-        house.node.fail("the node ended")
+        harness.node.fail("the node ended")
     else:
-        house.bridge.calls.replace(call_routes())
+        harness.bridge.calls.replace(call_routes())
     await asyncio.sleep(0.1)
-    assert house.broker.retained.get("r2d2/walk/_status") is None
+    assert harness.broker.retained.get("r2d2/walk/_status") is None
 
 
-async def test_an_action_is_of_one_type(house):
+async def test_an_action_is_of_one_type(harness):
     """Others may offer services by the same names, of which ROS takes those of one type for one."""
-    walks, client = await begin(house)
-    other = house.node.add_service("/walk/_action/send_goal", "acme/action/Crawl_SendGoal", None)
-    house.node.add_service("/walk/_action/get_result", "std_srvs/srv/Trigger", None)
+    walks, client = await begin(harness)
+    other = harness.node.add_service("/walk/_action/send_goal", "acme/action/Crawl_SendGoal", None)
+    harness.node.add_service("/walk/_action/get_result", "std_srvs/srv/Trigger", None)
     await asyncio.sleep(0)
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
     result = walks.services[1]
@@ -210,23 +210,23 @@ async def test_an_action_is_of_one_type(house):
     other.remove()
     await asyncio.sleep(0)
     assert (await client.error(GOAL, {"order": 3}))[0] == "unavailable"
-    house.node.add_service(result.name, result.type, result.handler)
+    harness.node.add_service(result.name, result.type, result.handler)
     await asyncio.sleep(0)
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_ros_ends_while_goals_are_under_way(house):
-    _, client = await begin(house)
+async def test_ros_ends_while_goals_are_under_way(harness):
+    _, client = await begin(harness)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
-    house.node.fail("the node ended")
+    harness.node.fail("the node ended")
     await until(lambda: results(client), "the result")
     (answer,) = client.payloads(f"r2d2/walk/_result/{goal}")
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "ros_error")
 
 
-async def test_goals_are_bounded_and_so_are_kept_results(house, monkeypatch):
+async def test_goals_are_bounded_and_so_are_kept_results(harness, monkeypatch):
     monkeypatch.setattr(module, "RESULTS", 3)
-    walks, client = await begin(house)
+    walks, client = await begin(harness)
     for _ in range(20):
         assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
     assert (await client.error(GOAL, {"order": 3}))[0] == "too_many"
@@ -234,53 +234,53 @@ async def test_goals_are_bounded_and_so_are_kept_results(house, monkeypatch):
     walks.finish()
     await until(lambda: len(results(client)) >= 20, "the results")
     await asyncio.sleep(0.01)
-    late = house.client("late", "r2d2/walk/_result/+")
+    late = harness.client("late", "r2d2/walk/_result/+")
     assert len(late.received) == 3
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_results_that_are_not_kept(house):
-    walks, client = await begin(house, keep_result=0)
+async def test_results_that_are_not_kept(harness):
+    walks, client = await begin(harness, keep_result=0)
     await client.call(GOAL, {"order": 3})
     await until(lambda: walks.results, "the result is asked for")
     walks.finish()
     await until(lambda: results(client), "the result")
-    assert house.client("late", "r2d2/walk/_result/+").received == []
+    assert harness.client("late", "r2d2/walk/_result/+").received == []
 
 
-async def test_the_appliance_stops_with_goals_under_way(house):
-    walks, client = await begin(house, cancel_on_disconnect=True)
+async def test_the_appliance_stops_with_goals_under_way(harness):
+    walks, client = await begin(harness, cancel_on_disconnect=True)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
-    await house.bridge.stop()
+    await harness.bridge.stop()
     assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
 
 
-async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(house):
-    walks, client = await begin(house, cancel_on_disconnect=True)
+async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(harness):
+    walks, client = await begin(harness, cancel_on_disconnect=True)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     await until(lambda: walks.results, "the result is asked for")
     changed = action("/walk", cancel_on_disconnect=True, keep_result=1)
-    house.bridge.calls.replace(call_routes(changed))
+    harness.bridge.calls.replace(call_routes(changed))
     client.leave()
     await until(lambda: walks.cancelled, "the goal is cancelled")
     assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
 
 
-async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(house):
-    walks, client = await begin(house, cancel_on_disconnect=True)
+async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(harness):
+    walks, client = await begin(harness, cancel_on_disconnect=True)
     await client.call(GOAL, {"order": 3})
-    house.bridge.calls.replace(call_routes())
-    await house.bridge.stop()
+    harness.bridge.calls.replace(call_routes())
+    await harness.bridge.stop()
     assert len(walks.cancelled) == 1
 
 
-async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(house):
+async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(harness):
     """A server that is busy with accepting it knows of no such goal yet."""
-    walks, client = await begin(house, timeout=0.05)
+    walks, client = await begin(harness, timeout=0.05)
     walks.accepting = False
     assert (await client.error(GOAL, {"order": 3}))[0] == "timeout"
     await until(lambda: walks.cancelled, "the goal is cancelled, in vain")
-    latched = house.node.add_publisher(
+    latched = harness.node.add_publisher(
         "/walk/_action/status", STATUS, QosProfile(durability=Durability.TRANSIENT_LOCAL)
     )
     walks.late.pop()({"accepted": True})
@@ -295,24 +295,24 @@ async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(house):
     assert len(set(walks.cancelled)) == 1 and len(walks.cancelled) == 2
 
 
-async def test_the_server_of_a_goal_vanishes_after_the_last_route(house, monkeypatch):
+async def test_the_server_of_a_goal_vanishes_after_the_last_route(harness, monkeypatch):
     monkeypatch.setattr(requests, "IDLE_LOOKS", 2)
-    walks, client = await begin(house)
+    walks, client = await begin(harness)
     await client.call(GOAL, {"order": 3})
     await until(lambda: walks.results, "the result is asked for")
-    house.bridge.calls.replace(call_routes())
+    harness.bridge.calls.replace(call_routes())
     walks.vanish()
     await until(lambda: results(client), "the result")
     assert client.payloads(results(client)[0].topic)[0]["error"]["code"] == "vanished"
     for _ in range(4):
-        house.node.spin()
-    assert house.node.clients == []
+        harness.node.spin()
+    assert harness.node.clients == []
 
 
 @pytest.mark.parametrize("sent_at", ["-6", "+0.4", "+3600", "yesterday"])
-async def test_a_cancel_is_heard_however_old_it_says_to_be(house, sent_at):
+async def test_a_cancel_is_heard_however_old_it_says_to_be(harness, sent_at):
     """It is how an action is stopped."""
-    walks, client = await begin(house)
+    walks, client = await begin(harness)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
     text = sent_at if sent_at.isalpha() else str(time.time() + float(sent_at))
     client.send(
@@ -324,4 +324,4 @@ async def test_a_cancel_is_heard_however_old_it_says_to_be(house, sent_at):
     )
     await until(lambda: walks.cancelled, "the goal is cancelled")
     walks.finish()
-    await until(lambda: house.counters().under_way == 0, "it has ended")
+    await until(lambda: harness.counters().under_way == 0, "it has ended")

@@ -13,7 +13,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, call_routes, parameters, service
+from call_harness import AllTypes, CallHarness, action, call_routes, parameters, service
 
 from appliance.mqtt.codec import Property
 from appliance.ros.calls.goals import GOAL_INFO, STATUS, id_of, split_id, with_id
@@ -66,27 +66,27 @@ async def ask(client, topic, payload, content_type=None):
 
 
 @pytest.fixture
-async def house():
-    house = House(FakeNode(types=AllTypes()))
-    yield house
-    await house.stop()
+async def harness():
+    harness = CallHarness(FakeNode(types=AllTypes()))
+    yield harness
+    await harness.stop()
 
 
-def echo(house, name, type_name):
+def echo(harness, name, type_name):
     """A service whose response has the request's fields."""
 
     def on_request(request, respond):
         respond(cdr(f"{type_name}_Response", value(f"{type_name}_Request", request)))
 
-    house.node.add_service(name, type_name, on_request)
+    harness.node.add_service(name, type_name, on_request)
 
 
-def switch(house, name="/switch"):
+def switch(harness, name="/switch"):
     def on_request(request, respond):
         data = value(f"{SET_BOOL}_Request", request)["data"]
         respond(cdr(f"{SET_BOOL}_Response", {"success": data, "message": "on" if data else "off"}))
 
-    house.node.add_service(name, SET_BOOL, on_request)
+    harness.node.add_service(name, SET_BOOL, on_request)
 
 
 # Services
@@ -95,13 +95,13 @@ CALL = "r2d2/switch/_call"
 
 
 @every_encoding
-async def test_the_content_type_goes_before_the_route(house, encoding):
+async def test_the_content_type_goes_before_the_route(harness, encoding):
     for route in TYPES:
-        house.start(service("/switch", encoding=route))
-        if not house.node.remote_services:
-            switch(house)
-        house.node.spin()
-        client = house.client("alice")
+        harness.start(service("/switch", encoding=route))
+        if not harness.node.remote_services:
+            switch(harness)
+        harness.node.spin()
+        client = harness.client("alice")
         payload = encode(encoding, f"{SET_BOOL}_Request", {"data": True})
         for said in (TYPES[encoding], f"{TYPES[encoding].upper()}; charset=utf-8"):
             status, answer = await ask(client, CALL, payload, said)
@@ -109,15 +109,15 @@ async def test_the_content_type_goes_before_the_route(house, encoding):
             fields = decode(answer, f"{SET_BOOL}_Response")
             assert fields == {"success": True, "message": "on"}
         client.leave()
-        await house.bridge.stop()
+        await harness.bridge.stop()
 
 
 @every_encoding
-async def test_without_a_content_type_it_is_the_route_s(house, encoding):
-    house.start(service("/switch", encoding=encoding))
-    switch(house)
-    house.node.spin()
-    client = house.client("alice")
+async def test_without_a_content_type_it_is_the_route_s(harness, encoding):
+    harness.start(service("/switch", encoding=encoding))
+    switch(harness)
+    harness.node.spin()
+    client = harness.client("alice")
     payload = encode(encoding, f"{SET_BOOL}_Request", {"data": True})
     for sent, expected in ((payload, True), (b"", False)):
         status, answer = await ask(client, CALL, sent)
@@ -133,11 +133,11 @@ async def test_without_a_content_type_it_is_the_route_s(house, encoding):
 
 
 @every_encoding
-async def test_errors_are_understood_in_each_encoding(house, encoding):
-    house.start(service("/switch", encoding=encoding), service("/gone", encoding=encoding))
-    switch(house)
-    house.node.spin()
-    client = house.client("alice")
+async def test_errors_are_understood_in_each_encoding(harness, encoding):
+    harness.start(service("/switch", encoding=encoding), service("/gone", encoding=encoding))
+    switch(harness)
+    harness.node.spin()
+    client = harness.client("alice")
     broken = {"json": b"{", "cbor": b"\xa1\x64data", "cdr": b"\0\1\0\0"}[encoding]
     for topic, payload, code in (
         (CALL, broken, "bad_request"),
@@ -154,11 +154,11 @@ async def test_errors_are_understood_in_each_encoding(house, encoding):
             assert error["code"] == code and error["message"]
 
 
-async def test_a_wrong_field_in_cbor_is_named_as_in_json(house):
-    house.start(service("/switch"))
-    switch(house)
-    house.node.spin()
-    client = house.client("alice")
+async def test_a_wrong_field_in_cbor_is_named_as_in_json(harness):
+    harness.start(service("/switch"))
+    switch(harness)
+    harness.node.spin()
+    client = harness.client("alice")
     _, answer = await ask(client, CALL, cbor2.dumps({"data": 1}), TYPES["cbor"])
     assert decode(answer, None)["error"]["message"].startswith("data: expected true or false")
     for hostile in (
@@ -172,11 +172,11 @@ async def test_a_wrong_field_in_cbor_is_named_as_in_json(house):
         assert decode(answer, None)["error"]["code"] == "bad_request"
 
 
-async def test_an_unknown_content_type_is_read_as_the_route_s(house):
-    house.start(service("/switch"))
-    switch(house)
-    house.node.spin()
-    client = house.client("alice")
+async def test_an_unknown_content_type_is_read_as_the_route_s(harness):
+    harness.start(service("/switch"))
+    switch(harness)
+    harness.node.spin()
+    client = harness.client("alice")
     status, _ = await ask(client, CALL, b'{"data": true}', "text/plain")
     assert status == "ok"
     _, answer = await ask(client, CALL, b"true", "text/pla\nin")
@@ -184,11 +184,11 @@ async def test_an_unknown_content_type_is_read_as_the_route_s(house):
     assert message.endswith("(it says to be 'text/pla\\nin', and was read as json)")
 
 
-async def test_numbers_and_bytes_keep_their_form_in_cbor(house):
-    house.start(service("/arrays"))
-    echo(house, "/arrays", ARRAYS)
-    house.node.spin()
-    client = house.client("alice")
+async def test_numbers_and_bytes_keep_their_form_in_cbor(harness):
+    harness.start(service("/arrays"))
+    echo(harness, "/arrays", ARRAYS)
+    harness.node.spin()
+    client = harness.client("alice")
     numbers = struct.pack("<3d", 0.5, math.inf, -math.inf)
     fields = {
         "byte_values": b"\1\2\3",
@@ -203,13 +203,13 @@ async def test_numbers_and_bytes_keep_their_form_in_cbor(house):
     assert got["uint16_values"] == cbor2.CBORTag(69, b"\1\0\2\0\xff\xff")
 
 
-async def test_a_service_that_mqtt_answers_in_cbor(house):
-    house.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.5, encoding="cbor"))
-    house.node.spin()
-    client = house.client("alice", "r2d2/ask/_request/+")
+async def test_a_service_that_mqtt_answers_in_cbor(harness):
+    harness.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.5, encoding="cbor"))
+    harness.node.spin()
+    client = harness.client("alice", "r2d2/ask/_request/+")
     for said, make in ((None, "cbor"), ("application/json", "json"), ("application/cdr", "cdr")):
         got = []
-        house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": True}), got.append)
+        harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": True}), got.append)
         await until(lambda: client.received, "the request")
         (request,) = client.received
         client.received.clear()
@@ -220,12 +220,12 @@ async def test_a_service_that_mqtt_answers_in_cbor(house):
         client.send(request.properties[Property.RESPONSE_TOPIC], answer, **more)
         await until(lambda got=got: got, "the response")
         assert value(f"{SET_BOOL}_Response", got[0]) == {"success": True, "message": make}
-    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": True}), got.append)
+    harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": True}), got.append)
     await until(lambda: client.received, "the request")
     error = cbor2.dumps({"error": {"code": "no", "message": "not today"}})
     client.send(client.received[0].properties[Property.RESPONSE_TOPIC], error)
     await until(lambda: len(got) == 2, "the response")
-    assert got[1] is None and house.counters().errors["rejected"] == 1
+    assert got[1] is None and harness.counters().errors["rejected"] == 1
 
 
 # Actions
@@ -236,8 +236,8 @@ class Walks:
 
     STAMP: ClassVar = {"sec": 5, "nanosec": 6}
 
-    def __init__(self, house):
-        self.node = house.node
+    def __init__(self, harness):
+        self.node = harness.node
         self.goals = []
         self.cancelled = []
         self.results = {}
@@ -247,10 +247,10 @@ class Walks:
             ("cancel_goal", CANCEL, self.on_cancel),
         ):
             self._serve(name, kind, handle)
-        self.status = house.node.add_publisher(
+        self.status = harness.node.add_publisher(
             "/walk/_action/status", STATUS, QosProfile(durability=Durability.TRANSIENT_LOCAL)
         )
-        self.feedback = house.node.add_publisher(
+        self.feedback = harness.node.add_publisher(
             "/walk/_action/feedback", f"{FIBONACCI}_FeedbackMessage"
         )
 
@@ -289,18 +289,18 @@ class Walks:
 GOAL, STOP = "r2d2/walk/_goal", "r2d2/walk/_cancel"
 
 
-async def begin(house, **route):
-    house.start(action("/walk", **route))
-    walks = Walks(house)
+async def begin(harness, **route):
+    harness.start(action("/walk", **route))
+    walks = Walks(harness)
     await asyncio.sleep(0)
-    house.node.spin()
+    harness.node.spin()
     return walks
 
 
 @every_encoding
-async def test_a_goal_from_its_beginning_to_its_end(house, encoding):
-    walks = await begin(house, encoding=encoding)
-    client = house.client("alice", "r2d2/walk/_feedback/+", "r2d2/walk/_result/+")
+async def test_a_goal_from_its_beginning_to_its_end(harness, encoding):
+    walks = await begin(harness, encoding=encoding)
+    client = harness.client("alice", "r2d2/walk/_feedback/+", "r2d2/walk/_result/+")
     client.subscribe("r2d2/walk/_status")
     payload = encode(encoding, f"{FIBONACCI}_Goal", {"order": 7})
     status, answer = await ask(client, GOAL, payload)
@@ -369,9 +369,9 @@ def test_an_id_goes_before_a_goal_of_ros_1():
 
 
 @every_encoding
-async def test_a_result_that_never_comes_is_told_in_words(house, encoding):
-    walks = await begin(house, encoding=encoding)
-    client = house.client("alice", "r2d2/walk/_result/+")
+async def test_a_result_that_never_comes_is_told_in_words(harness, encoding):
+    walks = await begin(harness, encoding=encoding)
+    client = harness.client("alice", "r2d2/walk/_result/+")
     await ask(client, GOAL, b"")
     ((goal, _),) = walks.goals
     await until(lambda: goal in walks.results, "the result is asked for")
@@ -382,9 +382,9 @@ async def test_a_result_that_never_comes_is_told_in_words(house, encoding):
 
 
 @every_encoding
-async def test_a_goal_s_answer_cancels_that_goal_alone(house, encoding):
-    walks = await begin(house)
-    client = house.client("alice")
+async def test_a_goal_s_answer_cancels_that_goal_alone(harness, encoding):
+    walks = await begin(harness)
+    client = harness.client("alice")
     payload = encode(encoding, f"{FIBONACCI}_Goal", {"order": 7})
     _, answer = await ask(client, GOAL, payload, TYPES[encoding])
     ((goal, _),) = walks.goals
@@ -400,9 +400,9 @@ async def test_a_goal_s_answer_cancels_that_goal_alone(house, encoding):
 NONE = "00" * 16
 
 
-async def test_cancelling_all_and_all_before_a_time(house):
-    walks = await begin(house, cancel="any")
-    client = house.client("alice")
+async def test_cancelling_all_and_all_before_a_time(harness):
+    walks = await begin(harness, cancel="any")
+    client = harness.client("alice")
     nobody, start = {"goal_id": NONE}, {"sec": 0, "nanosec": 0}
     for payload, stamp in (
         ({"all": True}, start),
@@ -419,10 +419,10 @@ async def test_cancelling_all_and_all_before_a_time(house):
     assert walks.cancelled == []
 
 
-async def test_who_may_not_cancel_others_goals_may_cancel_its_own(house):
-    walks = await begin(house)
-    house.rules.deny("bob", "publish", "r2d2/walk/_cancel_any")
-    alice, bob = house.client("alice"), house.client("bob")
+async def test_who_may_not_cancel_others_goals_may_cancel_its_own(harness):
+    walks = await begin(harness)
+    harness.rules.deny("bob", "publish", "r2d2/walk/_cancel_any")
+    alice, bob = harness.client("alice"), harness.client("bob")
     hers = (await alice.call(GOAL, {"order": 1}))[1]["goal_id"]
     his = (await bob.call(GOAL, {"order": 2}))[1]["goal_id"]
     stranger = "11" * 16  # as of a ROS node
@@ -434,12 +434,12 @@ async def test_who_may_not_cancel_others_goals_may_cancel_its_own(house):
     # Also when it has ended, and by whichever of the user's clients.
     walks.end(his)
     bob.leave()
-    again = house.client("bob")
+    again = harness.client("bob")
     assert (await again.call(STOP, {"goal_id": his}))[0] == "ok"
     # Who may write to _cancel_any, or everyone where the route says so, may cancel them all.
     assert (await alice.call(STOP, {"goal_id": his}))[0] == "ok"
     assert (await alice.call(STOP, {"goal_id": stranger}))[0] == "ok"
-    house.bridge.calls.replace(call_routes(action("/walk", cancel="any")))
+    harness.bridge.calls.replace(call_routes(action("/walk", cancel="any")))
     assert (await again.call(STOP, {"all": True}))[0] == "ok"
     assert [goal for goal, _ in walks.cancelled] == [his, his, his, stranger, NONE]
 
@@ -450,7 +450,7 @@ async def test_who_may_not_cancel_others_goals_may_cancel_its_own(house):
 class Node:
     """A node with two parameters, one of them of bytes."""
 
-    def __init__(self, house):
+    def __init__(self, harness):
         self.set = []
         for verb, kind, handle in (
             ("list_parameters", "ListParameters", self.on_list),
@@ -459,7 +459,7 @@ class Node:
             ("set_parameters", "SetParameters", self.on_set),
             ("set_parameters_atomically", "SetParametersAtomically", self.on_set),
         ):
-            self._serve(house.node, f"/arm/{verb}", f"rcl_interfaces/srv/{kind}", handle)
+            self._serve(harness.node, f"/arm/{verb}", f"rcl_interfaces/srv/{kind}", handle)
 
     def _serve(self, node, name, kind, handle):
         def on_request(request, respond):
@@ -488,11 +488,11 @@ class Node:
         return {"results": results} if len(results) == 1 else {"result": results[0]}
 
 
-async def test_parameters_in_cbor(house):
-    house.start(parameters("/arm/*", encoding="cbor"))
-    node = Node(house)
-    house.node.spin()
-    client = house.client("alice", "r2d2/arm/_param/+")
+async def test_parameters_in_cbor(harness):
+    harness.start(parameters("/arm/*", encoding="cbor"))
+    node = Node(harness)
+    harness.node.spin()
+    client = harness.client("alice", "r2d2/arm/_param/+")
     await until(lambda: client.on("r2d2/arm/_param/key"), "the values")
     key = client.on("r2d2/arm/_param/key")[0]
     assert key.properties[Property.CONTENT_TYPE] == "application/cbor"

@@ -8,7 +8,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("rcl_interfaces.srv")
-from call_house import AllTypes, House, action, call_routes, parameters
+from call_harness import AllTypes, CallHarness, action, call_routes, parameters
 
 from appliance.ros.calls import parameters as module
 from appliance.ros.calls.dispatcher import CallError
@@ -23,7 +23,7 @@ CONVERTERS = Converters(load_description)
 class Declaring:
     """A node with parameters, all integers; it gives none of them when one is `unset`."""
 
-    def __init__(self, house, name="/arm", **values):
+    def __init__(self, harness, name="/arm", **values):
         self.name = name
         self.values = values
         self.unset = set()
@@ -35,8 +35,8 @@ class Declaring:
             ("get_parameters", "GetParameters", self.on_get),
         ):
             type_name = f"rcl_interfaces/srv/{kind}"
-            house.node.add_service(f"{name}/{verb}", type_name, self._handler(type_name, answer))
-        self.events = house.node.add_publisher(EVENTS, EVENT)
+            harness.node.add_service(f"{name}/{verb}", type_name, self._handler(type_name, answer))
+        self.events = harness.node.add_publisher(EVENTS, EVENT)
 
     def _handler(self, type_name, answer):
         def handle(cdr, respond):
@@ -72,105 +72,105 @@ class Declaring:
 
 
 @pytest.fixture
-async def house():
-    house = House(FakeNode(types=AllTypes()))
-    yield house
-    await house.stop()
-    watcher = house.client("watcher", "r2d2/+/_param/#")
+async def harness():
+    harness = CallHarness(FakeNode(types=AllTypes()))
+    yield harness
+    await harness.stop()
+    watcher = harness.client("watcher", "r2d2/+/_param/#")
     assert watcher.received == []  # what was retained has gone with the appliance
 
 
-async def shown(house, name, value):
-    await until(lambda: house.retained(f"r2d2/arm/_param/{name}") == value, f"{name} {value}")
+async def shown(harness, name, value):
+    await until(lambda: harness.retained(f"r2d2/arm/_param/{name}") == value, f"{name} {value}")
 
 
-async def test_a_change_while_the_values_are_read_is_not_lost(house):
-    house.start(parameters("/arm/*"))
-    arm = Declaring(house, speed=1)
+async def test_a_change_while_the_values_are_read_is_not_lost(harness):
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, speed=1)
     arm.is_held = True
-    house.node.spin()
+    harness.node.spin()
     await until(lambda: arm.holds, "the names are asked for")
     arm.holds.pop(0)()
     await until(lambda: arm.holds, "the values are asked for")
     arm.change("speed", 2)
     arm.release()  # the value of before comes after the change
-    await shown(house, "speed", 2)
+    await shown(harness, "speed", 2)
     await asyncio.sleep(0.01)
-    assert house.retained("r2d2/arm/_param/speed") == 2
+    assert harness.retained("r2d2/arm/_param/speed") == 2
 
 
-async def test_a_node_that_takes_the_place_of_one_that_was_killed(house):
-    house.start(parameters("/arm/*"))
-    arm = Declaring(house, speed=1, old=1)
-    house.node.nodes = lambda: ["/bridge", "/arm"]
-    house.node.spin()
-    await shown(house, "old", 1)
+async def test_a_node_that_takes_the_place_of_one_that_was_killed(harness):
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, speed=1, old=1)
+    harness.node.nodes = lambda: ["/bridge", "/arm"]
+    harness.node.spin()
+    await shown(harness, "old", 1)
     arm.values = {"speed": 2}
-    house.node.nodes = lambda: ["/bridge", "/arm", "/arm"]  # the killed one is not forgotten yet
-    house.node.spin()
-    await shown(house, "speed", 2)
-    await shown(house, "old", None)
+    harness.node.nodes = lambda: ["/bridge", "/arm", "/arm"]  # the killed one is not forgotten yet
+    harness.node.spin()
+    await shown(harness, "speed", 2)
+    await shown(harness, "old", None)
 
 
-async def test_a_flood_of_changes_has_the_node_read_anew(house, monkeypatch):
+async def test_a_flood_of_changes_has_the_node_read_anew(harness, monkeypatch):
     monkeypatch.setattr(module, "WAITING_EVENTS", 20)
-    house.start(parameters("/arm/*"))
-    arm = Declaring(house, speed=1, other=1)
-    house.node.spin()
-    await shown(house, "speed", 1)
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, speed=1, other=1)
+    harness.node.spin()
+    await shown(harness, "speed", 1)
     for number in range(50):  # the loop has no turn meanwhile
         arm.change("speed", number)
     arm.change("other", 7)
-    await shown(house, "speed", 49)
-    await shown(house, "other", 7)
+    await shown(harness, "speed", 49)
+    await shown(harness, "other", 7)
     assert arm.asked == ["list"] * 2
 
 
-async def test_one_parameter_that_cannot_be_given_hides_no_others(house):
-    house.start(parameters("/arm/*"))
-    arm = Declaring(house, speed=1, steps=2)
+async def test_one_parameter_that_cannot_be_given_hides_no_others(harness):
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, speed=1, steps=2)
     arm.unset.add("void")
-    house.node.spin()
-    await shown(house, "steps", 2)
-    await shown(house, "speed", 1)
-    assert house.retained("r2d2/arm/_param/void") is None
+    harness.node.spin()
+    await shown(harness, "steps", 2)
+    await shown(harness, "speed", 1)
+    assert harness.retained("r2d2/arm/_param/void") is None
 
 
-async def test_the_appliance_stops_just_when_a_node_cannot_be_read(house):
-    house.start(parameters("/mute/*"))
+async def test_the_appliance_stops_just_when_a_node_cannot_be_read(harness):
+    harness.start(parameters("/mute/*"))
     kind = "rcl_interfaces/srv/GetParameters"
-    house.node.add_service("/mute/get_parameters", kind, lambda request, respond: None)
+    harness.node.add_service("/mute/get_parameters", kind, lambda request, respond: None)
     for turns in range(12):  # one of these is between the failure and the task's hearing of it
-        house.node.spin()
+        harness.node.spin()
         for _ in range(turns):
             await asyncio.sleep(0)
-        await asyncio.wait_for(house.bridge.stop(), 5)
-        house.bridge = None
-        house.start(parameters("/mute/*"))
+        await asyncio.wait_for(harness.bridge.stop(), 5)
+        harness.bridge = None
+        harness.start(parameters("/mute/*"))
 
 
-async def test_routes_that_change_while_they_run(house):
-    house.start(parameters("/arm/sp*"))
-    Declaring(house, speed=1, spin=3, steps=2)
-    house.node.spin()
-    await shown(house, "speed", 1)
-    assert house.retained("r2d2/arm/_param/steps") is None
+async def test_routes_that_change_while_they_run(harness):
+    harness.start(parameters("/arm/sp*"))
+    Declaring(harness, speed=1, spin=3, steps=2)
+    harness.node.spin()
+    await shown(harness, "speed", 1)
+    assert harness.retained("r2d2/arm/_param/steps") is None
     routes = parameters(["/arm/s*", "/arm/none", "!/arm/sp*", "/*/mode"])
-    house.bridge.calls.replace(call_routes(routes))
-    await shown(house, "steps", 2)
-    assert house.retained("r2d2/arm/_param/speed") is None
-    assert house.retained("r2d2/arm/_param/spin") is None
+    harness.bridge.calls.replace(call_routes(routes))
+    await shown(harness, "steps", 2)
+    assert harness.retained("r2d2/arm/_param/speed") is None
+    assert harness.retained("r2d2/arm/_param/spin") is None
 
 
-async def test_what_a_run_that_was_killed_has_left_is_taken_back(house):
-    before = house.client("before")
+async def test_what_a_run_that_was_killed_has_left_is_taken_back(harness):
+    before = harness.client("before")
     left = ["r2d2/arm/_param/speed", "r2d2/arm/left/_param/a/b", "r2d2/walk/_status"]
     others = ["r2d2/arm/speed", "r2d2/_param/x", "r2d2/walk/_result/1", "r2d2/run/_status"]
     for topic in (*left, *others):
         before.send(topic, 1, retain=True)
-    house.start(parameters("/**/*"), action("/walk", mqtt="r2d2/walk"))
-    assert [topic for topic in left if house.retained(topic) is not None] == []
-    assert [topic for topic in others if house.retained(topic) is None] == []
+    harness.start(parameters("/**/*"), action("/walk", mqtt="r2d2/walk"))
+    assert [topic for topic in left if harness.retained(topic) is not None] == []
+    assert [topic for topic in others if harness.retained(topic) is None] == []
 
 
 @pytest.mark.parametrize(
@@ -225,12 +225,12 @@ def test_what_may_have_any_type_takes_it_from_the_value():
     assert to_value("x", ["a"], {}) == {"type": 9, "string_array_value": ["a"]}
 
 
-async def test_names_that_make_no_topic_hide_no_others(house):
-    house.start(parameters("/arm/*"))
-    arm = Declaring(house, **{"a+b": 1, "a\nb": 1, "\ufffe": 1, "x" * 70_000: 1, "speed": 1})
-    house.node.spin()
-    await shown(house, "speed", 1)
+async def test_names_that_make_no_topic_hide_no_others(harness):
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, **{"a+b": 1, "a\nb": 1, "\ufffe": 1, "x" * 70_000: 1, "speed": 1})
+    harness.node.spin()
+    await shown(harness, "speed", 1)
     for name in ("y" * 70_000, "tab\tbed", "speed"):
         arm.change(name, 2)
-    await shown(house, "speed", 2)
-    assert not house.bridge.calls._parameters._events
+    await shown(harness, "speed", 2)
+    assert not harness.bridge.calls._parameters._events

@@ -12,7 +12,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("std_srvs.srv")
-from call_house import AllTypes, House, call_routes, service
+from call_harness import AllTypes, CallHarness, call_routes, service
 
 from appliance.broker.message import Late, Message
 from appliance.broker.session import Session
@@ -39,21 +39,21 @@ def value(type_name, data):
 
 
 @pytest.fixture
-async def house():
-    house = House(FakeNode(types=AllTypes()))
-    yield house
-    await house.stop()
-    assert house.node.clients == house.node.own_services == []
+async def harness():
+    harness = CallHarness(FakeNode(types=AllTypes()))
+    yield harness
+    await harness.stop()
+    assert harness.node.clients == harness.node.own_services == []
 
 
 class Switch:
     """A SetBool service; with `holds` the answers wait."""
 
-    def __init__(self, house, name="/switch"):
+    def __init__(self, harness, name="/switch"):
         self.asked = []
         self.waiting = []
         self.holds = False
-        self.service = house.node.add_service(name, SET_BOOL, self.on_request)
+        self.service = harness.node.add_service(name, SET_BOOL, self.on_request)
 
     def on_request(self, request, respond):
         data = value(f"{SET_BOOL}_Request", request)["data"]
@@ -72,10 +72,10 @@ class Switch:
 CALL = "r2d2/switch/_call"
 
 
-async def test_a_call_of_each_version(house):
-    house.start(service("/switch"))
-    Switch(house)
-    client = house.client("alice")
+async def test_a_call_of_each_version(harness):
+    harness.start(service("/switch"))
+    Switch(harness)
+    client = harness.client("alice")
     status, answer = await client.call(CALL, {"data": True})
     assert (status, answer) == ("ok", {"success": True, "message": "on"})
     (message,) = client.on("answers/alice")
@@ -88,34 +88,34 @@ async def test_a_call_of_each_version(house):
     assert await client.call_311(CALL, {"data": True}) == {"success": True, "message": "on"}
     # An empty payload has every field's default.
     assert await client.call_311(CALL) == {"success": False, "message": "off"}
-    counters = house.counters()
+    counters = harness.counters()
     assert (counters.calls, counters.answers, counters.under_way) == (3, 3, 0)
     assert not counters.errors
 
 
-async def test_many_calls_at_once_get_each_its_own_answer(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
+async def test_many_calls_at_once_get_each_its_own_answer(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
     switch.holds = True
-    clients = [house.client(f"c{i}") for i in range(10)]
+    clients = [harness.client(f"c{i}") for i in range(10)]
     calls = [
         asyncio.ensure_future(client.call(CALL, {"data": bool(i % 2)}))
         for client in clients
         for i in range(10)
     ]
     await until(lambda: len(switch.asked) == 100, "the requests")
-    assert house.counters().under_way == 100
+    assert harness.counters().under_way == 100
     switch.waiting.reverse()
     switch.answer()
     answers = await asyncio.gather(*calls)
     assert [answer["success"] for _, answer in answers] == [bool(i % 2) for i in range(10)] * 10
 
 
-async def test_raw_cdr(house):
-    house.start(service("/switch", encoding="cdr"))
-    Switch(house)
+async def test_raw_cdr(harness):
+    harness.start(service("/switch", encoding="cdr"))
+    Switch(harness)
     await asyncio.sleep(0)  # the bridge sees it
-    client = house.client("alice")
+    client = harness.client("alice")
     client.send(CALL, cdr(f"{SET_BOOL}_Request", {"data": True}), response_topic="answers/alice")
     client.send(CALL, b"\0\1\0\0", response_topic="answers/alice")
     await until(lambda: len(client.on("answers/alice")) == 2, "the answers")
@@ -127,9 +127,9 @@ async def test_raw_cdr(house):
     assert json.loads(answers["application/json"])["error"]["code"] == "bad_request"
 
 
-async def test_a_service_that_is_absent(house):
-    house.start(service("/switch"), service("/typed", type=SET_BOOL))
-    client = house.client("alice")
+async def test_a_service_that_is_absent(harness):
+    harness.start(service("/switch"), service("/typed", type=SET_BOOL))
+    client = harness.client("alice")
     expected = ("unavailable", "there is no /switch on the bus")
     assert await client.error(CALL, {"data": True}) == expected
     assert await client.error("r2d2/typed/_call", {"data": True}) == (
@@ -138,19 +138,19 @@ async def test_a_service_that_is_absent(house):
     )
     answer = await client.call_311(CALL, {"data": True})
     assert answer["error"] == {"code": expected[0], "message": expected[1]}
-    Switch(house)
+    Switch(harness)
     await asyncio.sleep(0)
-    house.node.spin()
+    harness.node.spin()
     await asyncio.sleep(0)
     assert (await client.call(CALL))[0] == "ok"
 
 
 @pytest.mark.parametrize("ros", ["/switch", "/*"])
-async def test_a_service_that_vanishes_during_the_call(house, ros):
-    house.start(service(ros, mqtt="r2d2{ros}"))
-    switch = Switch(house)
+async def test_a_service_that_vanishes_during_the_call(harness, ros):
+    harness.start(service(ros, mqtt="r2d2{ros}"))
+    switch = Switch(harness)
     switch.holds = True
-    client = house.client("alice")
+    client = harness.client("alice")
     await asyncio.sleep(0)  # a pattern has seen it
     calling = asyncio.ensure_future(client.error(CALL, {"data": True}))
     await until(lambda: switch.asked, "the request")
@@ -158,17 +158,17 @@ async def test_a_service_that_vanishes_during_the_call(house, ros):
     assert await calling == ("vanished", "/switch went away before it answered")
 
 
-async def test_no_answer_within_the_routes_time(house):
-    house.start(service("/switch", timeout=0.05))
-    switch = Switch(house)
+async def test_no_answer_within_the_routes_time(harness):
+    harness.start(service("/switch", timeout=0.05))
+    switch = Switch(harness)
     switch.holds = True
-    client = house.client("alice")
+    client = harness.client("alice")
     assert await client.error(CALL) == ("timeout", "no answer from /switch within 0.05 s")
     switch.answer()  # too late: it is not told a second time
     await asyncio.sleep(0.02)
     assert len(client.on("answers/alice")) == 1
-    assert house.counters().under_way == 0
-    assert house.counters().errors == {"timeout": 1}
+    assert harness.counters().under_way == 0
+    assert harness.counters().errors == {"timeout": 1}
 
 
 @pytest.mark.parametrize(
@@ -180,31 +180,31 @@ async def test_no_answer_within_the_routes_time(house):
         (b"\xff\x00", "not JSON"),
     ],
 )
-async def test_a_payload_that_is_wrong_names_the_field(house, payload, problem):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    code, message = await house.client("alice").error(CALL, payload)
+async def test_a_payload_that_is_wrong_names_the_field(harness, payload, problem):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    code, message = await harness.client("alice").error(CALL, payload)
     assert code == "bad_request"
     assert problem in message
     assert switch.asked == []
 
 
-async def test_a_type_that_is_not_installed(house):
-    house.start(service("/switch"))
-    house.node.add_service("/switch", "no_pkg/srv/Thing", lambda request, respond: None)
-    house.node.spin()
-    code, message = await house.client("alice").error(CALL)
+async def test_a_type_that_is_not_installed(harness):
+    harness.start(service("/switch"))
+    harness.node.add_service("/switch", "no_pkg/srv/Thing", lambda request, respond: None)
+    harness.node.spin()
+    code, message = await harness.client("alice").error(CALL)
     assert code == "unknown_type"
     assert "no_pkg" in message
 
 
-async def test_calls_are_bounded_a_client_and_in_all(house):
-    house.start()
-    house.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5, 4)))
-    switch = Switch(house)
+async def test_calls_are_bounded_a_client_and_in_all(harness):
+    harness.start()
+    harness.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5, 4)))
+    switch = Switch(harness)
     switch.holds = True
-    house.node.spin()
-    clients = [house.client(name) for name in "abcd"]
+    harness.node.spin()
+    clients = [harness.client(name) for name in "abcd"]
     calls = [asyncio.ensure_future(c.call(CALL)) for c in clients[:2] for _ in range(2)]
     await until(lambda: len(switch.asked) == 4, "the requests")
     assert await clients[0].error(CALL) == (
@@ -223,10 +223,10 @@ async def test_calls_are_bounded_a_client_and_in_all(house):
     assert (await clients[0].call(CALL))[0] == "ok"  # all of their places are free again
 
 
-async def test_a_call_without_a_way_back_is_not_carried_out(house, caplog):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    client = house.client("alice", "r2d2/switch/_reply/alice/#")
+async def test_a_call_without_a_way_back_is_not_carried_out(harness, caplog):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    client = harness.client("alice", "r2d2/switch/_reply/alice/#")
     client.send(CALL, {"data": True})
     await until(lambda: client.on("r2d2/switch/_reply/alice"), "the error")
     (answer,) = client.payloads("r2d2/switch/_reply/alice")
@@ -235,34 +235,34 @@ async def test_a_call_without_a_way_back_is_not_carried_out(house, caplog):
     assert switch.asked == []
     assert "no_response_topic" in caplog.text
     # A client id that cannot be in a topic: MQTT 5's way is left to it.
-    strange = house.client("a/b")
+    strange = harness.client("a/b")
     strange.send(f"{CALL}/1", {"data": True})
     await asyncio.sleep(0.01)
     assert switch.asked == []
-    assert house.counters().errors == {"no_response_topic": 2}
+    assert harness.counters().errors == {"no_response_topic": 2}
     assert (await strange.call(CALL, {"data": True}, "answers/a/b"))[0] == "ok"
 
 
 @pytest.mark.parametrize("size", [100, 40_000], ids=str)
-async def test_a_way_back_that_no_topic_can_be_is_none(house, size):
+async def test_a_way_back_that_no_topic_can_be_is_none(harness, size):
     """Its own topic for answers would be longer than a string can be: refused, and no fault."""
-    house.start(service("/switch"))
-    switch = Switch(house)
-    client = house.client("a" * size)
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    client = harness.client("a" * size)
     client.send(f"{CALL}/{'t' * (65_500 - min(size, 60))}", {"data": True})
     await asyncio.sleep(0.01)
-    assert house.counters().errors == {"no_response_topic": 1}
-    assert not switch.asked and not house.broker.faults.count
-    assert (await house.client("bob").call(CALL, {"data": True}))[0] == "ok"
+    assert harness.counters().errors == {"no_response_topic": 1}
+    assert not switch.asked and not harness.broker.faults.count
+    assert (await harness.client("bob").call(CALL, {"data": True}))[0] == "ok"
 
 
-async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    house.rules.deny("mallory", "publish", "r2d2/cmd_vel")
-    mallory = house.client("mallory", "r2d2/#")
-    victim = house.client("victim", "r2d2/cmd_vel", "r2d2/arm", "$SYS/#")
-    house.broker.guards["r2d2/arm"] = []  # where commands are received that have rules
+async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    harness.rules.deny("mallory", "publish", "r2d2/cmd_vel")
+    mallory = harness.client("mallory", "r2d2/#")
+    victim = harness.client("victim", "r2d2/cmd_vel", "r2d2/arm", "$SYS/#")
+    harness.broker.guards["r2d2/arm"] = []  # where commands are received that have rules
     for topic in ("r2d2/cmd_vel", "$SYS/broker/version", "r2d2/arm"):
         mallory.send(CALL, {"data": True}, response_topic=topic)
     await until(lambda: len(mallory.on("r2d2/switch/_reply/mallory")) == 3, "the refusals")
@@ -273,73 +273,73 @@ async def test_a_caller_cannot_use_the_bridge_to_write_where_it_may_not(house):
     assert (await mallory.call(CALL, response_topic="r2d2/elsewhere"))[0] == "ok"
 
 
-async def test_the_replies_below_its_own_name_need_the_right_to_read_them(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    house.rules.deny("alice", "publish", "r2d2/switch/_reply")
-    house.rules.deny("bob", "receive", "r2d2/switch/_reply")
-    alice = house.client("alice", "r2d2/switch/_reply/alice/#")
+async def test_the_replies_below_its_own_name_need_the_right_to_read_them(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    harness.rules.deny("alice", "publish", "r2d2/switch/_reply")
+    harness.rules.deny("bob", "receive", "r2d2/switch/_reply")
+    alice = harness.client("alice", "r2d2/switch/_reply/alice/#")
     status, _ = await alice.call(CALL, response_topic="r2d2/switch/_reply/alice/mine")
     assert status == "ok"
     # Another's is not its own, though it begins alike.
     alice.send(CALL, response_topic="r2d2/switch/_reply/alice2/x")
     await until(lambda: alice.on("r2d2/switch/_reply/alice"), "the refusal")
     before = len(switch.asked)
-    house.client("bob").send(f"{CALL}/1")
-    await until(lambda: house.counters().errors["not_authorized"] == 2, "the second refusal")
+    harness.client("bob").send(f"{CALL}/1")
+    await until(lambda: harness.counters().errors["not_authorized"] == 2, "the second refusal")
     assert len(switch.asked) == before
 
 
-async def test_an_answer_is_no_call(house):
+async def test_an_answer_is_no_call(harness):
     """A Response Topic that is a call topic, or a route's to ROS, does not go round."""
-    house.start(service("/switch"))
-    switch = Switch(house)
+    harness.start(service("/switch"))
+    switch = Switch(harness)
     await asyncio.sleep(0)  # the bridge sees it
-    house.client("alice").send(CALL, {"data": True}, response_topic=CALL)
-    await until(lambda: house.counters().answers, "the answer")
+    harness.client("alice").send(CALL, {"data": True}, response_topic=CALL)
+    await until(lambda: harness.counters().answers, "the answer")
     await asyncio.sleep(0.02)
     assert switch.asked == [True]
 
 
-async def test_a_retained_call_is_not_carried_out(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    client = house.client("alice")
+async def test_a_retained_call_is_not_carried_out(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    client = harness.client("alice")
     client.send(CALL, {"data": True}, retain=True, response_topic="answers/alice")
     await until(lambda: client.on("answers/alice"), "the error")
     assert client.payloads("answers/alice")[0]["error"]["code"] == "bad_request"
     assert switch.asked == []
 
 
-async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    client = house.client("alice")
+async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    client = harness.client("alice")
     again = Message(CALL, b"", 1, properties={Property.RESPONSE_TOPIC: "answers/alice"})
-    house.broker.publish(Late(again, 60.0), client.session)
+    harness.broker.publish(Late(again, 60.0), client.session)
     client.send(CALL, {"data": True}, response_topic="answers/alice")
     await until(lambda: len(client.on("answers/alice")) == 2, "the errors")
     codes = [answer["error"]["code"] for answer in client.payloads("answers/alice")]
     assert codes == ["expired", "expired"] and switch.asked == []
-    house.broker.publish(Late(again, 1.0), house.client("bob").session)  # within its time
+    harness.broker.publish(Late(again, 1.0), harness.client("bob").session)  # within its time
     await until(lambda: switch.asked, "another client's call")
 
 
 @pytest.mark.parametrize(
     ("ago", "code"), [(60.0, "expired"), (-60.0, "bad_request"), (0.0, None), (3.0, None)]
 )
-async def test_a_call_is_as_old_as_it_says(house, ago, code):
+async def test_a_call_is_as_old_as_it_says(harness, ago, code):
     """Also the first of a client that was never seen, which may have queued it."""
-    house.start(service("/switch"))
-    switch = Switch(house)
-    house.node.spin()
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    harness.node.spin()
     await asyncio.sleep(0)
     said = {
         Property.RESPONSE_TOPIC: "answers/alice",
         Property.USER_PROPERTY: [("sent-at", str(time.time() - ago))],
     }
-    client = house.client("alice")
-    house.broker.publish(Message(CALL, b"", 1, properties=said), client.session)
+    client = harness.client("alice")
+    harness.broker.publish(Message(CALL, b"", 1, properties=said), client.session)
     if code is None:
         await until(lambda: switch.asked, "the call")
         return
@@ -348,25 +348,25 @@ async def test_a_call_is_as_old_as_it_says(house, ago, code):
     assert switch.asked == []
 
 
-async def test_patterns_follow_the_bus(house):
-    house.start(
+async def test_patterns_follow_the_bus(harness):
+    harness.start(
         service(["/arm/*", "!/arm/secret"], type="std_srvs/srv/*"),
         service(["/absent", "/**", "!/arm/secret"]),
     )
-    node = house.node
-    Switch(house, "/arm/grip")
-    other = Switch(house, "/other")
-    Switch(house, "/arm/secret")
-    Switch(house, "/_hidden")
+    node = harness.node
+    Switch(harness, "/arm/grip")
+    other = Switch(harness, "/other")
+    Switch(harness, "/arm/secret")
+    Switch(harness, "/_hidden")
     node.add_service("/node/set_parameters", "rcl_interfaces/srv/SetParameters", None)
     node.spin()
     await asyncio.sleep(0)
-    first, second = house.bridge.calls.status()
+    first, second = harness.bridge.calls.status()
     assert first.names == ("/arm/grip",)
     assert set(second.names) == {"/absent", "/other"}
-    client = house.client("alice")
+    client = harness.client("alice")
     assert (await client.call("r2d2/arm/grip/_call"))[0] == "ok"
-    routes = house.retained("r2d2/_appliance/routes")
+    routes = harness.retained("r2d2/_appliance/routes")
     assert {
         "ros": "/other",
         "mqtt": "r2d2/other/_call",
@@ -377,64 +377,64 @@ async def test_patterns_follow_the_bus(house):
     other.service.remove()
     node.spin()
     await asyncio.sleep(0)
-    assert house.bridge.calls.status()[1].names == ("/absent",)
-    assert [r["ros"] for r in house.retained("r2d2/_appliance/routes")] == ["/arm/grip"]
+    assert harness.bridge.calls.status()[1].names == ("/absent",)
+    assert [r["ros"] for r in harness.retained("r2d2/_appliance/routes")] == ["/arm/grip"]
 
 
-async def test_routes_come_and_go_while_calls_are_under_way(house):
+async def test_routes_come_and_go_while_calls_are_under_way(harness):
     stays = service("/switch")
-    house.start(stays, service("/other"))
-    switch, other = Switch(house), Switch(house, "/other")
+    harness.start(stays, service("/other"))
+    switch, other = Switch(harness), Switch(harness, "/other")
     switch.holds = other.holds = True
-    client = house.client("alice")
+    client = harness.client("alice")
     staying = asyncio.ensure_future(client.call(CALL))
     leaving = asyncio.ensure_future(client.call("r2d2/other/_call"))
     await until(lambda: switch.asked and other.asked, "the requests")
-    house.bridge.calls.replace(call_routes(stays, service("/new")))
+    harness.bridge.calls.replace(call_routes(stays, service("/new")))
     switch.answer()
     other.answer()  # what was asked before is answered yet
     assert (await staying)[0] == (await leaving)[0] == "ok"
     assert client.send("r2d2/other/_call") is ReasonCode.NO_MATCHING_SUBSCRIBERS
-    Switch(house, "/new")
-    house.node.spin()
+    Switch(harness, "/new")
+    harness.node.spin()
     await asyncio.sleep(0)
     assert (await client.call("r2d2/new/_call"))[0] == "ok"
-    assert house.counters().calls == 1
+    assert harness.counters().calls == 1
 
 
-async def test_what_is_under_way_is_told_when_the_appliance_stops_or_ros_ends(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
+async def test_what_is_under_way_is_told_when_the_appliance_stops_or_ros_ends(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
     switch.holds = True
-    client = house.client("alice")
+    client = harness.client("alice")
     calling = asyncio.ensure_future(client.error(CALL))
     await until(lambda: switch.asked, "the request")
-    house.node.fail("the node ended")
+    harness.node.fail("the node ended")
     assert await calling == ("ros_error", "the connection to ROS ended")
     assert (await client.error(CALL))[0] in ("unavailable", "ros_error")
-    house.node.running = True
-    house.node.spin()
+    harness.node.running = True
+    harness.node.spin()
     await asyncio.sleep(0)
     calling = asyncio.ensure_future(client.error(CALL))
     await until(lambda: len(switch.asked) == 2, "the request")
-    await house.bridge.stop()
+    await harness.bridge.stop()
     assert (await calling)[0] == "stopping"
 
 
-async def test_a_client_that_has_gone_leaves_nothing_behind(house):
-    house.start(service("/switch"))
-    Switch(house)
-    client = house.client("alice")
+async def test_a_client_that_has_gone_leaves_nothing_behind(harness):
+    harness.start(service("/switch"))
+    Switch(harness)
+    client = harness.client("alice")
     await client.call(CALL)
     for token in range(9):
         client.send(f"{CALL}/{token}")
-    await until(lambda: house.counters().answers == 10, "the answers")
+    await until(lambda: harness.counters().answers == 10, "the answers")
     gc.collect()
     gc.disable()  # nobody looks for circles among what is old
     try:
         client.leave()
         del client
-        await house.client("bob").call(CALL)  # caches that it was in are made anew
+        await harness.client("bob").call(CALL)  # caches that it was in are made anew
         sessions = [one for one in gc.get_objects() if isinstance(one, Session)]
         assert not [one for one in sessions if one.client_id == "alice"]
     finally:
@@ -450,8 +450,8 @@ PROVIDED = service("/ask", to="mqtt", type=SET_BOOL, timeout=0.2)
 class Asker:
     """A ROS client of /ask."""
 
-    def __init__(self, house):
-        self.house = house
+    def __init__(self, harness):
+        self.harness = harness
         self.responses = []
 
     def ask(self, data=True):
@@ -459,13 +459,13 @@ class Asker:
             response = None if response is None else value(f"{SET_BOOL}_Response", response)
             self.responses.append(response)
 
-        self.house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": data}), done)
+        self.harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {"data": data}), done)
 
 
-async def test_a_ros_service_that_mqtt_answers(house):
-    house.start(PROVIDED)
-    asker = Asker(house)
-    client = house.client("alice", "r2d2/ask/_request/+")
+async def test_a_ros_service_that_mqtt_answers(harness):
+    harness.start(PROVIDED)
+    asker = Asker(harness)
+    client = harness.client("alice", "r2d2/ask/_request/+")
     asker.ask()
     await until(lambda: client.received, "the request")
     (request,) = client.received
@@ -479,18 +479,18 @@ async def test_a_ros_service_that_mqtt_answers(house):
     await until(lambda: asker.responses, "the response")
     await asyncio.sleep(0.01)
     assert asker.responses == [{"success": True, "message": "hi"}]
-    counters = house.counters()
+    counters = harness.counters()
     assert (counters.calls, counters.answers, counters.under_way) == (1, 1, 0)
 
 
-async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(house):
+async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(harness):
     on_error = '{"success": false, "message": "nobody"}'
-    house.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.05, on_error=on_error))
-    asker = Asker(house)
+    harness.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.05, on_error=on_error))
+    asker = Asker(harness)
     nobody = {"success": False, "message": "nobody"}
     asker.ask()  # nobody has subscribed: at once
     await until(lambda: asker.responses == [nobody], "the first", 1)
-    client = house.client("alice", "r2d2/ask/_request/+")
+    client = harness.client("alice", "r2d2/ask/_request/+")
     asker.ask()  # no response
     await until(lambda: asker.responses == [nobody] * 2, "the second")
     for number, (payload, properties) in enumerate(
@@ -507,7 +507,7 @@ async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(house):
         topic = client.received[-1].properties[Property.RESPONSE_TOPIC]
         client.send(topic, payload, **properties)
         await until(lambda n=number: asker.responses == [nobody] * n, payload)
-    assert house.counters().errors == {
+    assert harness.counters().errors == {
         "unavailable": 1,
         "timeout": 1,
         "bad response": 2,
@@ -515,76 +515,76 @@ async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(house):
     }
 
 
-async def test_without_on_error_ros_gets_nothing(house):
-    house.start(PROVIDED)
-    asker = Asker(house)
+async def test_without_on_error_ros_gets_nothing(harness):
+    harness.start(PROVIDED)
+    asker = Asker(harness)
     asker.ask()
-    await until(lambda: house.counters().errors, "the failure")
+    await until(lambda: harness.counters().errors, "the failure")
     await asyncio.sleep(0.01)
     assert asker.responses == [None]
 
 
-async def test_an_offered_service_goes_with_its_route(house):
-    house.start(PROVIDED)
-    assert [s.name for s in house.node.own_services] == ["/ask"]
-    house.bridge.calls.replace(call_routes())
-    assert house.node.own_services == []
-    house.bridge.calls.replace(call_routes(PROVIDED))
-    house.node.spin()
-    assert [s.name for s in house.node.own_services] == ["/ask"]
+async def test_an_offered_service_goes_with_its_route(harness):
+    harness.start(PROVIDED)
+    assert [s.name for s in harness.node.own_services] == ["/ask"]
+    harness.bridge.calls.replace(call_routes())
+    assert harness.node.own_services == []
+    harness.bridge.calls.replace(call_routes(PROVIDED))
+    harness.node.spin()
+    assert [s.name for s in harness.node.own_services] == ["/ask"]
 
 
-async def test_bridges_without_calls_ask_nothing_of_the_graph(house):
-    house.node.services = None  # would raise
-    bridge = house.start()
+async def test_bridges_without_calls_ask_nothing_of_the_graph(harness):
+    harness.node.services = None  # would raise
+    bridge = harness.start()
     assert isinstance(bridge, Bridge)
-    house.node.spin()
+    harness.node.spin()
 
 
-async def test_a_client_id_with_a_slash_gives_no_way_into_the_answers_of_another(house):
-    house.start(service("/switch"))
-    switch = Switch(house)
-    house.rules.deny("alice/1", "publish", "r2d2/switch/_reply")
-    alice = house.client("alice", "r2d2/switch/_reply/alice/+")
-    mallory = house.client("alice/1")
+async def test_a_client_id_with_a_slash_gives_no_way_into_the_answers_of_another(harness):
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    harness.rules.deny("alice/1", "publish", "r2d2/switch/_reply")
+    alice = harness.client("alice", "r2d2/switch/_reply/alice/+")
+    mallory = harness.client("alice/1")
     for topic in ("r2d2/switch/_reply/alice/1", "r2d2/switch/_reply/alice/1/2"):
         mallory.send(CALL, {"data": True}, response_topic=topic)
-    await until(lambda: house.counters().errors.total() == 2, "the refusals")
+    await until(lambda: harness.counters().errors.total() == 2, "the refusals")
     await asyncio.sleep(0.02)
-    assert house.counters().errors == {"not_authorized": 2}
+    assert harness.counters().errors == {"not_authorized": 2}
     assert switch.asked == [] and alice.received == []
     status, _ = await mallory.call(CALL, {"data": True})  # where it may publish, it has answers
     assert status == "ok"
 
 
-async def test_of_two_services_at_one_topic_the_second_waits_for_it(house, caplog):
+async def test_of_two_services_at_one_topic_the_second_waits_for_it(harness, caplog):
     first, second = service("/switch"), service("/other", mqtt="r2d2/switch")
-    house.start(first)
-    switch, other = Switch(house), Switch(house, "/other")
-    client = house.client("alice")
-    house.bridge.calls.replace(call_routes(first, second))
+    harness.start(first)
+    switch, other = Switch(harness), Switch(harness, "/other")
+    client = harness.client("alice")
+    harness.bridge.calls.replace(call_routes(first, second))
     assert "/other cannot be called: calls at r2d2/switch/_call are for /switch" in caplog.text
     await client.call(CALL, {"data": True})
     assert (switch.asked, other.asked) == ([True], [])
-    house.bridge.calls.replace(call_routes(second))
+    harness.bridge.calls.replace(call_routes(second))
     await client.call(CALL, {"data": False})
     assert (switch.asked, other.asked) == ([True], [False])
-    house.bridge.calls.replace(call_routes())
-    assert house.bridge.calls.board._offers == {}
+    harness.bridge.calls.replace(call_routes())
+    assert harness.bridge.calls.dispatcher._endpoints == {}
 
 
-async def test_a_call_that_is_too_large(house):
-    house.start(service("/switch"), service("/ask", to="mqtt", type=SET_BOOL, on_error="{}"))
-    house.bridge.calls.board.limits = CallLimits(input=InputLimits(payload=100))
-    switch = Switch(house)
-    client = house.client("alice", "r2d2/ask/_request/+")
-    before = house.broker.counters.cost
+async def test_a_call_that_is_too_large(harness):
+    harness.start(service("/switch"), service("/ask", to="mqtt", type=SET_BOOL, on_error="{}"))
+    harness.bridge.calls.dispatcher.limits = CallLimits(input=InputLimits(payload=100))
+    switch = Switch(harness)
+    client = harness.client("alice", "r2d2/ask/_request/+")
+    before = harness.broker.counters.cost
     code, text = await client.error(CALL, b'{"data": true}' + b" " * 87)
     assert (code, switch.asked) == ("too_large", [])
     assert "101 bytes" in text and "bridge.limits.payload" in text
-    assert house.broker.counters.cost > before + 101 // 16
+    assert harness.broker.counters.cost > before + 101 // 16
     said = []
-    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
     await until(lambda: client.received[1:], "the request")
     request = client.received[-1].topic
     client.send(request.replace("_request", "_response"), b'{"success": true}' + b" " * 100)
@@ -592,55 +592,55 @@ async def test_a_call_that_is_too_large(house):
     assert value(f"{SET_BOOL}_Response", said[0])["success"] is False
 
 
-async def test_calls_are_bounded_in_bytes(house, monkeypatch):
+async def test_calls_are_bounded_in_bytes(harness, monkeypatch):
     monkeypatch.setattr(calls, "TOTAL_BYTES", 100)
-    house.start(service("/switch"))
-    switch = Switch(house)
+    harness.start(service("/switch"))
+    switch = Switch(harness)
     switch.holds = True
     await asyncio.sleep(0)  # the bridge sees it
-    client = house.client("alice")
+    client = harness.client("alice")
     for token in (1, 2):
         client.send(f"{CALL}/{token}", b'{"data": true}' + b" " * 26)
     code, _ = await client.error(CALL, b'{"data": true}' + b" " * 26)
     assert code == "too_many"
     await until(lambda: len(switch.asked) == 2, "the calls")
     switch.answer()
-    await until(lambda: house.counters().under_way == 0, "the answers")
+    await until(lambda: harness.counters().under_way == 0, "the answers")
     switch.holds = False
     assert (await client.call(CALL, {"data": True}))[0] == "ok"
 
 
-async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(house):
+async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(harness):
     on_error = '{"success": false, "message": "gone"}'
-    house.start(service("/ask", to="mqtt", type=SET_BOOL, on_error=on_error))
-    house.client("alice", "r2d2/ask/_request/+")
+    harness.start(service("/ask", to="mqtt", type=SET_BOOL, on_error=on_error))
+    harness.client("alice", "r2d2/ask/_request/+")
     said = []
-    house.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
-    await until(lambda: house.counters().under_way, "the request")
-    house.bridge.calls.replace(call_routes())
+    harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), said.append)
+    await until(lambda: harness.counters().under_way, "the request")
+    harness.bridge.calls.replace(call_routes())
     await until(lambda: said, "the response")
     assert value(f"{SET_BOOL}_Response", said[0])["message"] == "gone"
 
 
-async def test_a_service_of_another_type_than_the_route_says(house):
-    house.start(service("/switch", type=TRIGGER, timeout=1.0))
-    Switch(house)
-    client = house.client("alice")
+async def test_a_service_of_another_type_than_the_route_says(harness):
+    harness.start(service("/switch", type=TRIGGER, timeout=1.0))
+    Switch(harness)
+    client = harness.client("alice")
     code, text = await client.error(CALL)
     assert code == "unavailable"
     assert text == f"/switch is a {SET_BOOL} on the bus, not a {TRIGGER}"
 
 
-async def test_the_log_calls_nothing_callable_that_nobody_offers(house, caplog):
+async def test_the_log_calls_nothing_callable_that_nobody_offers(harness, caplog):
     caplog.set_level(logging.INFO)
-    house.start(service("/switch"))
+    harness.start(service("/switch"))
     assert "can be called" not in caplog.text
     assert "/switch: no node offers it yet; it will be called at r2d2/switch/_call" in caplog.text
-    switch = Switch(house)
-    house.node.spin()
+    switch = Switch(harness)
+    harness.node.spin()
     await until(lambda: "/switch can be called at r2d2/switch/_call" in caplog.text)
     switch.service.remove()
     await until(lambda: "/switch cannot be called any more" in caplog.text)
-    house.node.spin()
+    harness.node.spin()
     await asyncio.sleep(0)
     assert caplog.text.count("can be called") == 1

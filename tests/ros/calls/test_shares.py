@@ -8,7 +8,7 @@ import math
 import pytest
 
 pytest.importorskip("test_msgs.action")
-from call_house import AllTypes, House, action, call_routes, parameters, service, until
+from call_harness import AllTypes, CallHarness, action, call_routes, parameters, service, until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,7 +20,7 @@ from appliance.net.callbacks import Entries
 from appliance.ros.bridge import RouteSettings
 from appliance.ros.calls import actions
 from appliance.ros.calls.dispatcher import CallLimits
-from appliance.ros.calls.fair import FairTable
+from appliance.ros.calls.fair_cache import FairCache
 from appliance.ros.node import FakeNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
@@ -36,28 +36,28 @@ CALL, GOAL, STOP = "r2d2/slow/_call", "r2d2/walk/_goal", "r2d2/walk/_cancel"
 
 
 @pytest.fixture
-async def house():
-    house = House(FakeNode(types=AllTypes()))
-    yield house
-    await house.stop()
+async def harness():
+    harness = CallHarness(FakeNode(types=AllTypes()))
+    yield harness
+    await harness.stop()
 
 
-def clients(house, user, count):
+def clients(harness, user, count):
     """So many of one user."""
-    return [house.client(f"{user}{number}", user=user) for number in range(count)]
+    return [harness.client(f"{user}{number}", user=user) for number in range(count)]
 
 
 class Slow:
     """A service that answers when it is told to, and an action whose goals go on until then."""
 
-    def __init__(self, house):
-        self.house = house
+    def __init__(self, harness):
+        self.harness = harness
         self.waiting = []
         self.results = {}
         #: Requests to cancel that are not answered yet.
         self.held = []
         self.holds_cancels = False
-        node = house.node
+        node = harness.node
         node.add_service("/slow", SET_BOOL, lambda _, respond: self.waiting.append(respond))
         for name, type_name, handle in (
             ("send_goal", f"{FIBONACCI}_SendGoal", self.on_goal),
@@ -97,26 +97,26 @@ class Slow:
         self.waiting.clear()
 
 
-async def begin(house, limits=None, **route):
-    house.start()
-    house.bridge.calls.replace(
+async def begin(harness, limits=None, **route):
+    harness.start()
+    harness.bridge.calls.replace(
         call_routes(
             service("/slow", timeout=60.0),
             action("/walk", timeout=60.0, **route),
             limits=limits or CallLimits(),
         )
     )
-    slow = Slow(house)
+    slow = Slow(harness)
     await asyncio.sleep(0)
-    house.node.spin()
+    harness.node.spin()
     return slow
 
 
-async def test_the_calls_of_one_user_leave_room_for_another(house):
+async def test_the_calls_of_one_user_leave_room_for_another(harness):
     """25 clients with 20 slow calls each: before, the operator's calls failed, and cancels too."""
-    slow = await begin(house)
-    crowd = clients(house, "mallory", 25)
-    operator = house.client("operator")
+    slow = await begin(harness)
+    crowd = clients(harness, "mallory", 25)
+    operator = harness.client("operator")
     _, goal = await operator.call(GOAL, {"order": 3})
     for client in crowd:
         for number in range(20):
@@ -135,7 +135,7 @@ async def test_the_calls_of_one_user_leave_room_for_another(house):
     assert (status, answer) == ("ok", {"goals_canceling": [goal["goal_id"]]})
     slow.finish()
     await asyncio.gather(*calls)
-    await until(lambda: house.counters().under_way == 0, "all are answered")
+    await until(lambda: harness.counters().under_way == 0, "all are answered")
     assert (await asyncio.gather(operator.call(CALL), _later(slow)))[0][0] == "ok"
 
 
@@ -144,13 +144,13 @@ async def _later(slow):
     slow.finish()
 
 
-async def test_who_cancels_much_keeps_nobody_from_cancelling(house):
-    slow = await begin(house, CallLimits(client=2, total=8))
-    operator = house.client("operator")
+async def test_who_cancels_much_keeps_nobody_from_cancelling(harness):
+    slow = await begin(harness, CallLimits(client=2, total=8))
+    operator = harness.client("operator")
     goal = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
     slow.holds_cancels = True
     for user in "abcde":  # more users than share the places of calls
-        (client,) = clients(house, user, 1)
+        (client,) = clients(harness, user, 1)
         own = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
         for number in range(2):
             client.send(f"{STOP}/{number}", {"goal_id": own})
@@ -167,10 +167,10 @@ async def test_who_cancels_much_keeps_nobody_from_cancelling(house):
         answer({"goals_canceling": [request["goal_info"]]})
 
 
-async def test_the_clients_without_a_user_are_one_user(house):
-    slow = await begin(house, CallLimits(client=2, total=8))
-    crowd = [house.client(f"nobody{number}") for number in range(3)]
-    nobody = house.broker.accounting.accounts.of(Identity(None, "nobody"))
+async def test_the_clients_without_a_user_are_one_user(harness):
+    slow = await begin(harness, CallLimits(client=2, total=8))
+    crowd = [harness.client(f"nobody{number}") for number in range(3)]
+    nobody = harness.broker.accounting.accounts.of(Identity(None, "nobody"))
     for client in crowd:
         client.session.account = nobody
     for client in crowd[:2]:
@@ -182,31 +182,31 @@ async def test_the_clients_without_a_user_are_one_user(house):
     slow.finish()
 
 
-async def test_the_goals_of_one_user_leave_room_for_another(house):
-    slow = await begin(house, CallLimits(client=3, total=16))
-    crowd = clients(house, "mallory", 3)
+async def test_the_goals_of_one_user_leave_room_for_another(harness):
+    slow = await begin(harness, CallLimits(client=3, total=16))
+    crowd = clients(harness, "mallory", 3)
     for client in crowd[:2]:
         for _ in range(2):
             assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
     code, text = await crowd[2].error(GOAL, {"order": 3})
     assert code == "too_many" and "4 goals of the user 'mallory'" in text
-    operator = house.client("operator")
+    operator = harness.client("operator")
     for _ in range(3):
         assert (await operator.call(GOAL, {"order": 3}))[0] == "ok"
     assert "3 goals of this client" in (await operator.error(GOAL, {"order": 3}))[1]
     await until(lambda: len(slow.results) == 7, "the results are asked for")
     slow.finish()
-    await until(lambda: not house.bridge.calls._actions.places._total, "they end")
+    await until(lambda: not harness.bridge.calls._actions.slots._total, "they end")
     assert (await crowd[2].call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(house, monkeypatch):
+async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkeypatch):
     """10,118 short goals of another client made it so that its owner could not cancel it."""
     monkeypatch.setattr(actions, "ENDED", 50)
-    slow = await begin(house)
+    slow = await begin(harness)
     for user in ("operator", "mallory"):
-        house.rules.deny(user, "publish", "r2d2/walk/_cancel_any")
-    operator, mallory = house.client("operator"), house.client("mallory")
+        harness.rules.deny(user, "publish", "r2d2/walk/_cancel_any")
+    operator, mallory = harness.client("operator"), harness.client("mallory")
     goal = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
     await until(lambda: slow.results, "its result is asked for")
     held, slow.results = slow.results, {}
@@ -217,7 +217,7 @@ async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(house, monkeypa
         assert (await mallory.call(GOAL, {"order": 3}))[0] == "ok"
         await until(lambda: slow.results, "its result is asked for")
         slow.finish()
-    table = house.bridge.calls._actions.ended
+    table = harness.bridge.calls._actions.ended
     await until(lambda: len(table) == 50, "it is full")
     assert (await mallory.error(STOP, {"goal_id": goal}))[0] == "not_authorized"
     assert (await operator.call(STOP, {"goal_id": goal}))[0] == "ok"
@@ -227,54 +227,56 @@ async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(house, monkeypa
     slow.finish()
 
 
-async def test_the_results_of_one_user_leave_those_of_another(house, monkeypatch):
+async def test_the_results_of_one_user_leave_those_of_another(harness, monkeypatch):
     monkeypatch.setattr(actions, "RESULTS", 4)
-    slow = await begin(house)
-    operator, mallory = house.client("operator"), house.client("mallory")
+    slow = await begin(harness)
+    operator, mallory = harness.client("operator"), harness.client("mallory")
 
     async def result_of(client):
         goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]
         await until(lambda: slow.results, "its result is asked for")
         slow.finish()
         topic = f"r2d2/walk/_result/{goal}"
-        await until(lambda: house.retained(topic), "the result")
+        await until(lambda: harness.retained(topic), "the result")
         return topic
 
     own = await result_of(operator)
     others = [await result_of(mallory) for _ in range(6)]
-    assert house.retained(own) is not None
-    assert [house.retained(topic) is not None for topic in others] == [False] * 3 + [True] * 3
+    assert harness.retained(own) is not None
+    assert [harness.retained(topic) is not None for topic in others] == [False] * 3 + [True] * 3
 
 
-async def test_kept_results_are_bounded_in_bytes(house, monkeypatch):
+async def test_kept_results_are_bounded_in_bytes(harness, monkeypatch):
     monkeypatch.setattr(actions, "RESULT_BYTES", 100)  # of 43 bytes or so each
-    slow = await begin(house)
-    client = house.client("alice")
+    slow = await begin(harness)
+    client = harness.client("alice")
     for _ in range(5):
         await client.call(GOAL, {"order": 3})
         await until(lambda: slow.results, "its result is asked for")
         slow.finish()
-        await until(lambda: not house.bridge.calls._actions.places._total, "it has ended")
-    assert len(list(house.broker.retained.find("r2d2/walk/_result/+"))) == 2
+        await until(lambda: not harness.bridge.calls._actions.slots._total, "it has ended")
+    assert len(list(harness.broker.retained.find("r2d2/walk/_result/+"))) == 2
 
 
-async def test_what_cancels_is_small(house):
-    await begin(house)
-    client = house.client("alice")
+async def test_what_cancels_is_small(harness):
+    await begin(harness)
+    client = harness.client("alice")
     code, text = await client.error(STOP, b'{"all": true}' + b" " * 2000)
     assert code == "too_large" and "takes 1024 at most" in text
 
 
-async def test_errors_of_size_say_which_limit(house):
-    house.start(service("/arrays"), parameters("/arm/*"))
+async def test_errors_of_size_say_which_limit(harness):
+    harness.start(service("/arrays"), parameters("/arm/*"))
     limits = CallLimits(input=InputLimits(payload=400_000, items=1000))
-    house.bridge.calls.board.limits = limits
+    harness.bridge.calls.dispatcher.limits = limits
     asked = []
-    house.node.add_service("/arrays", ARRAYS, lambda cdr, respond: asked.append(cdr))
-    house.node.add_service("/arm/get_parameters", "rcl_interfaces/srv/GetParameters", asked.append)
+    harness.node.add_service("/arrays", ARRAYS, lambda cdr, respond: asked.append(cdr))
+    harness.node.add_service(
+        "/arm/get_parameters", "rcl_interfaces/srv/GetParameters", asked.append
+    )
     await asyncio.sleep(0)
-    house.node.spin()
-    client = house.client("alice")
+    harness.node.spin()
+    client = harness.client("alice")
     for topic, payload, expected in (
         ("arrays/_call", {"string_values": ["a"] * 2000}, "than 1000 (bridge.limits.items)"),
         ("arrays/_call", b"[" * 400_001, "at most 400000 are converted (bridge.limits.payload)"),
@@ -287,29 +289,29 @@ async def test_errors_of_size_say_which_limit(house):
     assert asked == [] or len(asked) == 1  # the look at the parameters
 
 
-async def test_who_may_not_call_has_nothing_converted(house):
-    slow = await begin(house, CallLimits(client=1))
-    house.rules.deny("alice", "publish", "forbidden")
-    client = house.client("alice")
+async def test_who_may_not_call_has_nothing_converted(harness):
+    slow = await begin(harness, CallLimits(client=1))
+    harness.rules.deny("alice", "publish", "forbidden")
+    client = harness.client("alice")
     nonsense = b"not JSON" * 1000
     code, _ = await client.error(CALL, nonsense)
     assert code == "bad_request"
     client.send(f"{CALL}/1", {"data": True})
     await until(lambda: slow.waiting, "the call")
     assert (await client.error(CALL, nonsense))[0] == "too_many"
-    before = house.counters().errors["not_authorized"]
+    before = harness.counters().errors["not_authorized"]
     client.send(CALL, nonsense, response_topic="forbidden")
-    assert house.counters().errors["not_authorized"] == before + 1
+    assert harness.counters().errors["not_authorized"] == before + 1
     slow.finish()
 
 
-async def test_commands_and_calls_of_a_client_stay_in_order(house):
+async def test_commands_and_calls_of_a_client_stay_in_order(harness):
     routes = [RouteSettings(f"/{name}", "ros", f"r2d2/{name}", STRING) for name in ("a", "b")]
-    house.start(service("/slow", timeout=60.0), topics=routes)
-    slow = Slow(house)
-    peers = [house.node.add_subscriber(f"/{name}", STRING) for name in ("a", "b")]
-    await until(lambda: len(house.bridge.topics()) == 2, "the routes")
-    alice, bob = house.client("alice"), house.client("bob")
+    harness.start(service("/slow", timeout=60.0), topics=routes)
+    slow = Slow(harness)
+    peers = [harness.node.add_subscriber(f"/{name}", STRING) for name in ("a", "b")]
+    await until(lambda: len(harness.bridge.topics()) == 2, "the routes")
+    alice, bob = harness.client("alice"), harness.client("bob")
     bob.send("r2d2/b", {"data": "b" * 5000})  # it has its turn now, and the others wait
     for number in range(3):
         alice.send("r2d2/a", {"data": f"{number}" + "a" * 5000})
@@ -317,7 +319,7 @@ async def test_commands_and_calls_of_a_client_stay_in_order(house):
     alice.send(f"{CALL}/1", {"data": True})
     bob.send("r2d2/b", {"data": "little, too"})
     assert [len(peer.received) for peer in peers] == [0, 2]
-    assert house.broker.accounting.queued_bytes > 15_000
+    assert harness.broker.accounting.queued_bytes > 15_000
     texts = CONVERTERS.get(STRING)
     await until(lambda: len(peers[0].received) == 4, "all commands")
     order = [texts.to_dict(cdr)["data"][:2] for cdr in peers[0].received]
@@ -327,18 +329,18 @@ async def test_commands_and_calls_of_a_client_stay_in_order(house):
     assert alice.session.account.bytes < 5000
 
 
-async def test_who_has_too_much_waiting_is_told_so(house, monkeypatch):
+async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     monkeypatch.setattr(turns, "WAITING_OF_USER", 20_000)
-    house.start(topics=[RouteSettings("/a", "ros", "r2d2/a", STRING)])
-    peer = house.node.add_subscriber("/a", STRING)
-    await until(lambda: house.bridge.topics(), "the route")
-    alice = house.client("alice")
+    harness.start(topics=[RouteSettings("/a", "ros", "r2d2/a", STRING)])
+    peer = harness.node.add_subscriber("/a", STRING)
+    await until(lambda: harness.bridge.topics(), "the route")
+    alice = harness.client("alice")
     for _ in range(6):
         alice.send("r2d2/a", {"data": "a" * 5000})
-    objection = house.broker.objection
+    objection = harness.broker.objection
     assert objection.code == 0x97 and "waits to be converted" in objection.reason
     await until(lambda: len(peer.received) == 4, "those that had room")
-    assert house.bridge.topics()[0].errors == 2
+    assert harness.bridge.topics()[0].errors == 2
 
 
 # the table
@@ -352,7 +354,7 @@ async def test_who_has_too_much_waiting_is_told_so(house, monkeypatch):
     st.integers(1, 60) | st.just(math.inf),
 )
 def test_a_fair_table_takes_from_who_has_most(puts, entries, size):
-    table = FairTable(entries, size)
+    table = FairCache(entries, size)
     known = {}  # in the order of their coming
     for user, key, weight in puts:
         known.pop(key, None)
@@ -403,14 +405,14 @@ class Who:
 LARGE = turns.LITTLE + 1
 
 
-def turn_house(memory=1 << 20):
+def conversion_queue(memory=1 << 20):
     clock = Clock()
     accounting = Accounting(Limits(memory=memory), MemoryStore())
     return clock, turns.ConversionQueue(Entries(clock, Faults()), accounting)
 
 
 def test_one_is_done_at_once_and_the_others_one_a_turn():
-    clock, queue = turn_house()
+    clock, queue = conversion_queue()
     done = []
     for user in "abc":
         queue.do(Who(user), LARGE, lambda user=user: done.append(user))
@@ -424,7 +426,7 @@ def test_one_is_done_at_once_and_the_others_one_a_turn():
 
 
 def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
-    clock, queue = turn_house()
+    clock, queue = conversion_queue()
     done = []
     first, second, other = Who("a"), Who("a"), Who("b")
     queue.do(Who("c"), LARGE, lambda: None)
@@ -447,7 +449,7 @@ def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
 
 
 def test_what_fails_lets_the_next_have_its_turn(escaped):
-    clock, queue = turn_house()
+    clock, queue = conversion_queue()
     done = []
 
     def fail():
@@ -463,7 +465,7 @@ def test_what_fails_lets_the_next_have_its_turn(escaped):
 
 
 def test_what_cannot_wait_makes_the_others_wait():
-    clock, queue = turn_house()
+    clock, queue = conversion_queue()
     done = []
     for _ in range(5):
         queue.now(lambda: done.append("now"))
@@ -475,7 +477,7 @@ def test_what_cannot_wait_makes_the_others_wait():
 
 
 def test_what_waits_takes_memory_of_its_user(monkeypatch):
-    clock, queue = turn_house(memory=800_000)
+    clock, queue = conversion_queue(memory=800_000)
     a, b = Who("a"), Who("b")
     queue.do(a, LARGE, lambda: None)
     count = 0

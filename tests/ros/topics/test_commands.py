@@ -920,18 +920,18 @@ def test_limits_that_a_type_cannot_have(type_name, rules, problem):
 async def test_no_answer_to_a_call_is_a_command(house):
     """It would come late, as the appliance's own, and outlive the client that asked for it."""
     house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    board = house.bridge.calls.board
+    dispatcher = house.bridge.calls.dispatcher
 
     async def slow():
         return Answer(GO)
 
-    offer = CallEndpoint("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
-    board.offer(offer)
+    endpoint = CallEndpoint("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
+    dispatcher.register(endpoint)
     driver = Driver(house.broker, "a")
     properties = {Property.RESPONSE_TOPIC: TOPIC}
     driver.say(Publish("r2d2/slow/_call", b"", properties=properties))
     await asyncio.sleep(0.02)
-    board.withdraw(offer)
+    dispatcher.unregister(endpoint)
     assert house.robot.received == []
 
 

@@ -139,7 +139,7 @@ class Client(InsideLink):
         return answer["error"]["code"], answer["error"]["message"]
 
 
-class House:
+class CallHarness:
     def __init__(self, node):
         self.node = node
         self.rules = Rules()

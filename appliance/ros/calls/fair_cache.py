@@ -11,7 +11,7 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 
-class _Share(Generic[K, V]):
+class _UserEntries(Generic[K, V]):
     """What one user has: values with their sizes, the oldest first."""
 
     def __init__(self) -> None:
@@ -19,14 +19,14 @@ class _Share(Generic[K, V]):
         self.size = 0
 
 
-class FairTable(Generic[K, V]):
+class FairCache(Generic[K, V]):
     """Values by keys, each of a user (None: of all without one). It has up to `entries` of them,
     and up to `size` in all of what `put` says each has."""
 
     def __init__(self, entries: int, size: float = math.inf) -> None:
         self._most = entries
         self._largest = size
-        self._shares: dict[str | None, _Share[K, V]] = {}
+        self._shares: dict[str | None, _UserEntries[K, V]] = {}
         self._user_of: OrderedDict[K, str | None] = OrderedDict()
         self._size = 0
 
@@ -45,7 +45,7 @@ class FairTable(Generic[K, V]):
     def put(self, user: str | None, key: K, value: V, size: int = 0) -> list[tuple[K, V]]:
         """Add a value; returns what had to go for it."""
         self.remove(key)
-        share = self._shares.setdefault(user, _Share())
+        share = self._shares.setdefault(user, _UserEntries())
         share.entries[key] = value, size
         share.size += size
         self._user_of[key] = user
