@@ -24,14 +24,15 @@ robot: r2d2
 broker: {plugins: {some.Plugin: {password: s3cret-word}}}
 """
 
-#: The appliance with a part that fails at its start, as no user can mend.
+#: The appliance with a part that fails at its start.
 FAILING = """\
 import sys
-from appliance import app, cli
+from appliance.app import main as app
+from appliance.cli.main import main
 def fail(self):
     raise ValueError("a part\\nfailed")
 app.App._open_to_commands = fail
-cli.main(["run", "-c", sys.argv[1]])
+main(["run", "-c", sys.argv[1]])
 """
 
 
