@@ -26,7 +26,7 @@ from appliance.certs.contexts import (
 from appliance.certs.export import check_password, write_bundle, write_pkcs12
 from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
 from appliance.certs.identity import username_of
-from appliance.certs.listing import Ending, Listed, endings, listed
+from appliance.certs.listing import Ending, ListedCertificate, endings, listed
 from appliance.certs.registry import Issued
 from appliance.certs.renewal import keep_server_certificate, server_outside, server_revoked
 from appliance.certs.requests import REQUEST_SIZE

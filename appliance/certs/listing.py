@@ -19,7 +19,7 @@ _RANK: Final = {"authority": 0, "server": 1, "client": 2}
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ListedCertificate:
     """One certificate; `replaced` is valid too, but there is a newer one of the same name.
 
     `file` is None when it is not here, or not the newest.
@@ -96,14 +96,16 @@ def endings(files: TlsFiles) -> list[Ending]:
     return [Ending(what, file, end, (end - now).days) for what, file, end in found]
 
 
-def listed(directory: Path) -> list[Listed]:
+def listed(directory: Path) -> list[ListedCertificate]:
     """The authority, the server's certificates and the clients', by name, the newest first."""
     now = datetime.now(timezone.utc)
     path = directory / "ca.crt"
     authority = load_certificates(path)[0]
     end = authority.not_valid_after_utc
     days, state = _left(end, now)
-    found = [Listed("ca", "authority", state, authority.serial_number, end, days, None, path)]
+    found = [
+        ListedCertificate("ca", "authority", state, authority.serial_number, end, days, None, path)
+    ]
     seen: set[tuple[str, str]] = set()
     for entry in reversed(issued(directory)):
         days, state = _left(entry.expires, now)
@@ -114,7 +116,9 @@ def listed(directory: Path) -> list[Listed]:
         seen.add((entry.kind, entry.name))
         file = _file_of(directory, entry)
         serial, end = entry.serial, entry.expires
-        found.append(Listed(entry.name, entry.kind, state, serial, end, days, entry.revoked, file))
+        found.append(
+            ListedCertificate(entry.name, entry.kind, state, serial, end, days, entry.revoked, file)
+        )
     return sorted(found, key=lambda item: (_RANK[item.purpose], item.name))
 
 

@@ -12,7 +12,7 @@ import typer
 from appliance.cli.console import CommandError
 
 if TYPE_CHECKING:
-    from appliance.ops.install import Installation, Step
+    from appliance.ops.install import InstallStep, ServiceInstaller
 
 RootOption = Annotated[
     Path,
@@ -117,16 +117,16 @@ def uninstall(
         raise CommandError(str(error)) from None
 
 
-def _say(step: Step) -> None:
+def _say(step: InstallStep) -> None:
     typer.echo(f"{step.verb:<8}  {step.subject}: {step.text}")
 
 
-def _installation(root: Path, dry_run: bool, user: str = "") -> Installation:
-    from appliance.ops.install import COMMAND, Installation
+def _installation(root: Path, dry_run: bool, user: str = "") -> ServiceInstaller:
+    from appliance.ops.install import COMMAND, ServiceInstaller
 
     if hasattr(sys, "frozen"):
-        return Installation(COMMAND, Path(sys.executable), root, user, dry_run=dry_run)
+        return ServiceInstaller(COMMAND, Path(sys.executable), root, user, dry_run=dry_run)
     called = Path(sys.argv[0]).absolute()
     if called.name != "appliance":  # python -m appliance
         called = Path(sysconfig.get_path("scripts"), "appliance")
-    return Installation(called, None, root, user, dry_run=dry_run)
+    return ServiceInstaller(called, None, root, user, dry_run=dry_run)

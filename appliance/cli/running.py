@@ -37,12 +37,12 @@ def init(
     from appliance.certs import CertificateError
     from appliance.config import ConfigError
     from appliance.host.owners import OwnerError, acting_for
-    from appliance.ops.init import Credentials, InitError, Step, initialise
+    from appliance.ops.init import Credentials, InitError, InitStep, initialise
 
     try:
         with acting_for(directory / "appliance.yaml"):
             for step in initialise(directory, robot=robot, user=user, demo=demo, names=name or []):
-                if isinstance(step, Step):
+                if isinstance(step, InitStep):
                     verb = "made" if step.made else "kept"
                     typer.echo(f"{verb}  {shown(step.path)}: {step.text}")
                 elif isinstance(step, Credentials):

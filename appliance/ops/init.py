@@ -85,7 +85,7 @@ class InitError(Exception):
 
 
 @dataclass(frozen=True)
-class Step:
+class InitStep:
     """One file: whether it was made now or kept as it was, and what to know about it."""
 
     path: Path
@@ -121,7 +121,7 @@ def initialise(
     demo: bool = False,
     configuration: str = CONFIGURATION,
     names: Sequence[str] = (),
-) -> Iterator[Step | Credentials]:
+) -> Iterator[InitStep | Credentials]:
     """Makes what is missing in `directory`, telling each step as it is done.
 
     `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none;
@@ -142,11 +142,11 @@ def initialise(
     settings = config.load(file)
     if robot and not made and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")
-    yield Step(file, made, f"configuration of robot {settings.robot!r}")
+    yield InitStep(file, made, f"configuration of robot {settings.robot!r}")
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
-    yield Step(settings.broker.acl, made, "access rules")
+    yield InitStep(settings.broker.acl, made, "access rules")
     # Last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
 
@@ -193,13 +193,13 @@ def _filter(part: str) -> str:
     return "+" if "*" in part else part
 
 
-def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[Step]:
+def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[InitStep]:
     tls = settings.broker.tls
     directory = tls.certificate.parent
     authority, readme = directory / "ca.crt", directory / "README.md"
     ours = (directory / "server.crt", directory / "server.key", authority)
     if tls.certificate.exists() and tls.key.exists():
-        yield Step(tls.certificate, False, "the server's certificate")
+        yield InitStep(tls.certificate, False, "the server's certificate")
         return
     if (tls.certificate, tls.key, tls.ca) != ours:
         raise InitError(
@@ -211,21 +211,21 @@ def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Itera
     names += [name for name in more_names if name not in names]
     if made:
         certs.create_authority(directory, settings.robot, names, addresses)
-    yield Step(authority, made, "this appliance's own CA, for every client")
+    yield InitStep(authority, made, "this appliance's own CA, for every client")
     certs.issue_server(directory, names, addresses)
     known = ", ".join([*names, *map(str, addresses)])
-    yield Step(tls.certificate, True, f"the server's certificate, for {known}")
+    yield InitStep(tls.certificate, True, f"the server's certificate, for {known}")
     if not readme.exists():
         certs.write_readme(directory)
-        yield Step(readme, True, "what each of these files is, and who may have it")
+        yield InitStep(readme, True, "what each of these files is, and who may have it")
 
 
 def _users(
     settings: config.Settings, user: str, password_file: Path | None
-) -> Iterator[Step | Credentials]:
+) -> Iterator[InitStep | Credentials]:
     path = settings.broker.users
     if path.exists():
-        yield Step(path, False, f"users: {', '.join(Passwords.load(path).users())}")
+        yield InitStep(path, False, f"users: {', '.join(Passwords.load(path).users())}")
         return
     password = generate_password()
     users = Passwords(path)
@@ -234,9 +234,9 @@ def _users(
         password_file.unlink(missing_ok=True)
         _write_new(password_file, password + "\n", mode=0o600)
     users.save()
-    yield Step(path, True, f"users: {user}")
+    yield InitStep(path, True, f"users: {user}")
     if password_file is not None:
-        yield Step(password_file, True, f"the password of {user}, for the demo")
+        yield InitStep(password_file, True, f"the password of {user}, for the demo")
     yield Credentials(user, password)
 
 

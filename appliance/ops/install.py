@@ -19,8 +19,7 @@ from typing import Literal, NamedTuple
 from appliance import config
 from appliance.host.environment import for_other_programs
 from appliance.ops.init import CONFIGURATION as CONFIGURATION_TEXT
-from appliance.ops.init import Credentials, initialise, robot_name
-from appliance.ops.init import Step as InitStep
+from appliance.ops.init import Credentials, InitStep, initialise, robot_name
 from appliance.ops.unit import CONFIGURATION, DATA, ENVIRONMENT, NAME, OWN_USER, VARIABLES, Unit
 
 #: Where the single file goes, and an administrator's own units; and those of a package.
@@ -61,7 +60,7 @@ class InstallError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class InstallStep:
     """One thing, done or, with `dry_run`, to be done."""
 
     verb: Verb
@@ -76,7 +75,7 @@ class _Account(NamedTuple):
 
 
 @dataclass
-class Installation:
+class ServiceInstaller:
     """An appliance as a service below `root`.
 
     `source` is the single file that is to be the command; without one it is `command`, which stays
@@ -101,7 +100,7 @@ class Installation:
         self.root = self.root.resolve()
         self.user = self.user or self._user_before() or OWN_USER
 
-    def install(self) -> Iterator[Step | Credentials]:
+    def install(self) -> Iterator[InstallStep | Credentials]:
         """Puts everything in place, or the newer version in that of the older one.
 
         Raises:
@@ -123,7 +122,7 @@ class Installation:
                     if self._starts:
                         _before(self._at(path)).unlink(missing_ok=True)
 
-    def uninstall(self, *, purge: bool = False) -> Iterator[Step]:
+    def uninstall(self, *, purge: bool = False) -> Iterator[InstallStep]:
         """Takes the service and the command away; with `purge` what they have written as well.
 
         Raises:
@@ -133,7 +132,7 @@ class Installation:
         with self._alone():
             yield from self._uninstall(purge)
 
-    def _uninstall(self, purge: bool) -> Iterator[Step]:
+    def _uninstall(self, purge: bool) -> Iterator[InstallStep]:
         if self._lives_here and self._at(UNIT_FILE).exists():
             yield self._step("done", "systemctl", "the service is stopped", self._disable)
         for path in self._put_before():
@@ -149,7 +148,7 @@ class Installation:
             if not place.exists():
                 continue
             if not purge:
-                yield Step("kept", str(path), f"{text}; --purge removes it")
+                yield InstallStep("kept", str(path), f"{text}; --purge removes it")
             else:
                 if place.is_symlink():
                     text = f"the link; {text} stay in {place.resolve()}"
@@ -158,7 +157,7 @@ class Installation:
             remove = partial(self._run, "userdel", *self._prefix, OWN_USER)
             yield self._step("removed", OWN_USER, "the service's user", remove)
 
-    def _install(self) -> Iterator[Step | Credentials]:
+    def _install(self) -> Iterator[InstallStep | Credentials]:
         yield from self._install_command()
         account = self._account()
         if account is None:
@@ -299,7 +298,7 @@ class Installation:
             return PACKAGED_COMMAND
         return self.command if self.source is None else COMMAND
 
-    def _install_command(self) -> Iterator[Step]:
+    def _install_command(self) -> Iterator[InstallStep]:
         if self.packaged:
             # What was installed by hand before would stand in the way of the package's.
             by_hand = self._at(UNIT_FILE)
@@ -309,11 +308,11 @@ class Installation:
                     yield self._step("removed", str(path), "it is the package's now", unlink)
             return
         if self.source is None:
-            yield Step("kept", str(self.command), "the command, where it is")
+            yield InstallStep("kept", str(self.command), "the command, where it is")
             return
         place = self._at(COMMAND)
         if place.exists() and (place.samefile(self.source) or _same(place, self.source)):
-            yield Step("kept", str(COMMAND), "the command, which is this version")
+            yield InstallStep("kept", str(COMMAND), "the command, which is this version")
             return
         verb: Verb = "replaced" if place.exists() else "made"
         put = partial(self._put, COMMAND, self.source, 0o755)
@@ -336,7 +335,7 @@ class Installation:
     def _prefix(self) -> Sequence[str]:
         return () if self.root == Path("/") else ("--prefix", str(self.root.absolute()))
 
-    def _add_user(self) -> Step:
+    def _add_user(self) -> InstallStep:
         if self.user != OWN_USER:
             raise InstallError(f"there is no user {self.user}")
         options = ("--system", "--user-group", "--no-create-home", "--home-dir", str(DATA))
@@ -348,7 +347,7 @@ class Installation:
             lambda: self._run("useradd", *self._prefix, *options, *shell, self.user),
         )
 
-    def _configuration(self, account: _Account | None) -> Iterator[Step | Credentials]:
+    def _configuration(self, account: _Account | None) -> Iterator[InstallStep | Credentials]:
         place = self._at(CONFIGURATION)
         if not self.initialise:
             return
@@ -357,7 +356,7 @@ class Installation:
             is_there = os.access(place, os.X_OK) and (place / "appliance.yaml").exists()
             verb: Verb = "kept" if is_there or self._is_of_another(place) else "made"
             text = "configuration, certificates, first user and access rules; what is there stays"
-            yield Step(verb, str(CONFIGURATION), text)
+            yield InstallStep(verb, str(CONFIGURATION), text)
             return
         assert account is not None
         place.mkdir(mode=0o750, parents=True, exist_ok=True)
@@ -370,7 +369,7 @@ class Installation:
         for step in initialise(place, robot=self.robot, configuration=text):
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
-                yield Step("made" if step.made else "kept", str(shown), step.text)
+                yield InstallStep("made" if step.made else "kept", str(shown), step.text)
             else:
                 yield step
         _hand_over(place, account, before)
@@ -379,7 +378,7 @@ class Installation:
         """Whether another user than root has it, to whom it was handed over."""
         return place.exists() and place.stat().st_uid != 0
 
-    def _configuration_of_another(self, place: Path) -> Step:
+    def _configuration_of_another(self, place: Path) -> InstallStep:
         """That of an earlier installation; root makes nothing where another user is at home.
 
         Where it would be made is for that user to say, by links and by what appliance.yaml names.
@@ -394,9 +393,9 @@ class Installation:
         if self.robot and settings.robot != robot_name(self.robot):
             raise InstallError(f"{file} has robot: {settings.robot}; change it there")
         text = "configuration, certificates, users and access rules"
-        return Step("kept", str(CONFIGURATION), text)
+        return InstallStep("kept", str(CONFIGURATION), text)
 
-    def _data(self, account: _Account | None) -> Iterator[Step]:
+    def _data(self, account: _Account | None) -> Iterator[InstallStep]:
         place = self._at(DATA)
         text = "for sessions, messages and reports of crashes"
         verb: Verb = "kept" if place.exists() else "made"
@@ -408,9 +407,9 @@ class Installation:
 
         yield self._step(verb, str(DATA), text, make)
 
-    def _variables(self) -> Iterator[Step]:
+    def _variables(self) -> Iterator[InstallStep]:
         if self._at(ENVIRONMENT).exists():
-            yield Step("kept", str(ENVIRONMENT), "environment variables of the service")
+            yield InstallStep("kept", str(ENVIRONMENT), "environment variables of the service")
             return
         taken = [
             f"{name}={value}\n"
@@ -449,10 +448,10 @@ class Installation:
             systemd=systemd_version(),
         )
 
-    def _unit(self, account: _Account | None) -> Iterator[Step]:
+    def _unit(self, account: _Account | None) -> Iterator[InstallStep]:
         place, text = self._at(UNIT_FILE), str(self.unit(account))
         if place.exists() and place.read_text() == text:
-            yield Step("kept", str(UNIT_FILE), "systemd's unit")
+            yield InstallStep("kept", str(UNIT_FILE), "systemd's unit")
         else:
             verb: Verb = "replaced" if place.exists() else "made"
             put = partial(self._put, UNIT_FILE, text, 0o644)
@@ -466,10 +465,10 @@ class Installation:
 
             yield self._step("made", str(_ENABLED), "it starts when the computer does", enable)
 
-    def _start(self) -> Iterator[Step]:
+    def _start(self) -> Iterator[InstallStep]:
         if not self._starts:
             if self.root == Path("/"):
-                yield Step("kept", NAME, "not started: systemctl restart appliance")
+                yield InstallStep("kept", NAME, "not started: systemctl restart appliance")
             return
         yield self._step("done", "systemctl", "the service runs, and answers", self._restart)
 
@@ -493,10 +492,10 @@ class Installation:
 
     # How
 
-    def _step(self, verb: Verb, subject: str, text: str, do: Callable[[], object]) -> Step:
+    def _step(self, verb: Verb, subject: str, text: str, do: Callable[[], object]) -> InstallStep:
         if not self.dry_run:
             do()
-        return Step(verb, subject, text)
+        return InstallStep(verb, subject, text)
 
     def _put(self, path: Path, content: Path | str, mode: int) -> None:
         """The file with that content, or as it was before: never half of it, also after a crash."""

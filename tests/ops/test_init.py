@@ -12,14 +12,14 @@ from appliance import certs, config
 from appliance.access import Acl, Passwords
 from appliance.broker.ports import Action, Identity
 from appliance.ops.check import check
-from appliance.ops.init import Credentials, InitError, Step, initialise, robot_name
+from appliance.ops.init import Credentials, InitError, InitStep, initialise, robot_name
 
 
-def made(steps: list[Step | Credentials]) -> set[str]:
-    return {step.path.name for step in steps if isinstance(step, Step) and step.made}
+def made(steps: list[InitStep | Credentials]) -> set[str]:
+    return {step.path.name for step in steps if isinstance(step, InitStep) and step.made}
 
 
-def credentials(steps: list[Step | Credentials]) -> Credentials:
+def credentials(steps: list[InitStep | Credentials]) -> Credentials:
     assert isinstance(steps[-1], Credentials)
     return steps[-1]
 

@@ -18,7 +18,7 @@ import yaml
 from appliance.cli.install import install as install_command
 from appliance.config import load
 from appliance.ops.init import Credentials
-from appliance.ops.install import Installation, InstallError
+from appliance.ops.install import InstallError, ServiceInstaller
 from appliance.ops.unit import Unit
 
 PROJECT = Path(__file__).resolve().parent.parent.parent
@@ -47,7 +47,7 @@ def single_file(directory: Path, version: int = 1) -> Path:
 
 def install(image: Path, source: Path, **options: object) -> dict[str, str]:
     """What was done, by the thing that it was done to."""
-    steps = list(Installation(Path("/", COMMAND), source, image, **options).install())  # type: ignore[arg-type]
+    steps = list(ServiceInstaller(Path("/", COMMAND), source, image, **options).install())  # type: ignore[arg-type]
     return {step.subject: step.verb for step in steps if not isinstance(step, Credentials)}
 
 
@@ -97,13 +97,13 @@ def test_into_an_image_and_again(image: Path, tmp_path: Path) -> None:
     install(image, single_file(tmp_path, 3))
     assert "User=robot" in (image / UNIT).read_text(), "an upgrade keeps the user"
 
-    list(Installation(Path("/", COMMAND), root=image).uninstall())
+    list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall())
     assert not (image / COMMAND).exists() and not (image / UNIT).exists()
     assert not enabled.is_symlink()
     assert {path: path.read_bytes() for path in before} == before
-    list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall(purge=True))
     assert not home.exists() and not (image / "var/lib/appliance").exists()
-    assert list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True)) == []
+    assert list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall(purge=True)) == []
 
 
 def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_one_that_looks_as_another_ends(
     """Also when the first ends just between the steps of the second's look at its lock."""
     if os.geteuid():
         pytest.skip("gives files to another user, as root only may")
-    first, second = (Installation(Path("/", COMMAND), root=image)._alone() for _ in range(2))
+    first, second = (ServiceInstaller(Path("/", COMMAND), root=image)._alone() for _ in range(2))
     first.__enter__()
     with pytest.raises(InstallError, match=r"another .* is at work"):
         install(image, single_file(tmp_path))
@@ -222,7 +222,7 @@ def test_an_upgrade_of_the_package_keeps_the_user_of_the_units_changes(
         pytest.skip("gives files to another user, as root only may")
 
     def configure() -> None:
-        list(Installation(Path("/usr/bin/appliance"), root=image, packaged=True).install())
+        list(ServiceInstaller(Path("/usr/bin/appliance"), root=image, packaged=True).install())
 
     configure()
     changes = image / "etc/systemd/system/appliance.service.d/override.conf"
@@ -246,7 +246,7 @@ def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
     install(image, single_file(tmp_path))
     assert {path.stat().st_uid for path in (disk, *disk.rglob("*"))} == {disk.stat().st_uid}
     assert disk.stat().st_uid != os.geteuid()
-    steps = list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    steps = list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall(purge=True))
     assert [step.text for step in steps if step.subject == "/etc/appliance"] == [
         f"the link; configuration, users, certificates and keys stay in {disk}"
     ]
@@ -260,12 +260,12 @@ def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
 def test_two_at_once(image: Path, tmp_path: Path) -> None:
     if os.geteuid():
         pytest.skip("gives files to another user, as root only may")
-    first = Installation(Path("/", COMMAND), single_file(tmp_path), image).install()
+    first = ServiceInstaller(Path("/", COMMAND), single_file(tmp_path), image).install()
     next(first)
     with pytest.raises(InstallError, match="another `appliance install` is at work"):
         install(image, single_file(tmp_path, 2))
     with pytest.raises(InstallError, match="another `appliance install` is at work"):
-        list(Installation(Path("/", COMMAND), root=image).uninstall())
+        list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall())
     list(first)
     install(image, single_file(tmp_path, 2))
 
@@ -278,11 +278,11 @@ def test_interrupted_it_is_as_before(
         pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
 
-    def interrupted(self: Installation) -> None:
+    def interrupted(self: ServiceInstaller) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Installation, "_starts", True)
-    monkeypatch.setattr(Installation, "_restart", interrupted)
+    monkeypatch.setattr(ServiceInstaller, "_starts", True)
+    monkeypatch.setattr(ServiceInstaller, "_restart", interrupted)
     with pytest.raises(KeyboardInterrupt):
         install(image, single_file(tmp_path, 2))
     assert (image / COMMAND).read_text() == single_file(tmp_path).read_text()
@@ -298,14 +298,14 @@ def test_interrupted_at_the_restart_the_version_before_is_started(
     install(image, single_file(tmp_path))
     restarted: list[str] = []
 
-    def systemctl(self: Installation, *arguments: str) -> None:
+    def systemctl(self: ServiceInstaller, *arguments: str) -> None:
         if arguments[0] == "restart":
             restarted.append((image / COMMAND).read_text())
             if len(restarted) == 1:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(Installation, "_starts", True)
-    monkeypatch.setattr(Installation, "_systemctl", systemctl)
+    monkeypatch.setattr(ServiceInstaller, "_starts", True)
+    monkeypatch.setattr(ServiceInstaller, "_systemctl", systemctl)
     with pytest.raises(KeyboardInterrupt):
         install(image, single_file(tmp_path, 2))
     assert restarted == [single_file(tmp_path, 2).read_text(), single_file(tmp_path).read_text()]
@@ -369,7 +369,7 @@ def test_for_several_robots_no_keys_are_made(image: Path, tmp_path: Path) -> Non
 def test_what_is_in_the_way_is_told(image: Path, tmp_path: Path) -> None:
     def error(*arguments: object, **options: object) -> str:
         with pytest.raises(InstallError) as raised:
-            list(Installation(*arguments, dry_run=True, **options).install())  # type: ignore[arg-type]
+            list(ServiceInstaller(*arguments, dry_run=True, **options).install())  # type: ignore[arg-type]
         return str(raised.value)
 
     file = single_file(tmp_path)
@@ -446,7 +446,7 @@ def test_a_disk_that_is_mounted_there_does_not_keep_it_from_being_purged(
         rmdir(path, **options)
 
     monkeypatch.setattr(os, "rmdir", refuse)
-    list(Installation(Path("/", COMMAND), root=image).uninstall(purge=True))
+    list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall(purge=True))
     assert list(data.iterdir()) == [] and not (image / "etc/default/appliance").exists()
 
 
