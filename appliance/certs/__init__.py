@@ -38,7 +38,7 @@ __all__ = [
     "ClientCertificates",
     "Ending",
     "Issued",
-    "Listed",
+    "ListedCertificate",
     "LoadedTls",
     "TlsContexts",
     "TlsFiles",
