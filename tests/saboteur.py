@@ -22,7 +22,7 @@ import pytest
 
 from appliance.broker.faults import Faults
 from appliance.net import callbacks as entries
-from appliance.ros.contained import ContainedThread
+from appliance.ros.fault_containment import FaultContainment
 
 PACKAGE = Path(__file__).parents[1] / "appliance"
 
@@ -208,12 +208,12 @@ class Saboteur:
         def shielded(own, entry, faults, told):
             shield(own, entry, faults, Struck(entry, told))
 
-        contained = ContainedThread._contained
+        contained = FaultContainment._contained
 
         def of_the_node(own, entry, callback):
             return contained(own, entry, partial(struck, entry, callback))
 
-        monkeypatch.setattr(ContainedThread, "_contained", of_the_node)
+        monkeypatch.setattr(FaultContainment, "_contained", of_the_node)
         monkeypatch.setattr(entries.Entries, "run", entered)
         monkeypatch.setattr(entries.Entries, "task", begun)
         monkeypatch.setattr(entries.Repeated, "__init__", repeated)

@@ -57,8 +57,8 @@ from appliance.ops.control import ControlError, ask
 from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier
 from appliance.ros import bridge as bridge_module
-from appliance.ros.bridge import Bridge, RouteSettings
-from appliance.ros.graph import CallRoutes, ParameterSettings, ServiceSettings
+from appliance.ros.bridge import Bridge, TopicSettings
+from appliance.ros.calls.routes import CallRoutes, ParameterSettings, ServiceSettings
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules, OnSilence
 from appliance.store import sqlite
@@ -297,9 +297,9 @@ class Site:
             parameters=(ParameterSettings(("/n/*",), "r2d2{node}/_param"),),
         )
         routes = [
-            RouteSettings("/up", "mqtt", "r2d2/up", type=STRING, encoding="cdr", keep=1000),
-            RouteSettings("/cmd_vel", "ros", "r2d2/cmd_vel", type=TWIST, rules=rules),
-            RouteSettings("/down", "ros", "r2d2/down", type=STRING, encoding="cdr"),
+            TopicSettings("/up", "mqtt", "r2d2/up", type=STRING, encoding="cdr", keep=1000),
+            TopicSettings("/cmd_vel", "ros", "r2d2/cmd_vel", type=TWIST, rules=rules),
+            TopicSettings("/down", "ros", "r2d2/down", type=STRING, encoding="cdr"),
         ]
         self.bridge = Bridge(self.node, self.broker, routes, loop, "r2d2", calls, diagnostics=0.1)
         self.bridge.start()
@@ -858,7 +858,7 @@ ELSEWHERE = {
             "ros.take_back",
             "ros.task",
         ),
-        "ros/test_ros2_contained.py",
+        "ros/ros2/test_ros2_contained.py",
     ),
     "stop.session": "test_containment.py",
 }

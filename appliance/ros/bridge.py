@@ -29,27 +29,34 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, Repeated
+from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics
-from appliance.ros.graph import CallRoutes, Calls
-from appliance.ros.leftovers import Owners, is_of_route
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.payloads import CONTENT_TYPE
 from appliance.ros.payload.schema import json_schema, topic_of
+from appliance.ros.retained_cleanup import TopicOwners, is_of_route
 from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE
-from appliance.ros.skipped import Skip, ordered, summary
+from appliance.ros.skipped import Skipped, ordered, summary
 from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
-from appliance.ros.topics.arrivals import Arrivals
 from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
-from appliance.ros.topics.flows import Bridged, BridgeRoute, Direction, Echo, Flow, RouteSettings
+from appliance.ros.topics.flow import (
+    BridgedTopic,
+    BridgeRoute,
+    Direction,
+    EchoFilter,
+    Flow,
+    TopicSettings,
+)
 from appliance.ros.topics.lease import Leases
+from appliance.ros.topics.staleness import StalenessDetector
 from appliance.ros.topics.to_mqtt import ToMqtt
-from appliance.ros.topics.to_ros import Surroundings, ToRos
+from appliance.ros.topics.to_ros import ToRos, ToRosContext
 
-__all__ = ["Bridge", "Bridged", "BusState", "RouteSettings", "RouteStatus", "TopicStatus"]
+__all__ = ["Bridge", "BridgedTopic", "BusState", "RouteStatus", "TopicSettings", "TopicStatus"]
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +104,7 @@ class Bridge:
         self,
         node: RosNode,
         broker: Broker,
-        routes: Iterable[RouteSettings],
+        routes: Iterable[TopicSettings],
         loop: asyncio.AbstractEventLoop,
         robot: str,
         calls: CallRoutes | None = None,
@@ -127,11 +134,13 @@ class Bridge:
         self._told: set[str] = set()
         self._session: Session | None = None
         #: What leftovers are being looked for with.
-        self._owners: Owners | None = None
+        self._owners: TopicOwners | None = None
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._turns = ConversionQueue(entries, broker.accounting)
-        self._around = Surroundings(entries, self._post, broker, Leases(), self._turns, Arrivals())
+        self._around = ToRosContext(
+            entries, self._post, broker, Leases(), self._turns, StalenessDetector()
+        )
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
         self._meter_timer: Repeated | None = None
         self._metered = 0
@@ -145,7 +154,7 @@ class Bridge:
         self._named: dict[Direction, set[str]] = {"to_mqtt": set(), "to_ros": set()}
         #: The topics when patterns were last matched, and those that no pattern took.
         self._topics: dict[str, list[str]] | None = None
-        self._refused: list[Skip] = []
+        self._refused: list[Skipped] = []
         #: By what they carry. These belong to the ROS thread; those to ROS only as far as patterns
         #: found them, of which the loop's thread is told when they can be received for.
         self._to_mqtt: dict[tuple[str, str], ToMqtt] = {}
@@ -162,7 +171,7 @@ class Bridge:
         self._looks = 0
         self._is_joined = False
         #: Services, actions and parameters.
-        self.calls = Calls(
+        self.calls = CallBridge(
             node,
             broker,
             entries,
@@ -175,7 +184,7 @@ class Bridge:
         self.replace(routes)
         self.calls.replace(calls or CallRoutes())
 
-    def replace(self, routes: Iterable[RouteSettings]) -> None:
+    def replace(self, routes: Iterable[TopicSettings]) -> None:
         """Carry these routes from now on; one that was there before does not notice."""
         known = {(route.settings, route.direction): route for route in self._routes}
         wanted: list[BridgeRoute] = []
@@ -280,7 +289,7 @@ class Bridge:
         there = self._to_mqtt.get(key)
         back = self._found.get(key) or self._to_ros.get(key)
         if there is not None and back is not None and (back.echo is None or there.echo is None):
-            there.echo = back.echo = Echo(self._node.wire)
+            there.echo = back.echo = EchoFilter(self._node.wire)
 
     # The loop's thread
 
@@ -364,7 +373,7 @@ class Bridge:
             topic_status(flow.bridged, flow) for flow in self._flows() if flow.bridged is not None
         ]
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """What routes speak of and is not bridged, and why."""
         of_flows = [skip for flow in self._flows() for skip in flow.skips()]
         return ordered([*of_flows, *self._refused, *self.calls.skips()])
@@ -508,11 +517,11 @@ class Bridge:
 
     def forget_leftovers(self) -> None:
         """Take back what routes have retained that there are no more, of this run and others."""
-        self._owners = Owners((route.settings for route in self._routes), self.calls.routes)
+        self._owners = TopicOwners((route.settings for route in self._routes), self.calls.routes)
         self._sweep(self._owners, self._broker.retained.find_in_steps("#"), 0)
 
     def _sweep(
-        self, owners: Owners, steps: Iterator[tuple[str, Message] | None], count: int
+        self, owners: TopicOwners, steps: Iterator[tuple[str, Message] | None], count: int
     ) -> None:
         session = self._session
         if session is None or owners is not self._owners:  # the routes have changed again
@@ -697,8 +706,8 @@ class Bridge:
 
     def _find_refused(
         self, patterns: list[BridgeRoute], taken: Mapping[Direction, set[str]]
-    ) -> list[Skip]:
-        found: dict[tuple[str, str], Skip] = {}
+    ) -> list[Skipped]:
+        found: dict[tuple[str, str], Skipped] = {}
         for route in patterns:
             direction = route.direction
             for ros, types in (self._topics or {}).items():
@@ -707,7 +716,7 @@ class Bridge:
                     continue
                 refusal = route.refusal(ros, types)
                 if refusal is not None:
-                    found[ros, direction] = Skip(ros, direction, min(types), *refusal)
+                    found[ros, direction] = Skipped(ros, direction, min(types), *refusal)
         return list(found.values())
 
     def _end(self, flow: Flow) -> None:

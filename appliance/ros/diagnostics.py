@@ -15,7 +15,7 @@ from appliance.ros.node import BusError, QosProfile, RosNode, RosPublisher
 from appliance.ros.payload.converter import ConversionError, Converter, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.status import RouteStatus
-from appliance.ros.topics.flows import Tell
+from appliance.ros.topics.flow import LogFunction
 
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -37,7 +37,7 @@ _COMPLAINTS = (
 )
 
 
-class Observed(Protocol):
+class StatusSource(Protocol):
     """The bridge, as far as it is told of here."""
 
     @property
@@ -54,7 +54,7 @@ class Diagnostics:
     `look` and `lost` are for the ROS thread, all else is for the event loop's.
     """
 
-    def __init__(self, robot: str, broker: Broker, bridge: Observed, interval: float) -> None:
+    def __init__(self, robot: str, broker: Broker, bridge: StatusSource, interval: float) -> None:
         self._robot = robot
         self._broker = broker
         self._bridge = bridge
@@ -68,7 +68,7 @@ class Diagnostics:
 
     # The ROS thread
 
-    def look(self, node: RosNode, converters: Converters, tell: Tell) -> None:
+    def look(self, node: RosNode, converters: Converters, tell: LogFunction) -> None:
         """Get ready to publish, once on each bus."""
         if self._has_looked:
             return

@@ -115,7 +115,7 @@ class RosClient(Protocol):
 #: Some messages as CDR, each with the time at which it was published, in nanoseconds since the
 #: epoch, or 0; how many others were lost, as there was no room for more; and whether newer ones
 #: have been waiting behind them for so long that this is no burst.
-TakeLot: TypeAlias = Callable[[list[tuple[bytes, int]], int, bool], None]
+TakeBatch: TypeAlias = Callable[[list[tuple[bytes, int]], int, bool], None]
 
 
 #: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
@@ -223,7 +223,7 @@ class RosNode(Protocol):
         callback: Callable[..., None],
         *,
         timed: bool = False,
-        on_loop: TakeLot | None = None,
+        on_loop: TakeBatch | None = None,
     ) -> RosSubscription:
         """Call `callback` with each message, as CDR; when it is `timed`, with a few also with the
         time at which they were published, in nanoseconds since the epoch.
@@ -289,7 +289,7 @@ class FakeSubscription:
     topic: str
     endpoint: Endpoint
     callback: Callable[..., None]
-    on_loop: TakeLot | None = None
+    on_loop: TakeBatch | None = None
     #: What the middleware has lost and nobody has asked for yet.
     lost: int = 0
 
@@ -574,7 +574,7 @@ class FakeNode:
         callback: Callable[..., None],
         *,
         timed: bool = False,
-        on_loop: TakeLot | None = None,
+        on_loop: TakeBatch | None = None,
     ) -> FakeSubscription:
         self.load(type_name)
         own = FakeSubscription(self, topic, Endpoint(self.name, type_name, qos), callback, on_loop)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Protocol, TypeVar
 
-from appliance.ros.skipped import Skip, Why
+from appliance.ros.skipped import Skipped, SkipReason
 
 
 def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:
@@ -43,7 +43,7 @@ class Names:
             pattern.fullmatch(name) for _, pattern in self._excluded
         )
 
-    def refusal(self, name: str) -> tuple[Why, str] | None:
+    def refusal(self, name: str) -> tuple[SkipReason, str] | None:
         """Why a name that a pattern speaks of is not among them; None when it is, or none does."""
         if name in self or not any(pattern.fullmatch(name) for pattern in self._spoken_of):
             return None
@@ -53,7 +53,7 @@ class Names:
         return "hidden", "a part of its name begins with _, which the pattern does not spell out"
 
 
-class Listed(Protocol):
+class NamedRoute(Protocol):
     """A route for names and patterns."""
 
     @property
@@ -61,14 +61,14 @@ class Listed(Protocol):
         """The names, patterns, and what is left out."""
 
 
-ListedT = TypeVar("ListedT", bound=Listed)
+NamedRouteT = TypeVar("NamedRouteT", bound=NamedRoute)
 
 
 def assign(
-    routes: Sequence[ListedT],
+    routes: Sequence[NamedRouteT],
     found: Mapping[str, Sequence[str]],
-    fits: Callable[[ListedT, str], bool],
-) -> dict[str, ListedT]:
+    fits: Callable[[NamedRouteT, str], bool],
+) -> dict[str, NamedRouteT]:
     """The route of each name: one that spells it out, whether it was found or not; else, of those
     that were found, the first that has a pattern for it and that it `fits`."""
     assigned = {name: route for route in reversed(routes) for name in route.names if is_plain(name)}
@@ -81,19 +81,19 @@ def assign(
 
 
 def refusals(
-    routes: Iterable[ListedT],
+    routes: Iterable[NamedRouteT],
     found: Mapping[str, Sequence[str]],
     assigned: Container[str],
     direction: str,
-    misfit: Callable[[ListedT, str], tuple[Why, str] | None],
-) -> list[Skip]:
+    misfit: Callable[[NamedRouteT, str], tuple[SkipReason, str] | None],
+) -> list[Skipped]:
     """Of the names that were found, those that a route speaks of and none was assigned to."""
-    skips: dict[str, Skip] = {}
+    skips: dict[str, Skipped] = {}
     for route in routes:
         names = Names(route.names)
         for name, types in found.items():
             if name not in assigned and name not in skips:
                 why = misfit(route, name) if name in names else names.refusal(name)
                 if why is not None:
-                    skips[name] = Skip(name, direction, min(types), *why)
+                    skips[name] = Skipped(name, direction, min(types), *why)
     return list(skips.values())

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 from appliance.config import Route, Settings, TopicRoute
-from appliance.ros.bridge import RouteSettings
-from appliance.ros.graph import (
+from appliance.ros.bridge import TopicSettings
+from appliance.ros.calls.routes import (
     ActionSettings,
     CallLimits,
     CallRoutes,
@@ -21,10 +21,10 @@ from appliance.ros.topics.rules import CommandRules, OnSilence
 RouteT = TypeVar("RouteT", bound=Route)
 
 
-def routes(settings: Settings) -> list[RouteSettings]:
+def routes(settings: Settings) -> list[TopicSettings]:
     """The ways between ROS and MQTT."""
     return [
-        RouteSettings(
+        TopicSettings(
             ros=route.names[0] if len(names) == 1 else names,
             to=route.to,
             mqtt=route.topic(settings.robot),

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
 #: In the order in which somebody wants to know of them.
-Why: TypeAlias = Literal[
+SkipReason: TypeAlias = Literal[
     "problem",  # it cannot be set up: its type is not installed, its node does not answer …
     "absent",  # a route names it, and it is not there
     "two_types",  # another type that is on the same name is bridged
@@ -17,7 +17,7 @@ Why: TypeAlias = Literal[
     "other_type",  # a route's pattern is for other types
     "of_every_node",  # every node has it, and patterns do not take it
 ]
-_ORDER: tuple[Why, ...] = (
+_ORDER: tuple[SkipReason, ...] = (
     "problem",
     "absent",
     "two_types",
@@ -32,23 +32,23 @@ MOST_TOLD = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Skip:
-    """A name that is not bridged in a direction, as in `Bridged`, or as `service`, `action` or
+class Skipped:
+    """A name that is not bridged in a direction, as in `BridgedTopic`, or as `service`, `action` or
     `parameters`. `type` is empty where it is not known."""
 
     ros: str
     direction: str
     type: str
-    why: Why
+    why: SkipReason
     reason: str
 
 
-def ordered(skips: Iterable[Skip]) -> list[Skip]:
+def ordered(skips: Iterable[Skipped]) -> list[Skipped]:
     """What matters most first, and once each."""
     return sorted(set(skips), key=lambda one: (_ORDER.index(one.why), one.ros, one.direction))
 
 
-def summary(skips: list[Skip]) -> dict[str, Any]:
+def summary(skips: list[Skipped]) -> dict[str, Any]:
     """What `{robot}/_appliance/skipped` says: how many there are, and the first of them."""
     return {
         "count": len(skips),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from appliance.ros.metrics import FlowCounters, Latency
 from appliance.ros.payload.payloads import Encoding
-from appliance.ros.topics.flows import Bridged, BridgeRoute, Direction, Flow, RouteSettings
+from appliance.ros.topics.flow import BridgedTopic, BridgeRoute, Direction, Flow, TopicSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +55,9 @@ class RouteStatus:
     route, and of which topic. For what is counted see `FlowCounters`.
     """
 
-    settings: RouteSettings
+    settings: TopicSettings
     direction: Direction
-    topics: tuple[Bridged, ...]
+    topics: tuple[BridgedTopic, ...]
     messages: int
     bytes: int
     lost: int
@@ -76,7 +76,7 @@ class RouteStatus:
     commanding: tuple[tuple[str, str], ...]
 
 
-def topic_status(bridged: Bridged, flow: Flow) -> TopicStatus:
+def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
     """How a flow that is bridged is doing."""
     counters = flow.counters
     return TopicStatus(

@@ -14,7 +14,7 @@ from appliance.broker.ports import Action, Decision, Identity, InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge
-from appliance.ros.graph import (
+from appliance.ros.calls.routes import (
     ActionSettings,
     CallRoutes,
     ParameterSettings,

@@ -18,11 +18,11 @@ from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
-from appliance.ros.bridge import THOROUGH_LOOK, Bridge, Bridged, RouteSettings
-from appliance.ros.graph import ParameterSettings
+from appliance.ros.bridge import THOROUGH_LOOK, Bridge, BridgedTopic, TopicSettings
+from appliance.ros.calls.routes import ParameterSettings
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, QosProfile, Reliability
-from appliance.ros.topics.flows import BridgeRoute, Echo
+from appliance.ros.topics.flow import BridgeRoute, EchoFilter
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
@@ -112,15 +112,15 @@ async def house():
 
 
 def to_mqtt(ros, **kw):
-    return RouteSettings(ros, "mqtt", kw.pop("mqtt", "r2d2{ros}"), **kw)
+    return TopicSettings(ros, "mqtt", kw.pop("mqtt", "r2d2{ros}"), **kw)
 
 
 def to_ros(ros, **kw):
-    return RouteSettings(ros, "ros", kw.pop("mqtt", "r2d2{ros}"), **kw)
+    return TopicSettings(ros, "ros", kw.pop("mqtt", "r2d2{ros}"), **kw)
 
 
 def both(ros, **kw):
-    return RouteSettings(ros, "both", kw.pop("mqtt", "r2d2{ros}"), **kw)
+    return TopicSettings(ros, "both", kw.pop("mqtt", "r2d2{ros}"), **kw)
 
 
 # ROS to MQTT
@@ -141,7 +141,7 @@ async def test_type_and_qos_come_from_the_publishers(house):
     }
     status = house.status()
     assert (status.messages, status.bytes, status.errors) == (1, 16, 0)
-    assert status.topics == (Bridged("/chatter", "r2d2/chatter", STRING, "to_mqtt", "json"),)
+    assert status.topics == (BridgedTopic("/chatter", "r2d2/chatter", STRING, "to_mqtt", "json"),)
 
 
 @pytest.mark.parametrize(
@@ -758,8 +758,8 @@ async def test_both_ways_takes_the_type_from_a_publisher_too(house):
 
 def test_echo_knows_padding_and_forgets(monkeypatch):
     now = 0.0
-    monkeypatch.setattr("appliance.ros.topics.flows.monotonic", lambda: now)
-    echo = Echo()
+    monkeypatch.setattr("appliance.ros.topics.flow.monotonic", lambda: now)
+    echo = EchoFilter()
     sample = string("abcd")
     assert not echo.is_own(sample)
     echo.sent(sample)
@@ -1040,7 +1040,7 @@ async def test_what_there_was_no_room_for_on_ros_is_counted(house):
 
 
 async def test_what_the_middleware_lost_is_counted_with_the_route(house):
-    house.start(RouteSettings("/chatter", "mqtt", "r2d2/chatter"))
+    house.start(TopicSettings("/chatter", "mqtt", "r2d2/chatter"))
     house.node.add_publisher("/chatter", STRING)
     await until(lambda: house.node.subscriptions)
     house.node.subscriptions[0].lost = 88

@@ -13,7 +13,7 @@ from call_harness import AllTypes, CallHarness, action, call_routes, parameters,
 
 from appliance.cli import main as cli
 from appliance.ops import control
-from appliance.ros.bridge import RouteSettings
+from appliance.ros.bridge import TopicSettings
 from appliance.ros.node import FakeNode
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.skipped import MOST_TOLD
@@ -47,7 +47,7 @@ async def house():
 
 def topic(ros, to="mqtt", **kw):
     names = (ros,) if isinstance(ros, str) else tuple(ros)
-    return RouteSettings(names[0] if len(names) == 1 else names, to, "r2d2{ros}", **kw)
+    return TopicSettings(names[0] if len(names) == 1 else names, to, "r2d2{ros}", **kw)
 
 
 def skipped(house):

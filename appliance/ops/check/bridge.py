@@ -15,8 +15,8 @@ from appliance.config import Settings
 from appliance.ops.check.commands import commands, stop_message
 from appliance.ops.finding import Finding
 from appliance.ros import settings as ros_settings
-from appliance.ros.bridge import RouteSettings
-from appliance.ros.graph import CallRoutes
+from appliance.ros.bridge import TopicSettings
+from appliance.ros.calls.routes import CallRoutes
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import UnknownTypeError, describe
 from appliance.ros.payload.payloads import RAW
@@ -73,7 +73,7 @@ def _bus(settings: Settings) -> Iterator[Finding]:
         yield Finding("warning", subject, f"{discovery.OPEN}; {discovery.OPEN_ADVICE}")
 
 
-def _topics(routes: list[RouteSettings]) -> Iterator[Finding]:
+def _topics(routes: list[TopicSettings]) -> Iterator[Finding]:
     converters = Converters(lambda name: describe(ros2.load_message(name), ros2.load_message))
     for route in routes:
         type_name = route.type
@@ -96,7 +96,7 @@ def _topics(routes: list[RouteSettings]) -> Iterator[Finding]:
 
 
 def _looks(
-    route: RouteSettings, type_name: str, converters: Converters
+    route: TopicSettings, type_name: str, converters: Converters
 ) -> Iterator[Callable[[], object]]:
     """What raises an error for a mistake in the route, each for one."""
     if route.encoding not in RAW or route.rules is not None:

@@ -59,7 +59,7 @@ from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps
 from appliance.ros.qos import BURST
-from appliance.ros.skipped import Skip, Why
+from appliance.ros.skipped import Skipped, SkipReason
 
 log = logging.getLogger(__name__)
 
@@ -172,7 +172,7 @@ class ActionRoutes:
         #: Those whose route has gone before their goals.
         self._past: list[BridgedAction] = []
         #: Actions that patterns speak of and do not take.
-        self._refused: list[Skip] = []
+        self._refused: list[Skipped] = []
         self._tasks = _BackgroundTasks(entries)
         #: Of the goals under way.
         self.slots = ConcurrencyLimiter("goals")
@@ -202,7 +202,7 @@ class ActionRoutes:
         }
         routes = list(self._counters)
 
-        def misfit(route: ActionSettings, name: str) -> tuple[Why, str] | None:
+        def misfit(route: ActionSettings, name: str) -> tuple[SkipReason, str] | None:
             return _misfit(route, found[name][0])
 
         wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
@@ -270,16 +270,18 @@ class ActionRoutes:
             if action.is_there
         ]
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """The actions that routes speak of and are not bridged."""
         skips = list(self._refused)
         for action in self._actions.values():
             type_name = action.type or ""
             problem = self._requests.problem(f"{action.ros}{SEND_GOAL}", f"{type_name}_SendGoal")
             if problem is not None:
-                skips.append(Skip(action.ros, "action", type_name, "problem", problem))
+                skips.append(Skipped(action.ros, "action", type_name, "problem", problem))
             elif not action.is_there:
-                skips.append(Skip(action.ros, "action", type_name, "absent", "no node offers it"))
+                skips.append(
+                    Skipped(action.ros, "action", type_name, "absent", "no node offers it")
+                )
         return skips
 
     async def cancel_orphans(self) -> None:
@@ -339,7 +341,7 @@ def _types(name: str, services: Mapping[str, Sequence[str]]) -> set[str]:
     return goals_of & results_of
 
 
-def _misfit(route: ActionSettings, type_name: str) -> tuple[Why, str] | None:
+def _misfit(route: ActionSettings, type_name: str) -> tuple[SkipReason, str] | None:
     """Why a pattern of the route does not take an action of that type; None when it does."""
     if route.type is None or compile_pattern(route.type).fullmatch(type_name):
         return None

@@ -50,8 +50,8 @@ from appliance.ros.payload.payloads import (
     dumps,
     named_encoding,
 )
-from appliance.ros.topics.arrivals import SENT_AT, said_age
 from appliance.ros.topics.conversions import ConversionQueue, user_of
+from appliance.ros.topics.staleness import SENT_AT, said_age
 
 log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from appliance.ros.calls.parameter_topics import ParameterGroup, ParameterTopics
 from appliance.ros.node import BusError, ParameterServer, RosNode
 from appliance.ros.patterns import is_plain
 from appliance.ros.payload.payloads import dumps
-from appliance.ros.skipped import Skip
+from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
 
@@ -147,14 +147,16 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
         await done
         return ""
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """The parameters that routes name and are not there."""
         if self._is_blind:
             return []
         if self._problem is not None:
-            return [Skip("/", "parameters", "", "problem", self._problem)]
+            return [Skipped("/", "parameters", "", "problem", self._problem)]
         reason = "the Master has no such parameter"
-        return [Skip(name, "parameters", "", "absent", reason) for name in sorted(self._absent())]
+        return [
+            Skipped(name, "parameters", "", "absent", reason) for name in sorted(self._absent())
+        ]
 
     def _absent(self) -> set[str]:
         named = {name for route in self._counters for name in route.names if is_plain(name)}

@@ -33,7 +33,7 @@ from appliance.ros.patterns import is_plain
 from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.payloads import CallEncoding, dumps
-from appliance.ros.skipped import Skip
+from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
 
@@ -141,18 +141,18 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         node.is_gone = True
         super()._leave(node)
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """The nodes that routes name and are not there, or do not tell their parameters."""
         if self._is_stopped:
             return []
         skips = [
-            Skip(node.name, "parameters", "", "problem", node.problem)
+            Skipped(node.name, "parameters", "", "problem", node.problem)
             for node in self._groups.values()
             if node.problem is not None
         ]
         named = {name.rpartition("/")[0] for route in self._counters for name in route.names}
         return skips + [
-            Skip(node, "parameters", "", "absent", "there is no such node, or it has none")
+            Skipped(node, "parameters", "", "absent", "there is no such node, or it has none")
             for node in sorted(named - self._groups.keys())
             if is_plain(node)
         ]

@@ -49,7 +49,7 @@ from appliance.ros.payload.payloads import (
     loads,
     named_encoding,
 )
-from appliance.ros.skipped import Skip, Why
+from appliance.ros.skipped import Skipped, SkipReason
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ class ServiceRoutes:
         self._endpoints: dict[str, tuple[ServiceSettings, CallEndpoint]] = {}
         self._provided: dict[ServiceSettings, ProvidedService] = {}
         #: Services that patterns speak of and do not take.
-        self._refused: list[Skip] = []
+        self._refused: list[Skipped] = []
         #: The type that a service last had.
         self._types: dict[str, str] = {}
         #: Those of which the log says that they can be called.
@@ -195,7 +195,7 @@ class ServiceRoutes:
         found = {name: types for name, types in self._requests.services.items() if name not in own}
         routes = [route for route in self._counters if route.to == "ros"]
 
-        def misfit(route: ServiceSettings, name: str) -> tuple[Why, str] | None:
+        def misfit(route: ServiceSettings, name: str) -> tuple[SkipReason, str] | None:
             return _misfit(route, found[name])
 
         wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
@@ -290,16 +290,16 @@ class ServiceRoutes:
             for name in route.names
         ]
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """The services that routes speak of and cannot be called, or are not offered."""
         skips = list(self._refused)
         for name, (route, _) in self._endpoints.items():
             type_name = self._type(name, route) or ""
             problem = self._requests.problem(name, type_name)
             if problem is not None:
-                skips.append(Skip(name, "service", type_name, "problem", problem))
+                skips.append(Skipped(name, "service", type_name, "problem", problem))
             elif name not in self._requests.services:
-                skips.append(Skip(name, "service", type_name, "absent", "no node offers it"))
+                skips.append(Skipped(name, "service", type_name, "absent", "no node offers it"))
         for provided in self._provided.values():
             skips += provided.skips()
         return skips
@@ -325,7 +325,7 @@ class ServiceRoutes:
             provided.lost()
 
 
-def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[Why, str] | None:
+def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[SkipReason, str] | None:
     """Why a pattern of the route does not take a service of these types; None when it does."""
     if route.type is not None:
         if any(map(compile_pattern(route.type).fullmatch, types)):
@@ -409,11 +409,11 @@ class ProvidedService:
             return
         self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """Why it is not offered, where it is not; from any thread."""
         if self._problem is None:
             return []
-        return [Skip(self._ros, "provided", self._route.type or "", "problem", self._problem)]
+        return [Skipped(self._ros, "provided", self._route.type or "", "problem", self._problem)]
 
     def _on_request(self, cdr: bytes, respond: Respond) -> None:
         try:

@@ -23,7 +23,7 @@ from time import monotonic
 from typing import Any
 
 from appliance.net.callbacks import Entries
-from appliance.ros.contained import ContainedThread
+from appliance.ros.fault_containment import FaultContainment
 from appliance.ros.node import (
     BusError,
     Durability,
@@ -33,7 +33,7 @@ from appliance.ros.node import (
     Respond,
     RosClient,
     RosSubscription,
-    TakeLot,
+    TakeBatch,
 )
 from appliance.ros.payload.definitions import PACKED, TypeDescription, UnknownTypeError
 from appliance.ros.ros1.actions import HIDDEN, Actions, describe_action, find_actions, services_of
@@ -108,7 +108,7 @@ def remappings(arguments: Iterable[str]) -> Iterator[str]:
         before = argument
 
 
-class Ros1Node(ContainedThread):
+class Ros1Node(FaultContainment):
     """A RosNode on ROS 1. There can be one at a time in a process, as rospy is one.
 
     Messages come on threads of rospy's, one at a time for each subscription.
@@ -499,7 +499,7 @@ class Ros1Node(ContainedThread):
         callback: Callable[..., None],
         *,
         timed: bool = False,
-        on_loop: TakeLot | None = None,
+        on_loop: TakeBatch | None = None,
     ) -> RosSubscription:
         if HIDDEN in topic:
             return self._action_clients.subscribe(topic, type_name, callback)

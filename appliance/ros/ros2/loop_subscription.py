@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from appliance.net.callbacks import Entries
 from appliance.ros.mailbox import LARGE
-from appliance.ros.node import BusError, TakeLot
+from appliance.ros.node import BusError, TakeBatch
 
 #: What the loop's thread takes before it lets others have their turn: a millisecond of work.
 LOT = 64
@@ -107,7 +107,7 @@ class LoopSubscription:
         entries: Entries,
         call_soon: Callable[[Callable[[], None]], None],
         callback: Callable[..., None],
-        on_loop: TakeLot,
+        on_loop: TakeBatch,
         losses: Losses,
     ) -> None:
         """`handle` is rclpy's own, which becomes this one's to destroy. `call_soon` leads to the

@@ -16,7 +16,7 @@ from importlib import import_module
 from typing import Any
 
 from appliance.net.callbacks import Entries
-from appliance.ros.contained import ContainedThread
+from appliance.ros.fault_containment import FaultContainment
 from appliance.ros.node import (
     BusError,
     Durability,
@@ -26,7 +26,7 @@ from appliance.ros.node import (
     Reliability,
     Respond,
     RosSubscription,
-    TakeLot,
+    TakeBatch,
 )
 from appliance.ros.payload import uncompiled
 from appliance.ros.payload.definitions import (
@@ -99,7 +99,7 @@ def _resources(kind: str) -> Iterator[str]:
             yield from (entry.name for entry in index.iterdir())
 
 
-class Ros2Node(ContainedThread):
+class Ros2Node(FaultContainment):
     """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
 
     wire = CDR
@@ -339,7 +339,7 @@ class Ros2Node(ContainedThread):
         callback: Callable[..., None],
         *,
         timed: bool = False,
-        on_loop: TakeLot | None = None,
+        on_loop: TakeBatch | None = None,
     ) -> RosSubscription:
         message_class = load_message(type_name)
         if on_loop is not None and self._takes_on_loop and self._entries is not None:
@@ -367,7 +367,7 @@ class Ros2Node(ContainedThread):
         topic: str,
         qos: QosProfile,
         callback: Callable[..., None],
-        on_loop: TakeLot,
+        on_loop: TakeBatch,
     ) -> LoopSubscription:
         """Raises BusError, UnavailableError."""
         from rclpy.impl.implementation_singleton import rclpy_implementation

@@ -22,12 +22,19 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.payload.converter import ConversionError, Converter, Converters
 from appliance.ros.payload.payloads import unpacked_size
-from appliance.ros.topics.arrivals import BEGINS, QUEUED, SENT_AT, Verdict, said_age, sent_at
 from appliance.ros.topics.conversions import LITTLE, size_of
-from appliance.ros.topics.flows import REPORT_INTERVAL, BridgeRoute, Tell
+from appliance.ros.topics.flow import REPORT_INTERVAL, BridgeRoute, LogFunction
 from appliance.ros.topics.lease import OVERTAKEN, Lease
 from appliance.ros.topics.rules import CommandRules, FieldLimits
-from appliance.ros.topics.to_ros import AgainstRulesError, Surroundings, ToRos
+from appliance.ros.topics.staleness import (
+    BEGINS,
+    QUEUED,
+    SENT_AT,
+    CommandVerdict,
+    said_age,
+    sent_at,
+)
+from appliance.ros.topics.to_ros import RuleViolationError, ToRos, ToRosContext
 
 #: Seconds until a stop message that ROS would not take is published again.
 RETRY = 0.05
@@ -74,10 +81,10 @@ class _Command:
 
     message: Message
     origin: Session | None
-    #: Of `Arrivals`: which of two came first, on whatever topics.
+    #: Of `StalenessDetector`: which of two came first, on whatever topics.
     number: int
     at: float
-    verdict: Verdict
+    verdict: CommandVerdict
     #: Why it is not to be carried out, if it does not stop the robot.
     why: str
     #: What it was converted to, where that is known before its turn.
@@ -92,7 +99,7 @@ class _Command:
     @property
     def is_to_come(self) -> bool:
         """Whether it is to be carried out, though its client has left."""
-        return self.has_left and not self.why and self.verdict is Verdict.CARRY_OUT
+        return self.has_left and not self.why and self.verdict is CommandVerdict.CARRY_OUT
 
 
 class _Stop:
@@ -148,8 +155,8 @@ class Commands(ToRos):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: Tell,
-        around: Surroundings,
+        tell: LogFunction,
+        around: ToRosContext,
     ) -> None:
         super().__init__(route, ros, converters, tell, around)
         assert route.settings.rules is not None
@@ -171,7 +178,7 @@ class Commands(ToRos):
         self._arrivals = around.arrivals
         #: The lease that the route has joined.
         self._joined: Lease | None = None
-        #: First commands of clients, see `Arrivals`.
+        #: First commands of clients, see `StalenessDetector`.
         self._waiting: dict[Session, _Waiting] = {}
         #: Large commands that wait for their turn to be converted, and what is behind them.
         self._queued: dict[Session | None, deque[_Command]] = {}
@@ -238,7 +245,7 @@ class Commands(ToRos):
         if self._is_left or (retain and not self.rules.take_retained):
             return None
         command = self._judge(message, retain, origin, number)
-        is_refused = command.why or command.verdict is Verdict.REFUSE
+        is_refused = command.why or command.verdict is CommandVerdict.REFUSE
         if is_refused and not self._may_stop(message):
             return self._refuse(command, command.why or command.refusal)
         is_kept = retain or (message.retain and self.rules.take_retained)
@@ -262,7 +269,7 @@ class Commands(ToRos):
         """What is to become of it, as far as that is known without a look into the payload."""
         # When it was received: what came in one chunk came at once, however long it takes.
         now = self._around.broker.now
-        verdict = Verdict.CARRY_OUT
+        verdict = CommandVerdict.CARRY_OUT
         refusal = QUEUED
         try:
             why = self._old_by_itself(message) or self._old_by_its_way(message, retain, origin)
@@ -275,11 +282,11 @@ class Commands(ToRos):
                 self._arrivals.is_old(origin, now)
             elif not why and not is_proven and self.rules.oldest < math.inf:
                 verdict = self._arrivals.judge(origin, message.qos, self.rules.oldest, now, number)
-                if verdict is Verdict.REFUSE:
+                if verdict is CommandVerdict.REFUSE:
                     refusal = self._arrivals.why(origin)
             # What waits would be overtaken by it.
             self._forget(origin, why or refusal)
-            if verdict is Verdict.WAIT:
+            if verdict is CommandVerdict.WAIT:
                 self._arrivals.waits(origin, self)
         return _Command(message, origin, number, now, verdict, why, refusal=refusal)
 
@@ -299,7 +306,7 @@ class Commands(ToRos):
         if origin is None or origin in self._waiting:
             return
         queue = self._queued.get(origin, ())
-        if not any(one.verdict is Verdict.WAIT and not one.why for one in queue):
+        if not any(one.verdict is CommandVerdict.WAIT and not one.why for one in queue):
             self._arrivals.waited(origin, self)
 
     def _convert_and_carry_out(self, command: _Command) -> Objection | None:
@@ -310,12 +317,12 @@ class Commands(ToRos):
         verdict = command.verdict
         if isinstance(cdr, Objection):
             return cdr
-        if verdict is not Verdict.CARRY_OUT and self.stops(cdr):
+        if verdict is not CommandVerdict.CARRY_OUT and self.stops(cdr):
             # Who says stop is heard at once, whatever comes with it.
-            verdict = Verdict.CARRY_OUT
-        if origin is not None and verdict is Verdict.REFUSE:
+            verdict = CommandVerdict.CARRY_OUT
+        if origin is not None and verdict is CommandVerdict.REFUSE:
             return self._expire(message, command.refusal, origin)
-        if origin is not None and verdict is Verdict.WAIT:
+        if origin is not None and verdict is CommandVerdict.WAIT:
             return self._let_wait(command, cdr, origin)
         return self._carry_out(message, cdr, origin, command.number)
 
@@ -450,7 +457,7 @@ class Commands(ToRos):
             self._commanded(cdr, origin)
         return objection
 
-    # Old commands: see `Arrivals`
+    # Old commands: see `StalenessDetector`
 
     def _old_by_itself(self, message: Message) -> str:
         """Why the message is too old, as it says; empty when it is not. ValueError: nonsense."""
@@ -542,7 +549,7 @@ class Commands(ToRos):
         return waiting
 
     def drop_waiting(self, origin: Session, why: str) -> None:
-        """As `Arrivals` has it: what waits is of a queue."""
+        """As `StalenessDetector` has it: what waits is of a queue."""
         self._forget(origin, why)
 
     def _forget(self, origin: Session, why: str) -> None:
@@ -550,7 +557,7 @@ class Commands(ToRos):
         if self._wait_no_longer(origin) is not None:
             self._count_expired(why, origin)
         for command in self._queued.get(origin, ()):
-            if command.verdict is Verdict.WAIT:
+            if command.verdict is CommandVerdict.WAIT:
                 command.why = command.why or why
 
     def _give_up(self, origin: Session, why: str) -> None:
@@ -596,7 +603,7 @@ class Commands(ToRos):
         except ConversionError as error:
             if self.stops(cdr):
                 return cdr
-            raise AgainstRulesError("", f"it is against the route's rules: {error}") from None
+            raise RuleViolationError("", f"it is against the route's rules: {error}") from None
         if has_changed:
             if self.stops(cdr):  # clamped, it might move the robot
                 return cdr
@@ -673,8 +680,8 @@ class Commands(ToRos):
             self._carry_out_waiting(session)
             for command in self._queued.get(session, ()):
                 command.has_left = True
-                if command.verdict is Verdict.WAIT:
-                    command.verdict = Verdict.CARRY_OUT
+                if command.verdict is CommandVerdict.WAIT:
+                    command.verdict = CommandVerdict.CARRY_OUT
         else:
             self._forget(session, "its connection was lost")
             self._drop_queued(session, "its connection was lost")

@@ -27,7 +27,7 @@ WITHIN = 1.0
 CLIENTS = 1000
 
 
-class Ruled(Protocol):
+class CommandRoute(Protocol):
     """A route with rules that leads to the topic."""
 
     @property
@@ -64,9 +64,9 @@ class Lease:
         self.holder: Session | None = None
         #: When the holder commanded last.
         self.heard_at = -math.inf
-        self._routes: list[Ruled] = []
-        #: What came with a number below this is overtaken, see `Arrivals.number`; and what is
-        #: nobody's, by the last stop of all.
+        self._routes: list[CommandRoute] = []
+        #: A stop overtakes commands with a lower number (see `StalenessDetector.number`). The second
+        #: number is for commands without a session, which every stop overtakes.
         self._stopped = 0
         self._stopped_last = 0
         #: The stops of each client, by its client id: it may have a new connection since.
@@ -74,11 +74,11 @@ class Lease:
         #: Whether what went to ROS last was a stop.
         self._stands = False
 
-    def join(self, route: Ruled) -> None:
+    def join(self, route: CommandRoute) -> None:
         """A route with rules leads there."""
         self._routes.append(route)
 
-    def part(self, route: Ruled) -> None:
+    def part(self, route: CommandRoute) -> None:
         """It does no longer. The lease is over with the last one that is exclusive; until then
         others watch it."""
         self._routes.remove(route)

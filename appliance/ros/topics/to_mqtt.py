@@ -13,7 +13,7 @@ from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.payloads import RAW, check, packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
-from appliance.ros.topics.flows import BridgeRoute, Echo, Flow, Tell
+from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
 
 #: Seconds in which nothing comes on a topic with a budget of bytes until it is taken to be silent.
@@ -35,14 +35,14 @@ class ToMqtt(Flow):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: Tell,
+        tell: LogFunction,
         mailbox: Mailbox,
         publish: Callable[[Iterable[tuple[Lane, Message]]], None],
     ) -> None:
         """`publish` is how messages leave that are on the loop's thread already."""
         super().__init__(route, ros, converters, tell)
         settings = route.settings
-        self.echo: Echo | None = None
+        self.echo: EchoFilter | None = None
         self._mailbox = mailbox
         self._publish = publish
         self._lane = Lane(settings.samples, self.counters)

@@ -17,21 +17,21 @@ from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPubli
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.payloads import CONTENT_TYPE, check, claim, unpacker
 from appliance.ros.qos import publisher_qos
-from appliance.ros.topics.arrivals import Arrivals
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
-from appliance.ros.topics.flows import BridgeRoute, Echo, Flow, Tell
+from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
 from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
+from appliance.ros.topics.staleness import StalenessDetector
 
 #: Characters of a reason that a client is told.
 REASON_LENGTH = 500
 
 
-class AgainstRulesError(ConversionError):
+class RuleViolationError(ConversionError):
     """A message that could be converted, and that the route's rules do not let through."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class ToRosContext:
     """What a flow to ROS needs: the loop, a way to it from any thread, the broker, who commands
     which ROS topic alone, whose turn it is to have a large message converted, and what is known of
     how clients' commands come."""
@@ -41,7 +41,7 @@ class Surroundings:
     broker: Broker
     leases: Leases
     turns: ConversionQueue
-    arrivals: Arrivals
+    arrivals: StalenessDetector
 
 
 class ToRos(Flow):
@@ -56,13 +56,13 @@ class ToRos(Flow):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: Tell,
-        around: Surroundings,
+        tell: LogFunction,
+        around: ToRosContext,
     ) -> None:
         super().__init__(route, ros, converters, tell)
         self._around = around
         self._is_left = True
-        self.echo: Echo | None = None
+        self.echo: EchoFilter | None = None
         #: The topic's name on ROS, where a remapping gives it another.
         self._name = ros
         self._lease = Lease(ros)
@@ -159,7 +159,7 @@ class ToRos(Flow):
             return self._object(message, f"was refused: {self._why_not()}")
         try:
             return self._read(out[0], message, origin)
-        except AgainstRulesError as error:
+        except RuleViolationError as error:
             problem = f"was refused: {error}"
             self.refuse(problem)
             return self.objection(message, problem)

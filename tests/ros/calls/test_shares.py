@@ -17,7 +17,7 @@ from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
 from appliance.broker.ports import Identity, Limits
 from appliance.net.callbacks import Entries
-from appliance.ros.bridge import RouteSettings
+from appliance.ros.bridge import TopicSettings
 from appliance.ros.calls import actions
 from appliance.ros.calls.dispatcher import CallLimits
 from appliance.ros.calls.fair_cache import FairCache
@@ -306,7 +306,7 @@ async def test_who_may_not_call_has_nothing_converted(harness):
 
 
 async def test_commands_and_calls_of_a_client_stay_in_order(harness):
-    routes = [RouteSettings(f"/{name}", "ros", f"r2d2/{name}", STRING) for name in ("a", "b")]
+    routes = [TopicSettings(f"/{name}", "ros", f"r2d2/{name}", STRING) for name in ("a", "b")]
     harness.start(service("/slow", timeout=60.0), topics=routes)
     slow = Slow(harness)
     peers = [harness.node.add_subscriber(f"/{name}", STRING) for name in ("a", "b")]
@@ -331,7 +331,7 @@ async def test_commands_and_calls_of_a_client_stay_in_order(harness):
 
 async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     monkeypatch.setattr(turns, "WAITING_OF_USER", 20_000)
-    harness.start(topics=[RouteSettings("/a", "ros", "r2d2/a", STRING)])
+    harness.start(topics=[TopicSettings("/a", "ros", "r2d2/a", STRING)])
     peer = harness.node.add_subscriber("/a", STRING)
     await until(lambda: harness.bridge.topics(), "the route")
     alice = harness.client("alice")

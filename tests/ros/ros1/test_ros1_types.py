@@ -15,7 +15,7 @@ from appliance.ros.payload.definitions import PACKED, UnknownTypeError
 from appliance.ros.ros1.actions import describe_action, find_actions, to_feedback, to_status
 from appliance.ros.ros1.peers import parse_header
 from appliance.ros.ros1.types import describe, full_name, installed, ros1_name
-from appliance.ros.topics.flows import Echo
+from appliance.ros.topics.flow import EchoFilter
 
 RULE = "\n" + "=" * 80 + "\n"
 STAMPED = f"""\
@@ -150,7 +150,7 @@ def test_what_is_no_header(data: bytes) -> None:
 
 
 def test_an_echo_is_told_by_all_of_its_bytes() -> None:
-    echo = Echo(PACKED)
+    echo = EchoFilter(PACKED)
     echo.sent(b"\1\2\3\4")
     assert not echo.is_own(b"\0\2\3\4") and not echo.is_own(b"\1\2\3\4\0")
     assert echo.is_own(b"\1\2\3\4") and not echo.is_own(b"\1\2\3\4")

@@ -23,7 +23,7 @@ from appliance.host.environment import for_other_programs
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.net.callbacks import Entries
-from appliance.ros.bridge import Bridge, RouteSettings
+from appliance.ros.bridge import Bridge, TopicSettings
 from appliance.ros.node import BusError, QosProfile, Reliability
 from appliance.ros.payload.converter import compile_converter
 from appliance.ros.ros2 import fastdds, installation
@@ -274,7 +274,7 @@ async def peer():
 
 
 def route(ros, to, encoding="json", **kw):
-    return RouteSettings(ros, to, "r2d2" + ros, encoding=encoding, **kw)
+    return TopicSettings(ros, to, "r2d2" + ros, encoding=encoding, **kw)
 
 
 async def test_ros_to_mqtt(house, peer):
@@ -428,7 +428,7 @@ async def test_publishers_that_change_are_followed(house, peer):
 
 
 async def test_pattern(house, peer):
-    house.start(RouteSettings("/camera/**", "mqtt", "r2d2{ros}", encoding="cdr"))
+    house.start(TopicSettings("/camera/**", "mqtt", "r2d2{ros}", encoding="cdr"))
     await peer.do("advertise", "/camera/left/image", BYTES, "best_effort")
     await until(house.bridged, "the camera")
     assert house.bridged()[0].mqtt == "r2d2/camera/left/image"

@@ -27,8 +27,8 @@ pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
 from test_ros2 import STRING, House, Peer, domain, route, string
 
+from appliance.ros.calls.routes import CallRoutes, ServiceSettings
 from appliance.ros.diagnostics import TYPE
-from appliance.ros.graph import CallRoutes, ServiceSettings
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
 from appliance.ros.ros2.network_scope import NetworkScope, reach

@@ -30,7 +30,7 @@ from appliance.mqtt.packets import (
     Will,
     decode_packet,
 )
-from appliance.ros.bridge import RouteSettings
+from appliance.ros.bridge import TopicSettings
 from appliance.ros.calls.dispatcher import Answer, CallCounters, CallEndpoint
 from appliance.ros.calls.replay_guard import ReplayGuard
 from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProfile
@@ -38,18 +38,18 @@ from appliance.ros.payload.converter import Converter
 from appliance.ros.payload.fallback import ConversionError
 from appliance.ros.payload.payloads import ZSTD_MAGIC
 from appliance.ros.topics import commands, lease
-from appliance.ros.topics.arrivals import (
+from appliance.ros.topics.commands import Commands
+from appliance.ros.topics.lease import REPEATED
+from appliance.ros.topics.rules import CommandRules, FieldLimits, OnSilence
+from appliance.ros.topics.staleness import (
     EXPECTED,
     STEADY,
     WAIT,
     WITHHELD,
-    Arrivals,
-    Verdict,
+    CommandVerdict,
+    StalenessDetector,
     sent_at,
 )
-from appliance.ros.topics.commands import Commands
-from appliance.ros.topics.lease import REPEATED
-from appliance.ros.topics.rules import CommandRules, FieldLimits, OnSilence
 from appliance.store import MemoryStore
 
 pytest.importorskip("geometry_msgs.msg")
@@ -178,7 +178,7 @@ class Driver:
 
 class CommandHouse(House):
     def start(self, rules, **kw):
-        settings = RouteSettings(
+        settings = TopicSettings(
             "/cmd_vel",
             "ros",
             "r2d2{ros}",
@@ -388,7 +388,7 @@ async def test_retained_commands_only_where_asked_for(house):
     await house.settle()
     assert house.robot.received == []
     house.bridge.replace(
-        [RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(take_retained=True))]
+        [TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(take_retained=True))]
     )
     for _ in range(3):
         house.node.spin()
@@ -484,7 +484,7 @@ async def test_a_qos_2_command_whose_lease_was_lost_meanwhile(house):
 
 async def test_what_ros_says_on_a_topic_of_both_ways_needs_no_lease(house):
     rules = CommandRules(exclusive=True)
-    super(CommandHouse, house).start(RouteSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules))
+    super(CommandHouse, house).start(TopicSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules))
     house.client.subscribe(TOPIC)
     other = house.node.add_publisher("/cmd_vel", TWIST)
     Driver(house.broker, "a").drive()
@@ -711,11 +711,11 @@ async def test_the_end_of_the_route_or_the_bridge_stops_who_is_driven(house):
     bridge = house.start(rules)
     told = len(house.broker.departures)
     Driver(house.broker, "a").steer()
-    bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(expire=1))])
+    bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(expire=1))])
     assert house.robot.received == [twist(0.5), STOP]
     assert len(house.broker.departures) == told
     house.node.spin()
-    bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
+    bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
     house.node.spin()
     Driver(house.broker, "b").steer()
     await bridge.stop()
@@ -729,7 +729,7 @@ async def test_who_fell_silent_is_disconnected_though_its_route_has_changed(hous
     gone.cut()
     stalled.steer()
     rules = CommandRules(on_silence=OnSilence(2 * AFTER))
-    bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
+    bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
     await until(lambda: stalled.wire.closed)
     house.node.spin()
     expired = house.counters().expired
@@ -740,11 +740,11 @@ async def test_who_fell_silent_is_disconnected_though_its_route_has_changed(hous
 
 async def test_a_lease_and_a_driver_survive_a_reload(house):
     rules = CommandRules(exclusive=True, on_silence=OnSilence(60))
-    settings = RouteSettings("/cmd_vel", "ros", "r2d2{ros}", TWIST, rules=rules)
+    settings = TopicSettings("/cmd_vel", "ros", "r2d2{ros}", TWIST, rules=rules)
     bridge = house.start(rules)
     a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
     a.steer()
-    bridge.replace([settings, RouteSettings("/new", "mqtt", "r2d2{ros}")])
+    bridge.replace([settings, TopicSettings("/new", "mqtt", "r2d2{ros}")])
     house.node.spin()
     b.steer(qos=1)
     assert b.code == 0x87
@@ -829,7 +829,7 @@ async def test_no_number_at_all_is_refused_where_it_is_clamped(house, x, refused
 
 async def test_cdr_is_clamped_as_well(house):
     rules = CommandRules(clamp=(("linear.x", -0.5, 1.0),))
-    settings = RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, encoding="cdr", rules=rules)
+    settings = TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, encoding="cdr", rules=rules)
     super(CommandHouse, house).start(settings)
     robot = house.node.add_subscriber("/cmd_vel", TWIST)
     driver = Driver(house.broker, "a")
@@ -1008,7 +1008,7 @@ async def test_retained_commands_of_more_topics_than_one_turn_is_for(house):
     robots = [FakePeer(house.node, name, Endpoint("/robot", TWIST, QosProfile())) for name in names]
     house.node.remote_subscribers += robots
     House.start(
-        house, *(RouteSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
+        house, *(TopicSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
     )
     for _ in range(3):
         house.node.spin()
@@ -1031,7 +1031,7 @@ def test_a_bound_that_is_next_to_zero(low, high):
 async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(house, now):
     house.client.send(TOPIC, GO, retain=True)
     rules = CommandRules(take_retained=True)
-    House.start(house, RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
+    House.start(house, TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
     await house.settle()
     house.client.send(TOPIC, now, retain=True)
     robot = house.node.add_subscriber("/cmd_vel", TWIST)
@@ -1081,7 +1081,7 @@ class Sender:
         self.client_id = client_id
         self.age = 0.0
         self.qos = qos
-        self.arrivals = Arrivals()
+        self.arrivals = StalenessDetector()
         self.now = 100.0
         self.moved = []
         self.held = None
@@ -1102,9 +1102,9 @@ class Sender:
             self.arrivals.look(self, self.OLDEST, self.now)
         verdict = self.arrivals.judge(self, self.qos, self.OLDEST, self.now)
         self.held = None
-        if verdict is Verdict.CARRY_OUT:
+        if verdict is CommandVerdict.CARRY_OUT:
             self.moved.append(what)
-        elif verdict is Verdict.WAIT:
+        elif verdict is CommandVerdict.WAIT:
             self.held = what
             self.due = self.now + self.arrivals.waiting_time(self, self.OLDEST)
         return verdict
@@ -1313,7 +1313,7 @@ def test_who_left_while_it_drove():
 
 
 def test_clients_whose_return_is_expected_are_bounded():
-    arrivals = Arrivals()
+    arrivals = StalenessDetector()
     for number in range(2 * EXPECTED):
         arrivals.expect(str(number))
     assert len(arrivals._expected) == EXPECTED
@@ -1456,7 +1456,7 @@ def start_two(house, mqtt="r2d2/arm"):
     """Two routes to ROS; gives what the second's node receives."""
     rules = CommandRules(expire=0.5)
     routes = [
-        RouteSettings(ros, "ros", topic, TWIST, rules=rules)
+        TopicSettings(ros, "ros", topic, TWIST, rules=rules)
         for ros, topic in (("/cmd_vel", TOPIC), ("/arm", mqtt))
     ]
     House.start(house, *routes)
@@ -2043,8 +2043,8 @@ async def test_two_routes_to_one_ros_topic_have_one_driver(house, other, remappe
     exclusive = CommandRules(exclusive=True)
     House.start(
         house,
-        RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=exclusive),
-        RouteSettings(ros, "ros", "r2d2/joy", TWIST, rules=other),
+        TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=exclusive),
+        TopicSettings(ros, "ros", "r2d2/joy", TWIST, rules=other),
     )
     for name in {"/cmd_vel", ros}:
         house.node.add_subscriber(name, TWIST)
@@ -2073,7 +2073,7 @@ async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, sta
     """Also of the one that its holder drove through; what is left sees to its end."""
     rules = CommandRules(exclusive=True, lease=60)
     routes = [
-        RouteSettings("/cmd_vel", "ros", topic, TWIST, rules=rules) for topic in (TOPIC, "r2d2/joy")
+        TopicSettings("/cmd_vel", "ros", topic, TWIST, rules=rules) for topic in (TOPIC, "r2d2/joy")
     ]
     bridge = House.start(house, *routes)
     house.node.add_subscriber("/cmd_vel", TWIST)
@@ -2106,8 +2106,8 @@ def start_beside(house, rules=RULES, ros="/cmd_vel", own=RULES):
     house.node.remapped["/other"] = "/cmd_vel"
     bridge = House.start(
         house,
-        RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=own),
-        RouteSettings(ros, "ros", "r2d2/stop", TWIST, rules=rules),
+        TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=own),
+        TopicSettings(ros, "ros", "r2d2/stop", TWIST, rules=rules),
     )
     house.robot = house.node.add_subscriber("/cmd_vel", TWIST)
     if ros != "/cmd_vel":
@@ -2231,7 +2231,7 @@ async def test_the_bridges_own_stop_overtakes_what_has_come(house, cause):
     elif cause == "lost":
         source.cut()
     elif cause == "reload":
-        bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=RULES)])
+        bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=RULES)])
     await until(lambda: house.robot.received == [twist(0.5), STOP])
     other.wire.connection = Contact()
     await until(lambda: total(house, "expired") == 1)
@@ -2327,9 +2327,9 @@ async def test_a_route_that_cannot_convert_the_first_of_a_queue_lets_no_other_ca
     rules = CommandRules(expire=0.5)
     House.start(
         house,
-        RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
-        RouteSettings("/number", "ros", TOPIC, INT, rules=rules),
-        RouteSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=rules),
+        TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
+        TopicSettings("/number", "ros", TOPIC, INT, rules=rules),
+        TopicSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=rules),
     )
     robot = house.node.add_subscriber("/cmd_vel", TWIST)
     driver = Driver(house.broker, "a")
@@ -2346,7 +2346,7 @@ def test_a_qos_2_command_of_two_routes_is_looked_at_once():
         for _ in range(2):
             sender.arrivals.look(sender, sender.OLDEST, sender.now, number)
         verdicts.append(sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, number))
-    assert verdicts[2:] == [Verdict.CARRY_OUT] * 4
+    assert verdicts[2:] == [CommandVerdict.CARRY_OUT] * 4
 
 
 @pytest.mark.parametrize("pace", [0, 0.05])
@@ -2384,8 +2384,8 @@ async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, 
     if way == "late":  # by the rule of a route with a short expire
         bridge.replace(
             [
-                RouteSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=CommandRules(expire=0.15)),
-                RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
+                TopicSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=CommandRules(expire=0.15)),
+                TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
             ]
         )
         lamp = house.node.add_subscriber("/lamp", TWIST)
@@ -2402,7 +2402,7 @@ async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, 
     else:
         driver.drive(large(0.1) if way.startswith("turn") else GO, retain=way == "kept")
     if way.endswith("reload"):
-        bridge.replace([RouteSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=FRESH)])
+        bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=FRESH)])
         house.node.spin()
         await until(lambda: not bridge._turns.is_busy)
     elif way.endswith("overtaken"):
@@ -2664,7 +2664,7 @@ def test_what_was_held_is_old_also_for_the_route_with_the_shorter_expire(qos):
         sender.link.held = 0.0
         sender.now += 0.2  # until its PUBREL
     verdict = sender.arrivals.judge(sender, qos, sender.OLDEST, sender.now, 1)
-    assert verdict is Verdict.REFUSE
+    assert verdict is CommandVerdict.REFUSE
 
 
 @pytest.mark.parametrize("first", ["the lights", "the robot"])
@@ -2682,7 +2682,7 @@ def test_what_was_held_is_old_for_one_of_two_routes(qos, first):
     verdicts = {
         oldest: sender.arrivals.judge(sender, qos, oldest, sender.now, 1) for oldest in order
     }
-    assert verdicts[sender.OLDEST] is Verdict.REFUSE
+    assert verdicts[sender.OLDEST] is CommandVerdict.REFUSE
 
 
 def test_a_qos_2_command_that_was_held_behind_others_that_were():
@@ -2698,4 +2698,4 @@ def test_a_qos_2_command_that_was_held_behind_others_that_were():
     sender.link.held = 0.0
     sender.now += 0.2
     verdict = sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, 1)
-    assert verdict is Verdict.REFUSE
+    assert verdict is CommandVerdict.REFUSE

@@ -22,15 +22,15 @@ from appliance.ros.calls.services import ServiceRoutes, ServiceSettings
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
-from appliance.ros.skipped import Skip
+from appliance.ros.skipped import Skipped
 from appliance.ros.topics.conversions import ConversionQueue
 
 __all__ = [
     "ActionSettings",
+    "CallBridge",
     "CallLimits",
     "CallRoutes",
     "CallStatus",
-    "Calls",
     "ParameterSettings",
     "ServiceSettings",
 ]
@@ -57,7 +57,7 @@ class CallStatus:
     counters: CallCounters
 
 
-class Calls:
+class CallBridge:
     """All that is called, in one place: `look` follows the graph, `replace` the configuration."""
 
     def __init__(
@@ -158,7 +158,7 @@ class Calls:
             *self._parameters.bridged(),
         ]
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """What routes speak of and is not bridged, and why."""
         return [*self._services.skips(), *self._actions.skips(), *self._parameters.skips()]
 

@@ -23,7 +23,7 @@ from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import CDR, Serialization, UnknownTypeError
 from appliance.ros.payload.payloads import Compression, Encoding, InputLimits
-from appliance.ros.skipped import Skip, Why
+from appliance.ros.skipped import Skipped, SkipReason
 from appliance.ros.topics.rules import CommandRules
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
@@ -39,7 +39,7 @@ _TURNS = itertools.count()
 
 
 @dataclass(frozen=True, slots=True)
-class RouteSettings:
+class TopicSettings:
     """A route. `ros` is the name of a topic, or a pattern, or several of both: `*` is part of a
     name, `**` of a path, and what begins with `!` is left out again. `mqtt` is a topic; a `{ros}`
     in it stands for the ROS name.
@@ -86,7 +86,7 @@ class RouteSettings:
 class BridgeRoute:
     """A route in one direction."""
 
-    def __init__(self, settings: RouteSettings, direction: Direction) -> None:
+    def __init__(self, settings: TopicSettings, direction: Direction) -> None:
         self.settings = settings
         self.direction: Direction = direction
         self.is_pattern = settings.is_pattern
@@ -99,7 +99,7 @@ class BridgeRoute:
         """Whether a topic that carries these types is one of this route's."""
         return ros in self._names and any(map(self.fits, types))
 
-    def refusal(self, ros: str, types: Iterable[str]) -> tuple[Why, str] | None:
+    def refusal(self, ros: str, types: Iterable[str]) -> tuple[SkipReason, str] | None:
         """Why a topic that the route's pattern speaks of is not one of its; None when it is, or
         when no pattern speaks of it."""
         if ros not in self._names:
@@ -114,7 +114,7 @@ class BridgeRoute:
 
 
 @dataclass(frozen=True, slots=True)
-class Bridged:
+class BridgedTopic:
     """What a flow carries now."""
 
     ros: str
@@ -124,13 +124,13 @@ class Bridged:
     encoding: Encoding
 
 
-class Tell(Protocol):
+class LogFunction(Protocol):
     """Writes a line to the log, from any thread."""
 
     def __call__(self, level: int, text: str, *args: object) -> None: ...
 
 
-class Echo:
+class EchoFilter:
     """Tells samples of our own publisher from others', on a topic that is bridged both ways.
 
     They are told by their content: rclpy cannot ask the middleware to leave out local publishers,
@@ -179,7 +179,7 @@ class Flow(ABC):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: Tell,
+        tell: LogFunction,
     ) -> None:
         self.route = route
         self.settings = settings = route.settings
@@ -188,7 +188,7 @@ class Flow(ABC):
         self.counters = FlowCounters()
         #: For the loop's thread.
         self.meter = Meter()
-        self.bridged: Bridged | None = None
+        self.bridged: BridgedTopic | None = None
         #: A number of its own: of so many flows, not all take their time at the same look.
         self.turn = next(_TURNS)
         #: Whether a pattern found the topic: it is then bridged while it has other ends.
@@ -267,7 +267,7 @@ class Flow(ABC):
                 self._tell(logging.ERROR, "%s is not bridged: %s", self, problem)
             return
         self._problem = None
-        self.bridged = Bridged(self.ros, self.mqtt, type_name, self.direction, encoding)
+        self.bridged = BridgedTopic(self.ros, self.mqtt, type_name, self.direction, encoding)
         self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 
     def begin_anew(self, problem: str) -> None:
@@ -278,21 +278,22 @@ class Flow(ABC):
             self.close()
         self.bridged = None
 
-    def skips(self) -> list[Skip]:
+    def skips(self) -> list[Skipped]:
         """What of the topic is not carried; from any thread."""
         problem, count, wanted, bridged = self._problem, self._count, self._wanted, self.bridged
         if bridged is not None:
             reason = f"the topic carries {bridged.type} as well, which is bridged"
             return [
-                Skip(self.ros, self.direction, name, "two_types", reason) for name in self._foreign
+                Skipped(self.ros, self.direction, name, "two_types", reason)
+                for name in self._foreign
             ]
         if problem is not None:
             type_name = wanted[0] if wanted else ""
-            return [Skip(self.ros, self.direction, type_name, "problem", problem)]
+            return [Skipped(self.ros, self.direction, type_name, "problem", problem)]
         if self.is_matched or count is None:
             return []
         type_name = self.settings.type or ""
-        return [Skip(self.ros, self.direction, type_name, "absent", self.absence)]
+        return [Skipped(self.ros, self.direction, type_name, "absent", self.absence)]
 
     def _tell_foreign(self, types: set[str], chosen: str) -> None:
         if types != self._foreign:

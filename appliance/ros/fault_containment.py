@@ -12,7 +12,7 @@ from appliance.net.callbacks import Entries
 log = logging.getLogger(__name__)
 
 
-class ContainedThread:
+class FaultContainment:
     """What a node calls on its own threads; `entries` are the loop's, or None without one."""
 
     def __init__(self) -> None:

@@ -8,8 +8,8 @@ from waiting import until
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros.graph import ActionSettings, CallRoutes, ParameterSettings
-from appliance.ros.leftovers import Owners
+from appliance.ros.calls.routes import ActionSettings, CallRoutes, ParameterSettings
+from appliance.ros.retained_cleanup import TopicOwners
 
 __all__ = ["house"]
 
@@ -83,4 +83,4 @@ def test_what_is_called_has_topics_too(topic, is_owned):
             ),
         ),
     )
-    assert Owners([], calls).has(topic) is is_owned
+    assert TopicOwners([], calls).has(topic) is is_owned

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros.graph import CallRoutes
+from appliance.ros.calls.routes import CallRoutes
 from appliance.ros.patterns import Names
-from appliance.ros.topics.flows import RouteSettings
+from appliance.ros.topics.flow import TopicSettings
 
 _OF_ACTION = re.compile(r"/(_status|_result/[^/]+)\Z")
 _PARAMETER = "/_param/"
@@ -25,10 +25,10 @@ def is_of_route(message: Message) -> bool:
     return "ros-type" in names or _PARAMETER in message.topic
 
 
-class Owners:
+class TopicOwners:
     """The routes that there are now, and which topics may still be theirs."""
 
-    def __init__(self, routes: Iterable[RouteSettings], calls: CallRoutes) -> None:
+    def __init__(self, routes: Iterable[TopicSettings], calls: CallRoutes) -> None:
         self._topics = [
             _Template(route.mqtt, "{ros}", route.names)
             for route in routes

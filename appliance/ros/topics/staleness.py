@@ -89,11 +89,11 @@ BEGINS = "a stream is carried out from its third command on"
 EXPECTED = 1000
 
 
-class Verdict(Enum):
+class CommandVerdict(Enum):
     """What to do with a command."""
 
     CARRY_OUT = "carry out"
-    #: Until `Arrivals.waiting_time` is over, unless another comes.
+    #: Until `StalenessDetector.waiting_time` is over, unless another comes.
     WAIT = "wait"
     REFUSE = "refuse"
 
@@ -119,20 +119,20 @@ class _Pace:
     was_held: bool = False
     #: Of the message that came last.
     number: int = -1
-    verdict: Verdict = Verdict.CARRY_OUT
+    verdict: CommandVerdict = CommandVerdict.CARRY_OUT
     #: Where a first command waits.
-    holders: list[Holder] = field(default_factory=list)
+    holders: list[PendingCommands] = field(default_factory=list)
     withheld_until: float = -math.inf
 
 
-class Holder(Protocol):
+class PendingCommands(Protocol):
     """A route that lets first commands wait."""
 
     def drop_waiting(self, origin: Session, why: str) -> None:
         """What waits of the session is not carried out: it is of a queue."""
 
 
-class Arrivals:
+class StalenessDetector:
     """The commands of all clients to all topics, as they come; times in seconds.
 
     A client has one queue for all topics: what is known of it by one route holds for the others.
@@ -153,7 +153,7 @@ class Arrivals:
 
     def judge(
         self, origin: Session, qos: int, oldest: float, now: float, number: int = -1
-    ) -> Verdict:
+    ) -> CommandVerdict:
         """What to do with a command of unknown age that has come now.
 
         `number` is the message's, which may have several routes; -1 when it is not known.
@@ -168,20 +168,20 @@ class Arrivals:
             began.was_held = _is_held(origin, oldest)
             if began.was_held or gap < self.waiting_time(origin, oldest):
                 began.is_queue, began.is_waiting = True, False
-                verdict = Verdict.REFUSE
+                verdict = CommandVerdict.REFUSE
         elif pace is not None and is_same and self._is_for_all(pace, origin, oldest):
             return pace.verdict
         else:
             verdict = self._judge(pace, origin, qos, oldest, now)
         pace = self._paces[origin]
         pace.number, pace.verdict = number, verdict
-        if verdict is Verdict.REFUSE:
+        if verdict is CommandVerdict.REFUSE:
             self._drop(pace, origin, self.why(origin))
         return verdict
 
     def _is_for_all(self, pace: _Pace, origin: Session, oldest: float) -> bool:
         """Whether the verdict holds for a route with that `oldest`, too."""
-        return pace.verdict is Verdict.REFUSE or not _is_held(origin, oldest)
+        return pace.verdict is CommandVerdict.REFUSE or not _is_held(origin, oldest)
 
     def why(self, origin: Session) -> str:
         """Why its command was refused that was judged last."""
@@ -190,14 +190,14 @@ class Arrivals:
 
     def _judge(
         self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
-    ) -> Verdict:
+    ) -> CommandVerdict:
         was_held = pace is not None and pace.was_held
         is_held = _is_held(origin, oldest)
         if pace is None or now - pace.last > oldest or (is_held and not was_held):
             verdict = self._begin(origin, oldest, now)
             pace = self._paces[origin]
             if is_held:  # whatever it has said since, this may be older
-                pace.is_queue, pace.is_waiting, verdict = True, False, Verdict.REFUSE
+                pace.is_queue, pace.is_waiting, verdict = True, False, CommandVerdict.REFUSE
             pace.was_held = is_held
             return verdict
         gap = pace.gap = now - pace.last
@@ -206,10 +206,10 @@ class Arrivals:
         pace.begins = False
         if is_held:
             pace.is_queue, pace.is_waiting, pace.steady = True, False, 0
-            return Verdict.REFUSE
+            return CommandVerdict.REFUSE
         pace.was_held = False
         if pace.is_known:
-            return Verdict.CARRY_OUT
+            return CommandVerdict.CARRY_OUT
         if qos < 2:
             self._time(pace, origin, qos, gap, now)
         else:
@@ -220,12 +220,12 @@ class Arrivals:
         if pace.steady >= STEADY:
             pace.is_known = True
             pace.is_waiting = pace.is_queue = False
-            return Verdict.CARRY_OUT
+            return CommandVerdict.CARRY_OUT
         if pace.is_waiting or pace.is_queue or gap < self.waiting_time(origin, oldest):
             pace.is_queue, pace.is_waiting = True, False
-            return Verdict.REFUSE
+            return CommandVerdict.REFUSE
         pace.is_waiting = True
-        return Verdict.WAIT
+        return CommandVerdict.WAIT
 
     def _time(self, pace: _Pace, origin: Session, qos: int, gap: float, now: float) -> None:
         """Does it come at the pace of somebody who steers, and does not wait for an answer?"""
@@ -239,7 +239,7 @@ class Arrivals:
         if pace.steady >= STEADY and origin.link is not None:
             origin.link.withhold(0.0)
 
-    def _begin(self, origin: Session, oldest: float, now: float) -> Verdict:
+    def _begin(self, origin: Session, oldest: float, now: float) -> CommandVerdict:
         before = self._paces.get(origin)
         if before is not None:
             self._drop(before, origin, QUEUED)
@@ -249,7 +249,7 @@ class Arrivals:
             # Of who left in the midst of driving even a single one is from then, most likely.
             pace.is_queue = origin.age <= oldest
         pace.is_waiting = not pace.is_queue
-        return Verdict.WAIT if pace.is_waiting else Verdict.REFUSE
+        return CommandVerdict.WAIT if pace.is_waiting else CommandVerdict.REFUSE
 
     def _withhold(self, pace: _Pace, origin: Session, now: float) -> None:
         if origin.link is not None and now > pace.withheld_until + TRY_AGAIN:
@@ -296,7 +296,7 @@ class Arrivals:
         self._coming.pop(origin, None)
         self._paces[origin] = _Pace(now, is_queue=True)
 
-    def waits(self, origin: Session, holder: Holder) -> None:
+    def waits(self, origin: Session, holder: PendingCommands) -> None:
         """A first command waits there."""
         self._paces[origin].holders.append(holder)
 
@@ -305,7 +305,7 @@ class Arrivals:
         for holder in holders:
             holder.drop_waiting(origin, why)
 
-    def waited(self, origin: Session, holder: Holder) -> None:
+    def waited(self, origin: Session, holder: PendingCommands) -> None:
         """The command that waits there has none behind it, or waits no longer."""
         pace = self._paces.get(origin)
         if pace is not None:
