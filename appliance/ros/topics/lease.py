@@ -65,7 +65,7 @@ class Lease:
         #: When the holder commanded last.
         self.heard_at = -math.inf
         self._routes: list[CommandRoute] = []
-        #: A stop overtakes commands with a lower number (see `StalenessDetector.number`). The second
+        #: A stop overtakes commands with a lower number (`StalenessDetector.number`). The second
         #: number is for commands without a session, which every stop overtakes.
         self._stopped = 0
         self._stopped_last = 0
