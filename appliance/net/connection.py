@@ -465,6 +465,10 @@ class ClientConnection:
             return
         if self._who is not None:
             who, self._who = self._who, None
+            # What the client sends because of the answer is not older than the answer. Once that
+            # is written, nobody can tell it from what has come during the login.
+            self.is_read()
+            self.is_not_read()
             self._answer_connect(who)
             self._read_on()
         elif self._sends_on:

@@ -16,6 +16,7 @@ from waiting import PATIENCE, until
 from appliance.broker.ports import HERE, Contact
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.net import connection as wire_module
+from appliance.net.connection import ClientConnection
 from appliance.net.sockets import Probe, contact, inbox
 
 HOST = "127.0.0.1"
@@ -269,6 +270,41 @@ async def test_who_streams_on_is_new_again_after_a_pause(house):
         await until(lambda: held[-1] == 0, "that it has caught up, while it streams")
     finally:
         streaming.cancel()
+
+
+async def test_what_answers_connack_is_new_however_long_the_login_took(house, monkeypatch):
+    """The client is faster than the rest of what the broker does when it has answered."""
+    answer_connect = ClientConnection._answer_connect
+
+    def answer_and_be_slow(wire, who):
+        answer_connect(wire, who)
+        Watches(house, lambda _: held.append(wire.contact().held))
+        sock = wire._transport.get_extra_info("socket")
+        deadline = time.monotonic() + PATIENCE
+        while not inbox(sock).unread:
+            assert time.monotonic() < deadline, "no message behind CONNACK"
+            time.sleep(0.001)
+
+    monkeypatch.setattr(ClientConnection, "_answer_connect", answer_and_be_slow)
+    held = []
+    house.gate.clear()
+
+    def client() -> None:
+        with socket.create_connection(house.ports[0]) as sock:
+            sock.sendall(Connect("a").encode(5))
+            sock.recv(1000)
+            sock.sendall(Publish("x", b"").encode(5))
+            sock.recv(1000)
+
+    talking = asyncio.create_task(asyncio.to_thread(client))
+    await until(lambda: any(wire._logging_in for wire in house.network.open))
+    await asyncio.sleep(0.3)
+    house.gate.set()
+    await until(lambda: held, "the message")
+    assert held[0] < 0.2
+    (wire,) = house.network.open
+    wire.abort()
+    await talking
 
 
 async def test_what_comes_long_behind_a_slow_login_is_new(house):

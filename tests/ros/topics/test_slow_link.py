@@ -31,8 +31,9 @@ async def test_a_slow_client_does_not_decide_what_is_fresh(tmp_path):
     images = [number for number, _ in fast.images]
     assert images == list(range(images[0], outcome.images))
     assert at(outcome.fast_texts(), 0.99) < FAST_ENOUGH
-    # Whatever waits in front of a text: the one image on the link, never another behind it.
-    assert at(outcome.slow_texts(), 1) < 1.6 * ONE_IMAGE
+    # Whatever waits in front of a text: the one image on the link, never another behind it. The
+    # rest, up to the second image, is the computer's: it may be busy with something else.
+    assert at(outcome.slow_texts(), 1) < 1.9 * ONE_IMAGE
     assert 3 <= len(slow.images) < len(images) / 5
     # Images are not from a queue: none was older than what the link itself holds, or a bit more.
     assert at(outcome.staleness(), 1) < 0.6 * ONE_IMAGE
