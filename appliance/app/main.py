@@ -166,7 +166,7 @@ class App:
         audit = broker_settings.audit
         if audit.path is not None:
             self.audit = Audit(audit.path, audit.size, audit.keep)
-            broker.journal = shield("audit", broker.faults, self.audit)
+            broker.audit_log = shield("audit", broker.faults, self.audit)
             self._stack.callback(self.audit.close)
             self.audit.began()
             self._stack.callback(self.audit.ended)

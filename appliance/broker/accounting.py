@@ -53,7 +53,7 @@ class Accounting:
     #: And who publishes now can be told so.
     refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
-    may_keep: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
+    may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
     #: Seconds that the broker, and the computer under load, have left to the clients: a clock that
     #: does not go on while these could do nothing.
     spare: Callable[[], float] = field(init=False)

@@ -19,17 +19,17 @@ from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.backpressure import Congestion
 from appliance.broker.faults import Faults
-from appliance.broker.message import Heads, Late, Message
+from appliance.broker.message import DelayedMessage, HeaderCache, Message
 from appliance.broker.ports import (
     Access,
     Action,
+    AuditLog,
     Features,
     Identity,
-    Journal,
     Limits,
     Link,
-    Objection,
     Observer,
+    PublishRejection,
     Store,
 )
 from appliance.broker.rate_limited_log import RateLimitedLog
@@ -144,18 +144,18 @@ class Broker:
         self.counters = self.accounting.counters
         self.sessions: dict[str, Session] = {}
         self.router = Router(access, self.accounting, self.sessions)
-        self.accounting.may_keep = self.router.may_keep
+        self.accounting.may_still_receive = self.router.may_still_receive
         self.retained = Retained(self.accounting, self.rate_limited_log, self._retained_changed)
-        self.heads = Heads()
+        self.header_cache = HeaderCache()
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
         self.guards = self.router.guards
         #: What one of them has against the message that was just published, if anything.
-        self.objection: Objection | None = None
+        self.rejection: PublishRejection | None = None
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
-        self.journal: Journal | None = None
+        self.audit_log: AuditLog | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
         #: The outputs of network clients with bytes to write.
@@ -378,7 +378,7 @@ class Broker:
     def detach(self, session: Session) -> None:
         """End a session made by `attach`."""
         session.link = None
-        self._tell_departure(session)
+        self._notify_departure(session)
         self._end(session)
 
     def disconnect(
@@ -394,7 +394,7 @@ class Broker:
         self.counters.cost += ENDING_COST
         faults = self.faults
         session.link = None
-        session.is_told_full = False
+        session.is_full_logged = False
         session.ended_well = not publish_will
         if expiry is not None:
             session.expiry = min(expiry, self.limits.session_expiry)
@@ -402,7 +402,7 @@ class Broker:
         faults.run("disconnect.hand_over", self._hand_over, session, otherwise=None)
         if self.observer is not None:
             faults.run("disconnect.observer", self.observer.disconnected, session, otherwise=None)
-        self._tell_departure(session)
+        self._notify_departure(session)
         if not publish_will:
             session.set_will(None)
         will = session.will
@@ -418,7 +418,7 @@ class Broker:
             self._publish_will(session)
         faults.run("disconnect.store", self.store.session_saved, session, otherwise=None)
 
-    def _tell_filled(self, session: Session, shortage: str) -> None:
+    def _log_queue_full(self, session: Session, shortage: str) -> None:
         if session.ends_at is None:  # it is back, or has ended
             return
         away = timedelta(seconds=round(self.now - (session.ends_at - session.expiry)))
@@ -434,7 +434,7 @@ class Broker:
             what,
         )
 
-    def _tell_departure(self, session: Session) -> None:
+    def _notify_departure(self, session: Session) -> None:
         for told in tuple(self.departures):
             self.faults.run("broker.departure", told, session, otherwise=None)
 
@@ -614,7 +614,7 @@ class Broker:
                 if self.accounting.refusing and session.persistent:
                     kept = False  # who publishes has to try again, whoever else has got it
                 else:
-                    self._tell_full(session, message)
+                    self._log_receiver_full(session, message)
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message)
@@ -626,7 +626,7 @@ class Broker:
                 if self.accounting.refusing and any(m[1] and m[0].persistent for m in members):
                     kept = False
                 else:
-                    self._tell_full(asked, message)
+                    self._log_receiver_full(asked, message)
                 full = True
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
@@ -656,12 +656,12 @@ class Broker:
         for guard in self.guards.get(message.topic, ()):
             guard.announced(message, session)
 
-    def inspect(self, message: Message, session: Session) -> Objection | None:
+    def inspect(self, message: Message, session: Session) -> PublishRejection | None:
         """What a part of the appliance has against a QoS 2 message, before it is taken."""
         for guard in self.guards.get(message.topic, ()):
-            objection = guard.inspect(message, session)
-            if objection is not None:
-                return objection
+            rejection = guard.inspect(message, session)
+            if rejection is not None:
+                return rejection
         return None
 
     def shortage(self, route: Fanout, message: Message, origin: Session) -> str:
@@ -747,7 +747,7 @@ class Broker:
         self.counters.cost += HELD_COST
         message, full, _ = held
         if age > LATE:
-            message = Late(message, age + message.age)
+            message = DelayedMessage(message, age + message.age)
         if self.accounting.has_expired(message):
             return
         try:
@@ -786,21 +786,21 @@ class Broker:
             guard.refused(session)
         if self.observer is not None:
             self.observer.refused(session, message)
-        self._tell_denied(session, Action.PUBLISH, route.topic, route.reason)
+        self._audit_denied(session, Action.PUBLISH, route.topic, route.reason)
         self.log_rate_limited(
             session, "may not publish to %s: %s", quote(route.topic), route.reason
         )
 
-    def _tell_denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
-        if self.journal is not None and session.identity is not None:
-            self.journal.denied(session, action, topic, reason)
+    def _audit_denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
+        if self.audit_log is not None and session.identity is not None:
+            self.audit_log.denied(session, action, topic, reason)
 
     def log_rate_limited(self, session: Session, message: str, *args: object) -> None:
         """Log what a client does wrong, but not every time that it does it again."""
         key = session.client_id, message
         self.rate_limited_log.warning(self.now, key, f"%s {message}", session, *args)
 
-    def _tell_full(self, session: Session, message: Message) -> None:
+    def _log_receiver_full(self, session: Session, message: Message) -> None:
         if session.link is None:
             return  # that is told at the next tick, once: it is not slow, but away
         self.log_rate_limited(
@@ -824,7 +824,7 @@ class Broker:
         if refusal is not None:
             code, reason = refusal
             name = quote(subscription.filter)
-            self._tell_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
+            self._audit_denied(session, Action.SUBSCRIBE, subscription.filter, reason)
             self.log_rate_limited(session, "may not subscribe to %s: %s", name, reason)
             return code, reason
         topic_filter = subscription.filter
@@ -953,7 +953,7 @@ class Broker:
         expires_more = faults.run("clock.retained", self.retained.expire, now, otherwise=False)
         filled, self.accounting.filled = self.accounting.filled, []
         for session, shortage in filled:
-            faults.run("clock.full", self._tell_filled, session, shortage, otherwise=None)
+            faults.run("clock.full", self._log_queue_full, session, shortage, otherwise=None)
         left = ENDINGS_PER_TICK
         for client in tuple(self.clients):
             try:
@@ -1034,7 +1034,7 @@ class Broker:
                     output.flush()
                 except Exception as error:
                     self._abandon("flush", error, output)
-        self.heads.forget()
+        self.header_cache.clear()
 
     def _close_full(self, session: Session) -> None:
         session.close_link(

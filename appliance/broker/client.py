@@ -30,12 +30,12 @@ from appliance.broker.handshake import (
     pending_will,
 )
 from appliance.broker.inflow import Inflow
-from appliance.broker.message import OVERHEAD, Late, Message
+from appliance.broker.message import OVERHEAD, DelayedMessage, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
-from appliance.broker.ports import INSIDE, Exchange, Identity, Question, Refusal, Transport
+from appliance.broker.ports import INSIDE, AccessQuery, Exchange, Identity, Refusal, Transport
 from appliance.broker.routing import Fanout
 from appliance.broker.session import Session, UnreleasedPublish
-from appliance.broker.subscribing import Awaited, Step, answers, subscribe, unsubscribe
+from appliance.broker.subscribing import AwaitingDecision, Step, answers, subscribe, unsubscribe
 from appliance.mqtt.codec import (
     V5,
     V31,
@@ -314,7 +314,7 @@ class Client:
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
         if first & 8 or (self._came_at and self._is_old()):
-            message = Late(message, math.inf if first & 8 else self._age())
+            message = DelayedMessage(message, math.inf if first & 8 else self._age())
         else:
             # What came in is what goes out to a receiver with the same version, QoS and flags:
             # its bytes are taken over instead of being encoded again.
@@ -327,7 +327,7 @@ class Client:
             return
         code = self.broker.publish_to(targets, route, message, session)
         if qos:
-            if self.broker.objection is not None and self._object(packet_id, message):
+            if self.broker.rejection is not None and self._reject_publish(packet_id, message):
                 return
             reason = self._reason(code, route, message) if code >= 0x80 else ""
             self.output.acknowledge(0x40, packet_id, code, reason)
@@ -350,7 +350,7 @@ class Client:
             properties_wire=packet.passed_on,
         )
         if packet.dup or (self._came_at and self._is_old()):
-            message = Late(message, math.inf if packet.dup else self._age())
+            message = DelayedMessage(message, math.inf if packet.dup else self._age())
         route = self._router.route(session, message.topic_wire)
         if route.undecided and self._hold(route, len(packet.payload), self._on_publish, packet):
             return
@@ -370,7 +370,7 @@ class Client:
                 self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
             code = broker.publish_to(route.targets, route, message, session)
-            if packet.qos and not self._object(packet_id, message):
+            if packet.qos and not self._reject_publish(packet_id, message):
                 reason = self._reason(code, route, message) if code >= 0x80 else ""
                 self.output.acknowledge(0x40, packet_id, code, reason)
 
@@ -385,12 +385,12 @@ class Client:
             return CANNOT_KEEP
         return self.broker.shortage(route, message, session)
 
-    def _object(self, packet_id: int, message: Message) -> bool:
+    def _reject_publish(self, packet_id: int, message: Message) -> bool:
         """Acknowledge a message with what a part of the appliance has against it, if anything."""
-        objection, self.broker.objection = self.broker.objection, None
-        if objection is None or objection.message is not message:
+        rejection, self.broker.rejection = self.broker.rejection, None
+        if rejection is None or rejection.message is not message:
             return False
-        self.output.object(0x40, packet_id, objection)
+        self.output.reject_publish(0x40, packet_id, rejection)
         return True
 
     def _hold(
@@ -403,7 +403,7 @@ class Client:
         only, and misses it if nothing is known by then.
         """
         session = self.session
-        asked = self._router.asked
+        asked = self._router.pending_decisions
         if asked is None or self._has_waited or session is None:
             return False
         allowance, now = self._rights_allowance, self._accounting.now
@@ -411,16 +411,16 @@ class Client:
         self._asked_at = now
         if allowance.used_up and not self._is_asked_about(route):
             return False
-        until = now + asked.patience
+        until = now + asked.timeout
         came_at = self._came_at or now
         topic_wire = encode_string(route.topic)
         self._counters.publish_received -= 1  # it will be
         self._counters.publish_bytes_received -= size
 
-        def questions() -> list[Question]:
+        def questions() -> list[AccessQuery]:
             return self._router.route(session, topic_wire).undecided
 
-        def own() -> list[Question]:
+        def own() -> list[AccessQuery]:
             found = self._router.route(session, topic_wire)
             return found.undecided if self._is_asked_about(found) else []
 
@@ -647,11 +647,11 @@ class Client:
         else:
             self.broker.announce(message, session)
             # 3.1.1 cannot refuse: who objects does so when the message is published.
-            objection = self.broker.inspect(message, session) if self._version == 5 else None
-            if objection is not None:
+            rejection = self.broker.inspect(message, session) if self._version == 5 else None
+            if rejection is not None:
                 self._counters.publish_refused += 1
                 self._note_refused(packet_id)
-                self.output.object(0x50, packet_id, objection)
+                self.output.reject_publish(0x50, packet_id, rejection)
                 return
             full, everybody = self.broker.without_room(route, message)
             refuses = self._version == 5 and self.broker.limits.queue_full == "refuse"
@@ -758,7 +758,7 @@ class Client:
     def _begin(self, work: Iterator[Step]) -> None:
         """Do what a packet asks for that may be much; None is for the turn of the others."""
         for answer in work:
-            if answer is None or isinstance(answer, Awaited):
+            if answer is None or isinstance(answer, AwaitingDecision):
                 # What comes behind the packet waits for its end.
                 self._work = work
                 self._is_awaiting = answer is not None
@@ -911,9 +911,9 @@ class Client:
             self.wire.address,
             reason,
         )
-        if self.broker.journal is not None:
-            address, secured = self.wire.address, self.wire.secured()
-            self.broker.journal.refused(address, reason, code, name, user, secured)
+        if self.broker.audit_log is not None:
+            address, tls_info = self.wire.address, self.wire.tls_info()
+            self.broker.audit_log.refused(address, reason, code, name, user, tls_info)
         self._counters.connects_refused += 1
         tells = code in _TOLD and self.broker.features.reason_strings
         words = in_words(reason) if tells else None
@@ -964,9 +964,9 @@ class Client:
             agreement.keep_alive,
             ", session continued" if present else "",
         )
-        if self.broker.journal is not None:
-            address, secured = self.wire.address, self.wire.secured()
-            self.broker.journal.connected(session, address, packet.version, secured)
+        if self.broker.audit_log is not None:
+            address, tls_info = self.wire.address, self.wire.tls_info()
+            self.broker.audit_log.connected(session, address, packet.version, tls_info)
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
 
@@ -1053,8 +1053,8 @@ class Client:
         """The client broke the protocol: tell it why, where it can be told, and close."""
         self._log_rate_limited("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
-            if self.broker.journal is not None:
-                self.broker.journal.refused(self.wire.address, str(error), error.code)
+            if self.broker.audit_log is not None:
+                self.broker.audit_log.refused(self.wire.address, str(error), error.code)
             # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
             # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
@@ -1141,11 +1141,11 @@ class Client:
         return True
 
     def _leave(self, why: str, *, publish_will: bool, expiry: int | None = None) -> None:
-        session, journal = self.session, self.broker.journal
+        session, audit_log = self.session, self.broker.audit_log
         try:
             self._shut()
-            if session is not None and journal is not None:
-                journal.disconnected(session, self.wire.address, why)
+            if session is not None and audit_log is not None:
+                audit_log.disconnected(session, self.wire.address, why)
         finally:
             if session is not None:
                 self.broker.disconnect(

@@ -56,11 +56,11 @@ class Faults:
             name = str(served)[:LONGEST]
             what += f" while it served {name}" if name else ""
             self.last = f"{what}: {_words(error)}"
-            self._tell(entry, error, what)
+            self._log(entry, error, what)
         except Exception:  # to tell of a fault must not become one
             log.exception("%s, and it could not be told", what)
 
-    def _tell(self, entry: str, error: BaseException, what: str) -> None:
+    def _log(self, entry: str, error: BaseException, what: str) -> None:
         place = f"{entry} {type(error).__name__} {_place(error)}"
         if place in self._places or len(self._places) >= PLACES:
             self._rate_limited_log.warning(self.now, ("fault", entry), "%s", self.last)

@@ -75,8 +75,9 @@ class Message:
         self.expires_at = expires_at
         self.topic_wire = topic_wire or encode_string(topic)
         self.properties_wire = _passed_on(properties) if properties else properties_wire
-        #: One encoded beginning (QoS 0: the whole packet), and what it is for: the packet as it
-        #: came, most often, which most often goes out again as it is. `Heads` knows the others.
+        #: One encoded header (QoS 0: the whole packet), and the version and first byte that it is
+        #: for. Most often it is the header as it came in, which most often goes out unchanged.
+        #: `HeaderCache` has the others.
         self.wire_key = 0
         self.wire_head = b""
         #: Bytes that a queue counts for this message: its topic is there as a string, and twice in
@@ -104,11 +105,11 @@ class Message:
 
     @property
     def age(self) -> float:
-        """Seconds from its arrival until it was published, see `Late`."""
+        """Seconds from its arrival until it was published, see `DelayedMessage`."""
         return 0.0
 
     def dropped(self) -> None:
-        """A session has given it up, whose client was too slow; see `Watched`."""
+        """A session has given it up, whose client was too slow; see `CountedMessage`."""
 
     def is_like(self, other: Message) -> bool:
         """Whether it may be the same message, sent again."""
@@ -153,7 +154,7 @@ class Message:
         return bytes((first,)) + encode_varint(len(body)) + body
 
 
-class Heads:
+class HeaderCache:
     """The encoded beginnings of the message that is being given to its receivers.
 
     They are forgotten with the next one: kept with every message that waits, they would take more
@@ -164,7 +165,7 @@ class Heads:
         self._message: Message | None = None
         self._known: dict[int, bytes] = {}
 
-    def of(self, message: Message, version: int, first: int) -> bytes:
+    def get(self, message: Message, version: int, first: int) -> bytes:
         """`Message.encode_head`, once for all who get the same."""
         if message is not self._message:
             self._known.clear()
@@ -177,33 +178,33 @@ class Heads:
                 self._known[key] = head
         return head
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Let the message go."""
         self._known.clear()
         self._message = None
 
 
-class Watcher(Protocol):
+class SkipCounter(Protocol):
     """Counts what slow clients are not sent."""
 
     skipped: int
 
 
-class Watched(Message):
+class CountedMessage(Message):
     """A message of a part of the appliance that counts what slow clients are not sent of it.
 
-    Whoever makes one sets `watcher`.
+    Whoever makes one sets `skip_counter`.
     """
 
-    __slots__ = ("watcher",)
+    __slots__ = ("skip_counter",)
 
-    watcher: Watcher
+    skip_counter: SkipCounter
 
     def dropped(self) -> None:
-        self.watcher.skipped += 1
+        self.skip_counter.skipped += 1
 
 
-class Late(Message):
+class DelayedMessage(Message):
     """A message that was published some time after its client had sent it for the first time.
 
     `age` is that time in seconds, infinity where it is not known: what is sent again after a lost

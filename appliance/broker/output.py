@@ -7,7 +7,7 @@ from typing import Protocol, cast
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Contact, Objection, Transport
+from appliance.broker.ports import PeerStatus, PublishRejection, Transport
 from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Disconnect, Packet, Puback, Pubrec, Suback
@@ -37,7 +37,7 @@ def in_words(reason: str) -> Properties:
     return {Property.REASON_STRING: text.encode(errors="replace").decode().replace("\0", "")}
 
 
-class Talker(Protocol):
+class OutputOwner(Protocol):
     """The conversation that the output is one side of."""
 
     def later(self) -> None:
@@ -56,7 +56,7 @@ class Output:
     What it is sent is collected, and goes to the `Transport` at the flush.
     """
 
-    def __init__(self, broker: Broker, wire: Transport, client: Talker) -> None:
+    def __init__(self, broker: Broker, wire: Transport, client: OutputOwner) -> None:
         self.wire = wire
         self.writable = True
         self.session: Session | None = None
@@ -74,9 +74,9 @@ class Output:
         self._broker = broker
         self._accounting = broker.accounting
         self._counters = broker.counters
-        self._heads = broker.heads
+        self._header_cache = broker.header_cache
         #: None at the end: the two know each other, and nobody looks for such circles.
-        self._client: Talker | None = client
+        self._client: OutputOwner | None = client
         self._out: list[bytes] = []
         self._out_size = 0  # of the PUBLISH packets in there, from their sessions
         self._full = False  # not writable until the flush, for OUTPUT_LIMIT
@@ -141,7 +141,7 @@ class Output:
             else:
                 if message.size > LARGE_MESSAGE and self._wait_for_its_turn(message, first, None):
                     return
-                out.append(self._heads.of(message, version, first))
+                out.append(self._header_cache.get(message, version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))
                 if version == 5:
@@ -246,9 +246,9 @@ class Output:
         if self._client is not None:
             self._client.later()
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """How the client's computer answers."""
-        return self.wire.contact()
+        return self.wire.peer_status()
 
     def probe(self) -> None:
         """Have the client's computer answer, if it can."""
@@ -286,16 +286,16 @@ class Output:
         out.append(packet)
         self._counters.control_sent += 1
 
-    def object(self, first: int, packet_id: int, objection: Objection) -> None:
+    def reject_publish(self, first: int, packet_id: int, rejection: PublishRejection) -> None:
         """Acknowledge with what ROS has against a message: its publisher alone can mend that.
 
         To 3.1.1 it is acknowledged as any other.
         """
         if self.version == 5 and self.may_explain:
-            words: Properties = {Property.REASON_STRING: objection.reason}
-            self.send(_REFUSALS[first](packet_id, objection.code, words))
+            words: Properties = {Property.REASON_STRING: rejection.reason}
+            self.send(_REFUSALS[first](packet_id, rejection.code, words))
         else:
-            self.acknowledge(first, packet_id, objection.code)
+            self.acknowledge(first, packet_id, rejection.code)
 
     def send(self, packet: Packet) -> bool:
         """Send any packet; False when it is larger than the client takes, also without words."""

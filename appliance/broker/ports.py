@@ -90,7 +90,7 @@ class Access(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
+class PeerStatus:
     """How a client's computer answers, whatever the client says; times in seconds.
 
     `silence` is how long nothing has come from it, not even an acknowledgement of the network's;
@@ -107,20 +107,20 @@ class Contact:
 
 
 #: What is on this computer is there as long as its connection is.
-HERE = Contact()
+LOCAL_PEER = PeerStatus()
 
 #: A client's identity, what it wants to do, and the topic or filter: what rules are asked.
-Question: TypeAlias = "tuple[Identity, Action, str]"
+AccessQuery: TypeAlias = "tuple[Identity, Action, str]"
 
 
-class Asked(Protocol):
+class PendingDecisions(Protocol):
     """Those who may have to ask somebody else before they decide."""
 
     @property
-    def patience(self) -> float:
+    def timeout(self) -> float:
         """For how many seconds a packet waits for them."""
 
-    def waits(self, question: Question, wake: Callable[[], None]) -> bool:
+    def is_pending(self, question: AccessQuery, wake: Callable[[], None]) -> bool:
         """Whether there is no answer yet; `wake` is then called when there may be one."""
 
 
@@ -157,11 +157,11 @@ class Link(Protocol):
     def later(self) -> None:
         """Call `Session.pump` once more when the other clients have had their turn."""
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """How the client's computer answers."""
 
     def probe(self) -> None:
-        """Have the client's computer answer, within two seconds, if it can: `contact` tells."""
+        """Have the client's computer answer, within two seconds, if it can: `peer_status` tells."""
 
     def withhold(self, seconds: float) -> None:
         """Let nothing out for so long, acknowledgements included; with 0, no longer."""
@@ -204,9 +204,9 @@ class InsideLink:
     def later(self) -> None:
         """It has no retained messages to go on with."""
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """It is here."""
-        return HERE
+        return LOCAL_PEER
 
     def probe(self) -> None:
         """It is here."""
@@ -291,7 +291,7 @@ class Store(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Objection:
+class PublishRejection:
     """What a part of the appliance has against a message, for who has published it."""
 
     message: Message
@@ -299,7 +299,7 @@ class Objection:
     reason: str
 
 
-class Guard(Protocol):
+class PublishGuard(Protocol):
     """A part of the appliance that has a say in who publishes to its topic."""
 
     def decide(self, session: Session) -> Decision:
@@ -308,7 +308,7 @@ class Guard(Protocol):
     def announced(self, message: Message, session: Session) -> None:
         """A QoS 2 message has come, which will be published with its PUBREL."""
 
-    def inspect(self, message: Message, session: Session) -> Objection | None:
+    def inspect(self, message: Message, session: Session) -> PublishRejection | None:
         """What is wrong with a QoS 2 message, which can be refused before its PUBREL only, and in
         MQTT 5 only."""
 
@@ -342,7 +342,7 @@ class Observer(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Secured:
+class TlsInfo:
     """How a connection is secured: the version of TLS, and the name in the client's certificate.
 
     Both are empty where there is none.
@@ -376,7 +376,7 @@ class Transport(Protocol):
     def holds(self, size: int) -> None:
         """So many bytes came and wait for more: the next chunk, however small, may be costly."""
 
-    def secured(self) -> Secured:
+    def tls_info(self) -> TlsInfo:
         """What protects the connection, and who its certificate says that the client is."""
 
     def later(self) -> None:
@@ -398,7 +398,7 @@ class Transport(Protocol):
         """Whether some of it waits here, as the network takes no more; when it does,
         `Output.caught_up` is called, or `Output.resume_writing`."""
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """How the computer at the other end answers."""
 
     def probe(self) -> None:
@@ -414,10 +414,10 @@ class Transport(Protocol):
         """Close at once; never raises."""
 
 
-class Journal(Protocol):
+class AuditLog(Protocol):
     """Told of who comes, who is refused, and who leaves: an audit log. Not of messages."""
 
-    def connected(self, session: Session, address: str, version: int, secured: Secured) -> None:
+    def connected(self, session: Session, address: str, version: int, tls_info: TlsInfo) -> None:
         """A client came in, with this version of MQTT."""
 
     def refused(
@@ -427,7 +427,7 @@ class Journal(Protocol):
         code: int = 0,
         client_id: str | None = None,
         username: str | None = None,
-        secured: Secured | None = None,
+        tls_info: TlsInfo | None = None,
     ) -> None:
         """A connection, or the client on it, did not come in; who it is, it said itself."""
 

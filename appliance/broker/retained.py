@@ -107,7 +107,7 @@ class Retained:
             shortage = self._shortage(message, old, owner)
             if shortage:
                 self._accounting.counters.publish_dropped += 1
-                self._tell_full(message, owner, shortage)
+                self._log_no_room(message, owner, shortage)
                 return False
             self._put(message, owner)
         self._changed(message, owner)
@@ -166,7 +166,7 @@ class Retained:
             return quotas.retained_bytes.shortage(total, size, what, f"limits.{key}", key)
         return "" if accounting.may_store(owner, growth) else accounting.store_shortage(growth)
 
-    def _tell_full(self, message: Message, owner: Account, shortage: str) -> None:
+    def _log_no_room(self, message: Message, owner: Account, shortage: str) -> None:
         self._rate_limited_log.warning(
             self._accounting.now,
             ("retained", owner.username),

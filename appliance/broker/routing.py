@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.accounting import Accounting
-from appliance.broker.ports import Access, Action, Asked, Decision, Guard, Identity, Question
+from appliance.broker.ports import (
+    Access,
+    AccessQuery,
+    Action,
+    Decision,
+    Identity,
+    PendingDecisions,
+    PublishGuard,
+)
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target, as_target
 from appliance.mqtt.codec import decode_string, text_size
@@ -53,7 +61,7 @@ class Fanout:
     #: Whether there is any subscription to the topic, be it of a client that gets nothing.
     subscribed: bool
     #: What could not be decided yet, as somebody is asked: such a route is not kept.
-    undecided: list[Question]
+    undecided: list[AccessQuery]
 
 
 class Router:
@@ -68,11 +76,11 @@ class Router:
         #: The rules in force.
         self.access = access
         #: Those of them who may have to ask somebody else; None where nobody has to.
-        self.asked: Asked | None = None
+        self.pending_decisions: PendingDecisions | None = None
         #: What could not be decided of the route that is being found.
-        self._undecided: list[Question] | None = None
+        self._undecided: list[AccessQuery] | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it.
-        self.guards: dict[str, list[Guard]] = {}
+        self.guards: dict[str, list[PublishGuard]] = {}
         #: Grows whenever a cached route may be wrong.
         self.epoch = 0
         #: Shared subscriptions by their whole filter.
@@ -156,14 +164,14 @@ class Router:
             check_topic(topic)
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        undecided: list[Question] = []
+        undecided: list[AccessQuery] = []
         self._undecided = undecided
         try:
             return self._decide_route(session, topic, undecided)
         finally:
             self._undecided = None
 
-    def _decide_route(self, session: Session, topic: str, undecided: list[Question]) -> Fanout:
+    def _decide_route(self, session: Session, topic: str, undecided: list[AccessQuery]) -> Fanout:
         decision = self._may_publish(session, topic)
         if decision and topic in self.guards:
             verdicts = [
@@ -200,7 +208,7 @@ class Router:
             "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
         )
         undecided = self._undecided
-        is_asked = self.asked is not None and decision is not _FAULT
+        is_asked = self.pending_decisions is not None and decision is not _FAULT
         if decision.pending and is_asked and undecided is not None and len(undecided) < UNDECIDED:
             undecided.append((identity, action, topic))
         return decision
@@ -277,7 +285,7 @@ class Router:
                 self._cached += TARGET_SIZE + text_size(topic)
         return allowed
 
-    def may_keep(self, session: Session, topic: str) -> bool:
+    def may_still_receive(self, session: Session, topic: str) -> bool:
         """Whether a message that waits may still be sent.
 
         It was allowed when it came: while plugins make up their minds anew it stays so.

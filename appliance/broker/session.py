@@ -116,7 +116,7 @@ class Session:
         "expiry",
         "identity",
         "inflight",
-        "is_told_full",
+        "is_full_logged",
         "large",
         "latest",
         "link",
@@ -152,7 +152,7 @@ class Session:
         self.ended_well = False
         self.ends_at: float | None = None
         #: Whether the log says that its queue is full, while its client is away.
-        self.is_told_full = False
+        self.is_full_logged = False
         self.will: PendingWill | None = None
         self.will_at: float | None = None
         self.subscriptions: dict[str, Subscription] = {}
@@ -546,7 +546,7 @@ class Session:
 
     def _is_forbidden(self, message: Message) -> bool:
         """Whether rules that have changed meanwhile no longer let the client have it; counted."""
-        if not self.unchecked or self.accounting.may_keep(self, message.topic):
+        if not self.unchecked or self.accounting.may_still_receive(self, message.topic):
             return False
         self.accounting.counters.publish_dropped += 1
         return True
@@ -585,8 +585,8 @@ class Session:
 
     def _is_full(self, size: int) -> None:
         """Have it told, once an absence: nobody else knows what its client is missing."""
-        if self.link is None and not self.is_told_full:
-            self.is_told_full = True
+        if self.link is None and not self.is_full_logged:
+            self.is_full_logged = True
             self.accounting.filled.append((self, self.shortage(size)))
 
     def _drop(self, message: Message) -> None:

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.output import in_words
-from appliance.broker.ports import Action, Question
+from appliance.broker.ports import AccessQuery, Action
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
@@ -34,17 +34,17 @@ RETAINED_COST = 3
 ASKED_AT_ONCE = 4
 
 
-class Awaited:
+class AwaitingDecision:
     """Given in place of an answer, where the work goes on when somebody else has answered."""
 
 
-AWAITED: Final = Awaited()
-Step: TypeAlias = "Packet | Awaited | None"
+AWAITING_DECISION: Final = AwaitingDecision()
+Step: TypeAlias = "Packet | AwaitingDecision | None"
 
 
 def answers(
     broker: Broker,
-    questions: Callable[[], list[Question]],
+    questions: Callable[[], list[AccessQuery]],
     wake: Callable[[], None],
     until: float,
 ) -> Iterator[Step]:
@@ -52,12 +52,12 @@ def answers(
 
     `questions` gives what is to be asked now, which an answer may change.
     """
-    asked = broker.router.asked
+    asked = broker.router.pending_decisions
     while asked is not None and broker.now < until:
-        waiting = [question for question in questions() if asked.waits(question, wake)]
+        waiting = [question for question in questions() if asked.is_pending(question, wake)]
         if not waiting:
             return
-        yield AWAITED
+        yield AWAITING_DECISION
 
 
 def subscribe(
@@ -80,9 +80,9 @@ def subscribe(
     subscriptions = packet.subscriptions
     for _ in _check(broker, [subscription.filter for subscription in subscriptions], turn):
         yield None
-    asked = broker.router.asked
+    asked = broker.router.pending_decisions
     if asked is not None:
-        until = broker.now + asked.patience
+        until = broker.now + asked.timeout
         for start in range(0, len(subscriptions), ASKED_AT_ONCE):
             questions = _questions(session, subscriptions[start : start + ASKED_AT_ONCE])
             yield from answers(broker, lambda asking=questions: asking, wake, until)  # type: ignore[misc]
@@ -115,12 +115,12 @@ def subscribe(
     session.pump()
 
 
-def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[Question]:
+def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[AccessQuery]:
     """What is to be decided about them: may it subscribe and, where that says the topic, receive
     what is retained there?"""
     if session.identity is None:
         return []
-    found: list[Question] = []
+    found: list[AccessQuery] = []
     for subscription in subscriptions:
         topic_filter = subscription.filter
         found.append((session.identity, Action.SUBSCRIBE, topic_filter))

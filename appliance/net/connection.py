@@ -15,7 +15,7 @@ from typing import cast
 from appliance.broker.accounts import Account
 from appliance.broker.client import Client
 from appliance.broker.inflow import PAUSE_BEHIND
-from appliance.broker.ports import HERE, Contact, Exchange, Identity, Refusal, Secured
+from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, Refusal, TlsInfo
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -23,7 +23,7 @@ from appliance.net import lingering as farewell
 from appliance.net import tls
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.scheduler import PUBLISH_BURST, Scheduler
-from appliance.net.sockets import Probe, contact, inbox
+from appliance.net.sockets import Probe, inbox, peer_status
 from appliance.net.websocket import WebSocket
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
@@ -243,8 +243,8 @@ class ClientConnection:
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
         self._broker.rate_limited_log.warning(now, (self.host, what), "%s", message)
-        if self._broker.journal is not None:
-            self._broker.journal.refused(self.address, f"{what}: {why}")
+        if self._broker.audit_log is not None:
+            self._broker.audit_log.refused(self.address, f"{what}: {why}")
 
     @contained("connection.eof")
     def eof_received(self) -> None:
@@ -750,12 +750,12 @@ class ClientConnection:
         """A chunk is not little that may be the last byte of a large packet."""
         self._little = 0 if size > LITTLE else min(LITTLE, self._network.portion)
 
-    def secured(self) -> Secured:
+    def tls_info(self) -> TlsInfo:
         """The version of TLS, and the name in the client's certificate."""
         peer = self._transport.get_extra_info("ssl_object") if self._transport else None
         if peer is None:
-            return Secured()
-        return Secured(peer.version() or "", tls.name_in(peer.getpeercert()))
+            return TlsInfo()
+        return TlsInfo(peer.version() or "", tls.name_in(peer.getpeercert()))
 
     def later(self) -> None:
         """Let the others have their turn, then let the client go on; it is not read before that."""
@@ -840,11 +840,11 @@ class ClientConnection:
         if connection.family != socket.AF_UNIX and hasattr(socket, "TCP_NOTSENT_LOWAT"):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, SYSTEM_OUTPUT)
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """How the computer at the other end answers."""
         if self._transport is None:
-            return HERE
-        known = contact(self._transport.get_extra_info("socket"))
+            return LOCAL_PEER
+        known = peer_status(self._transport.get_extra_info("socket"))
         has_unread = known.has_unread or bool(self._held) or self._sends_on
         has_unread = has_unread or bool(self._transport.get_extra_info("has_unread"))
         now = self._accounting.now  # of the chunk that is being taken in, if one is
@@ -930,9 +930,9 @@ class _Gone:
     def holds(self, size: int) -> None:
         """Nothing more comes."""
 
-    def secured(self) -> Secured:
+    def tls_info(self) -> TlsInfo:
         """Nothing is left to be secured."""
-        return Secured()
+        return TlsInfo()
 
     def later(self) -> None:
         """There is nothing to go on with."""
@@ -953,9 +953,9 @@ class _Gone:
         """Nothing waits for anybody."""
         return False
 
-    def contact(self) -> Contact:
+    def peer_status(self) -> PeerStatus:
         """Nobody is at the other end."""
-        return Contact(silence=math.inf)
+        return PeerStatus(silence=math.inf)
 
     def probe(self) -> None:
         """Nobody would answer."""

@@ -209,8 +209,8 @@ class Listeners:
             connection.close()
             counters.connections_refused += 1
             self.broker.rate_limited_log.warning(now, refusal, "%s refused: %s", address, refusal)
-            if self.broker.journal is not None:
-                self.broker.journal.refused(address, refusal)
+            if self.broker.audit_log is not None:
+                self.broker.audit_log.refused(address, refusal)
             return
         protocol = ClientConnection(self.network, address, host, listener.anonymous)
         self.network.open.add(protocol)

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.broker.ports import Contact
+from appliance.broker.ports import PeerStatus
 
 log = logging.getLogger(__name__)
 
@@ -149,19 +149,19 @@ _MUCH = 4096
 _PROBE_AFTER = 1
 
 
-def contact(connection: socket.socket) -> Contact:
+def peer_status(connection: socket.socket) -> PeerStatus:
     """What the system knows of the computer at the other end; a Unix socket's is this one."""
     try:
         unread = _unread(connection)
         if connection.family == socket.AF_UNIX:
-            return Contact(has_unread=unread > 0)
+            return PeerStatus(has_unread=unread > 0)
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
         data, ack, round_trip = (
             struct.unpack_from("=I", info, at)[0] for at in (_LAST_DATA, _LAST_ACK, _ROUND_TRIP)
         )
     except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
-        return Contact(silence=math.inf)
-    return Contact(round_trip / 1e6, min(data, ack) / 1e3, unread > 0)
+        return PeerStatus(silence=math.inf)
+    return PeerStatus(round_trip / 1e6, min(data, ack) / 1e3, unread > 0)
 
 
 class Inbox(NamedTuple):

@@ -22,7 +22,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from appliance.broker.ports import Action, Identity, Secured
+from appliance.broker.ports import Action, Identity, TlsInfo
 from appliance.mqtt.codec import VERSION_NAMES
 from appliance.mqtt.reason import ReasonCode
 
@@ -68,7 +68,7 @@ class _Flood:
 
 
 class Audit:
-    """Writes the audit log: the broker's `Journal`, and `changed` for what is done to it.
+    """Writes the audit log: the broker's `AuditLog`, and `changed` for what is done to it.
 
     All methods but `_write_all` and what that calls are the event loop's.
     """
@@ -101,14 +101,14 @@ class Audit:
 
     # --- what happens --------------------------------------------------------------------------
 
-    def connected(self, session: Session, address: str, version: int, secured: Secured) -> None:
+    def connected(self, session: Session, address: str, version: int, tls_info: TlsInfo) -> None:
         """A client came in."""
         self._put(
             "connected",
             **_who(session.identity),
             address=address,
             mqtt=VERSION_NAMES[version],
-            **_how(secured),
+            **_how(tls_info),
         )
 
     def refused(
@@ -118,13 +118,13 @@ class Audit:
         code: int = 0,
         client_id: str | None = None,
         username: str | None = None,
-        secured: Secured | None = None,
+        tls_info: TlsInfo | None = None,
     ) -> None:
         """A client, or a connection, did not come in; what it said of itself is not proven."""
         said: Fields = {}
         if client_id is not None:
             said = {"client": client_id, "user": username}
-        how = _how(secured) if secured is not None else {}
+        how = _how(tls_info) if tls_info is not None else {}
         self._put("refused", **said, address=address, **how, **_code(code), reason=reason)
 
     def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
@@ -358,10 +358,10 @@ def _who(identity: Identity | None) -> Fields:
     return {"client": identity.client_id, "user": identity.username}
 
 
-def _how(secured: Secured) -> Fields:
-    if not secured.version:
+def _how(tls_info: TlsInfo) -> Fields:
+    if not tls_info.version:
         return {"tls": None}
-    return {"tls": secured.version, "certificate": secured.certificate or None}
+    return {"tls": tls_info.version, "certificate": tls_info.certificate or None}
 
 
 def _code(code: int) -> Fields:

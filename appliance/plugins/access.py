@@ -16,7 +16,7 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Access, Action, Decision, Identity, Question
+from appliance.broker.ports import Access, AccessQuery, Action, Decision, Identity
 from appliance.config.redaction import redacted
 from appliance.net.callbacks import Entries
 from appliance.plugins.adapters import Sessions, Unclaimed
@@ -47,7 +47,7 @@ class PluginAccess:
     anything (rules in the configuration, a token) are run on the spot. From the first time that
     one has to wait (HTTP, SQL, LDAP), all are asked in the background: a SUBSCRIBE or PUBLISH that
     is asked about for the first time, and what its client sends behind it, waits for the answer, up
-    to `patience`; then it is refused, and the answer holds for the next try. Later one
+    to `timeout`; then it is refused, and the answer holds for the next try. Later one
     that is older than `answers` says, or from before the files were read again, holds while they
     are asked anew, for 10 minutes at most.
 
@@ -74,10 +74,10 @@ class PluginAccess:
         self._guard = guard
         self._epoch = 0
         self._waits = False
-        self._verdicts: OrderedDict[Question, tuple[Decision, float, int]] = OrderedDict()
-        self._asked: dict[Question, asyncio.Task[None]] = {}
+        self._verdicts: OrderedDict[AccessQuery, tuple[Decision, float, int]] = OrderedDict()
+        self._asked: dict[AccessQuery, asyncio.Task[None]] = {}
         #: Who waits for the answer to each of them, and who for room to ask, in their order.
-        self._waiting: dict[Question, dict[Callable[[], None], None]] = {}
+        self._waiting: dict[AccessQuery, dict[Callable[[], None], None]] = {}
         self._line: dict[Callable[[], None], None] = {}
         self._line_timer: asyncio.TimerHandle | None = None
 
@@ -104,11 +104,11 @@ class PluginAccess:
         return self._verdict((identity, action, topic))
 
     @property
-    def patience(self) -> float:
+    def timeout(self) -> float:
         """Seconds that a packet waits for an answer."""
         return self._guard.timeout
 
-    def waits(self, question: Question, wake: Callable[[], None]) -> bool:
+    def is_pending(self, question: AccessQuery, wake: Callable[[], None]) -> bool:
         """Whether there is no answer yet; `wake` is then called when there may be one."""
         if not self.decide(*question).pending:
             return False
@@ -159,14 +159,14 @@ class PluginAccess:
                     "%s has to wait before it can say whether a topic is allowed: what is asked "
                     "for the first time waits with it, for up to %g s",
                     name(plugin),
-                    self.patience,
+                    self.timeout,
                 )
                 return False, ""
             if not answer:  # As in amqtt, None is a no.
                 return True, name(plugin)
         return True, ""
 
-    def _verdict(self, question: Question) -> Decision:
+    def _verdict(self, question: AccessQuery) -> Decision:
         """What the plugins last said; they are asked when that is long ago."""
         decision, said_at, epoch = self._verdicts.get(question, (None, 0.0, 0))
         age = asyncio.get_running_loop().time() - said_at
@@ -191,7 +191,7 @@ class PluginAccess:
         clients = [asked[0] for asked in self._asked if asked[0].username == identity.username]
         return len(clients) < USER_QUESTIONS and clients.count(identity) < CLIENT_QUESTIONS
 
-    async def _ask(self, question: Question) -> None:
+    async def _ask(self, question: AccessQuery) -> None:
         """Ask all topic plugins and keep what they say."""
         identity, action, topic = question
         session = self._sessions.of_identity(identity)
@@ -224,7 +224,7 @@ class PluginAccess:
         asked = (self._threads.call(plugin, "topic_filtering", arguments) for plugin in plugins)
         return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
 
-    def _keep(self, question: Question, decision: Decision) -> None:
+    def _keep(self, question: AccessQuery, decision: Decision) -> None:
         before, _, _ = self._verdicts.pop(question, (None, 0.0, 0))
         now = asyncio.get_running_loop().time()
         self._verdicts[question] = decision, now, self._files.epoch

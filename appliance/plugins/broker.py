@@ -245,7 +245,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             raise BrokerError(f"Broker instance can't be started: {error}") from error
         self._inside = self.broker.attach("_amqtt", InsideLink())
         if self.plugins_manager.plugins:
-            self.broker.access = self.broker.router.asked = self._access
+            self.broker.access = self.broker.router.pending_decisions = self._access
             if self._events.about_clients:
                 faults = self.broker.faults
                 self.broker.observer = shield("plugins.observer", faults, self._events)
@@ -290,7 +290,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         await self._finish("close", self.plugins_manager.close())
         self.broker.observer = None
         self.broker.access = self._files
-        self.broker.router.asked = None
+        self.broker.router.pending_decisions = None
         if self._inside is not None:
             self.broker.detach(self._inside)
             self._inside = None

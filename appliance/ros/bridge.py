@@ -23,7 +23,7 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink, Objection
+from appliance.broker.ports import InsideLink, PublishRejection
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
@@ -428,9 +428,9 @@ class Bridge:
         if objection is not None:
             self._object(objection)
 
-    def _object(self, objection: Objection) -> None:
+    def _object(self, objection: PublishRejection) -> None:
         if objection.message.qos == 1:
-            self._broker.objection = objection
+            self._broker.rejection = objection
 
     def _drain(self) -> None:
         if self._deliver():

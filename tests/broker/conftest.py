@@ -12,14 +12,14 @@ from appliance.broker.broker import Broker
 from appliance.broker.client import Client
 from appliance.broker.message import Message
 from appliance.broker.ports import (
-    HERE,
+    LOCAL_PEER,
     Action,
-    Contact,
     Decision,
     Exchange,
     Identity,
     Limits,
-    Secured,
+    PeerStatus,
+    TlsInfo,
     UserLimits,
 )
 from appliance.broker.retained import retained_size
@@ -208,8 +208,8 @@ class FakeWire:
         assert not self.closed
         return ""
 
-    def secured(self) -> Secured:
-        return Secured()
+    def tls_info(self) -> TlsInfo:
+        return TlsInfo()
 
     def holds(self, size: int) -> None:
         self.held = size
@@ -220,8 +220,8 @@ class FakeWire:
     def later(self) -> None:
         self.laters += 1
 
-    def contact(self) -> Contact:
-        return HERE
+    def peer_status(self) -> PeerStatus:
+        return LOCAL_PEER
 
     def probe(self) -> None:
         pass

@@ -400,7 +400,7 @@ PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
     (lambda broker, peer: Session, "forget_transient"),
     (lambda broker, peer: broker, "_hand_over"),
     (lambda broker, peer: broker.observer, "disconnected"),
-    (lambda broker, peer: broker.journal, "disconnected"),
+    (lambda broker, peer: broker.audit_log, "disconnected"),
     (lambda broker, peer: broker, "_publish_late"),
     (lambda broker, peer: broker.store, "session_saved"),
     (lambda broker, peer: broker.store, "session_removed"),
@@ -454,7 +454,7 @@ def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, 
 @pytest.mark.parametrize("leaves", [False, True], ids=["lost", "disconnects"])
 @pytest.mark.parametrize(("whose", "name"), PARTS, ids=[name for _, name in PARTS])
 def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, name, leaves, expiry):
-    broker.observer, broker.journal = Mock(), Mock()
+    broker.observer, broker.audit_log = Mock(), Mock()
     departed: list[str] = []
     broker.departures.append(lambda session: departed.append(session.client_id))
     keeps = {Property.SESSION_EXPIRY_INTERVAL: expiry}

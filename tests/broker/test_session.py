@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
-from appliance.broker.message import OVERHEAD, Heads, Message, Watched
+from appliance.broker.message import OVERHEAD, CountedMessage, HeaderCache, Message
 from appliance.broker.ports import Identity, Limits
 from appliance.broker.session import Session, UnreleasedPublish
 from appliance.mqtt.codec import Property
@@ -433,11 +433,11 @@ def test_a_message_counts_all_that_it_holds():
 
 
 def test_a_message_is_encoded_once_for_all_who_get_the_same():
-    message, heads = Message("a/b", b"payload", 1), Heads()
+    message, header_cache = Message("a/b", b"payload", 1), HeaderCache()
     for version in (4, 5):
         for first in (0x30, 0x31, 0x32, 0x3B, 0x34):
-            head = heads.of(message, version, first)
-            assert heads.of(message, version, first) is head
+            head = header_cache.get(message, version, first)
+            assert header_cache.get(message, version, first) is head
             qos = first >> 1 & 3
             expected = Publish(
                 "a/b", b"payload", qos, bool(first & 1), first >= 0x38, 7 if qos else None
@@ -496,9 +496,9 @@ class Counted:
     skipped = 0
 
 
-def watched(topic: str, payload: bytes, counted: Counted, retain: bool = False) -> Watched:
-    message = Watched(topic, payload, 0, retain)
-    message.watcher = counted
+def watched(topic: str, payload: bytes, counted: Counted, retain: bool = False) -> CountedMessage:
+    message = CountedMessage(topic, payload, 0, retain)
+    message.skip_counter = counted
     return message
 
 

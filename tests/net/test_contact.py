@@ -13,11 +13,11 @@ from house import House, Watches
 from test_websocket import frame, hear_frame, shake_hands
 from waiting import PATIENCE, until
 
-from appliance.broker.ports import HERE, Contact
+from appliance.broker.ports import LOCAL_PEER, PeerStatus
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.net import connection as wire_module
 from appliance.net.connection import ClientConnection
-from appliance.net.sockets import Probe, contact, inbox
+from appliance.net.sockets import Probe, inbox, peer_status
 
 HOST = "127.0.0.1"
 
@@ -42,18 +42,18 @@ async def test_a_probe_is_answered_by_the_computer_and_not_by_the_client(house, 
     await house.join("a", tls=tls)
     wire = house.protocol("a")
     begun = time.monotonic()
-    while wire.contact().silence < 0.3:
-        assert time.monotonic() < begun + 20, f"it is never silent: {wire.contact()}"
+    while wire.peer_status().silence < 0.3:
+        assert time.monotonic() < begun + 20, f"it is never silent: {wire.peer_status()}"
         await asyncio.sleep(0.05)
     asked = time.monotonic()
     wire.probe()
-    while wire.contact().silence + 0.02 >= time.monotonic() - asked:
-        assert time.monotonic() < asked + 20, f"there is no answer: {wire.contact()}"
+    while wire.peer_status().silence + 0.02 >= time.monotonic() - asked:
+        assert time.monotonic() < asked + 20, f"there is no answer: {wire.peer_status()}"
         await asyncio.sleep(0.05)
     connection = wire._transport.get_extra_info("socket")
     wire._end_probe()
     assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) > 60
-    assert 0 <= wire.contact().round_trip < 5
+    assert 0 <= wire.peer_status().round_trip < 5
 
 
 async def test_what_is_withheld_comes_in_its_order(house):
@@ -99,21 +99,21 @@ def test_bytes_that_nobody_has_read():
         near = socket.create_connection(server.getsockname())
         far, _ = server.accept()
         with near, far:
-            assert not contact(near).has_unread
+            assert not peer_status(near).has_unread
             far.send(b"x")
             deadline = time.monotonic() + 20
-            while not contact(near).has_unread:
+            while not peer_status(near).has_unread:
                 assert time.monotonic() < deadline, "the byte does not come"
-        assert contact(near) == Contact(silence=math.inf)  # it is closed
+        assert peer_status(near) == PeerStatus(silence=math.inf)  # it is closed
         Probe(near).end()
 
 
 def test_a_unix_socket_is_on_this_computer():
     near, far = socket.socketpair()
     with near, far:
-        assert contact(near) == HERE
+        assert peer_status(near) == LOCAL_PEER
         far.send(b"x")
-        assert contact(near).has_unread
+        assert peer_status(near).has_unread
         Probe(near).end()
 
 
@@ -148,7 +148,7 @@ async def test_what_was_not_read_for_a_time_is_told(house):
     caller = await house.join("a")
     wire = house.protocol("a")
     held = []
-    Watches(house, lambda message: held.append(wire.contact().held))
+    Watches(house, lambda message: held.append(wire.peer_status().held))
     await caller.say(Publish("x", b""))
     await until(lambda: len(held) == 1)
     wire._rest(0.3)
@@ -164,21 +164,21 @@ async def test_what_was_not_read_for_a_time_is_told(house):
 async def test_what_has_come_and_was_not_read_is_told(house):
     caller = await house.join("a")
     wire = house.protocol("a")
-    assert not wire.contact().has_unread
+    assert not wire.peer_status().has_unread
     wire._rest(PATIENCE)
     await caller.say(Publish("x", b"1"))
-    await until(lambda: wire.contact().has_unread, "bytes that the system holds")
+    await until(lambda: wire.peer_status().has_unread, "bytes that the system holds")
     heard = []
-    Watches(house, lambda message: heard.append(wire.contact().has_unread))
+    Watches(house, lambda message: heard.append(wire.peer_status().has_unread))
     wire._rest(0)
     await until(lambda: heard, "the message")
-    assert heard == [False] and not wire.contact().has_unread
+    assert heard == [False] and not wire.peer_status().has_unread
     # And what was read, and waits in here for its turn.
     wire._hold(Publish("x", b"2").encode(5), 0)
-    assert wire.contact().has_unread
+    assert wire.peer_status().has_unread
     wire._read_on()
     await until(lambda: len(heard) == 2, "the message that waited")
-    assert not wire.contact().has_unread
+    assert not wire.peer_status().has_unread
 
 
 ROUND_TRIP = 0.1
@@ -231,7 +231,7 @@ async def test_what_a_far_client_kept_back_is_not_new(house, monkeypatch, websoc
     wire, held = house.protocol("a"), []
 
     def published(_):
-        held.append(wire.contact().held)
+        held.append(wire.peer_status().held)
         if len(held) == 1:
             wire._rest(0.5)
 
@@ -254,7 +254,7 @@ async def test_who_streams_on_is_new_again_after_a_pause(house):
     """What it had kept back comes faster than what it says from then on."""
     caller = await house.join("a")
     wire, held = house.protocol("a"), []
-    Watches(house, lambda _: held.append(wire.contact().held))
+    Watches(house, lambda _: held.append(wire.peer_status().held))
     chunk = Publish("x", bytes(3000)).encode(5)
 
     async def stream():
@@ -278,7 +278,7 @@ async def test_what_answers_connack_is_new_however_long_the_login_took(house, mo
 
     def answer_and_be_slow(wire, who):
         answer_connect(wire, who)
-        Watches(house, lambda _: held.append(wire.contact().held))
+        Watches(house, lambda _: held.append(wire.peer_status().held))
         sock = wire._transport.get_extra_info("socket")
         deadline = time.monotonic() + PATIENCE
         while not inbox(sock).unread:
@@ -322,7 +322,7 @@ async def test_what_comes_long_behind_a_slow_login_is_new(house):
     await caller.hear()
     held = []
     await until(lambda: not wire._client.inflow.is_behind, "a look by itself")
-    Watches(house, lambda _: held.append(wire.contact().held))
+    Watches(house, lambda _: held.append(wire.peer_status().held))
     await caller.say(Publish("x", b""))
     await until(lambda: held)
     assert held == [0]

@@ -750,7 +750,7 @@ async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls,
     held: list[float] = []
 
     def published(_: Message) -> None:
-        held.append(wire.contact().held)
+        held.append(wire.peer_status().held)
         if len(held) == 1:
             wire._rest(0.5)  # as when it publishes too fast
 
@@ -864,7 +864,7 @@ async def test_what_waits_for_a_turn_below_is_held(house: House, tls, in_frames)
     waited: list[float] = []
 
     def published(_: Message) -> None:
-        held.append(wire.contact().held)
+        held.append(wire.peer_status().held)
         waited.append(loop.time() - begun)
 
     Watches(house, published)

@@ -24,7 +24,7 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 from waiting import eventually
 
-from appliance.broker.ports import Action, Identity, Secured
+from appliance.broker.ports import Action, Identity, TlsInfo
 from appliance.broker.session import Session
 from appliance.cli import main as cli
 from appliance.mqtt.packets import Connack, Disconnect, Publish, Subscribe, Subscription
@@ -68,8 +68,8 @@ def test_what_a_line_holds(tmp_path: Path) -> None:
     before = datetime.now(timezone.utc)
     with open_audit(path) as audit:
         alice = session_of("alice", "tablet")
-        audit.connected(alice, "10.0.0.1:1", 5, Secured("TLSv1.3", "tablet.local"))
-        audit.refused("10.0.0.1:2", "unknown user 'eve'", 0x87, "c", "eve", Secured())
+        audit.connected(alice, "10.0.0.1:1", 5, TlsInfo("TLSv1.3", "tablet.local"))
+        audit.refused("10.0.0.1:2", "unknown user 'eve'", 0x87, "c", "eve", TlsInfo())
         audit.refused("10.0.0.1:3", "no TLS connection: nonsense")
         audit.denied(alice, Action.PUBLISH, "a/b", "acl.conf:3: topic read a/#")
         audit.disconnected(alice, "10.0.0.1:1", "connection lost")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from appliance.broker.message import Message
-from appliance.broker.ports import HERE, Objection
+from appliance.broker.ports import LOCAL_PEER, PublishRejection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.node import BusError, QosProfile, RosNode
@@ -238,7 +238,7 @@ class Commands(ToRos):
 
     def receive(
         self, message: Message, retain: bool, origin: Session | None, number: int
-    ) -> Objection | None:
+    ) -> PublishRejection | None:
         """What is known of a command when it comes is judged then; a large one is converted when it
         is its turn, and what is wrong with it is returned only if that is now.
         """
@@ -290,7 +290,7 @@ class Commands(ToRos):
                 self._arrivals.waits(origin, self)
         return _Command(message, origin, number, now, verdict, why, refusal=refusal)
 
-    def _finish(self, command: _Command) -> Objection | None:
+    def _finish(self, command: _Command) -> PublishRejection | None:
         """Convert it and carry it out, if that is still to be; what the appliance itself fails in
         is told of as well."""
         try:
@@ -309,13 +309,13 @@ class Commands(ToRos):
         if not any(one.verdict is CommandVerdict.WAIT and not one.why for one in queue):
             self._arrivals.waited(origin, self)
 
-    def _convert_and_carry_out(self, command: _Command) -> Objection | None:
+    def _convert_and_carry_out(self, command: _Command) -> PublishRejection | None:
         message, origin = command.message, command.origin
         if command.why and not self._is_late_stop(message, origin):
             return self._refuse(command, command.why)
         cdr = command.cdr or self._convert(message, origin)
         verdict = command.verdict
-        if isinstance(cdr, Objection):
+        if isinstance(cdr, PublishRejection):
             return cdr
         if verdict is not CommandVerdict.CARRY_OUT and self.stops(cdr):
             # Who says stop is heard at once, whatever comes with it.
@@ -328,14 +328,14 @@ class Commands(ToRos):
 
     # Large commands, which wait for their turn to be converted
 
-    def _queue(self, command: _Command, size: int) -> Objection | None:
+    def _queue(self, command: _Command, size: int) -> PublishRejection | None:
         message, origin = command.message, command.origin
         turns = self._around.turns
         if not turns.has_room(origin, size):
             if self._may_stop(message) and unpacked_size(message.payload) <= self._stop_size:
                 # A stop is heard whoever fills the queue; the time it takes is its client's.
                 cdr = turns.now(partial(self._convert, message, origin))
-                if isinstance(cdr, Objection):
+                if isinstance(cdr, PublishRejection):
                     return cdr
                 if cdr is not None and self.stops(cdr):
                     command.cdr = cdr
@@ -347,12 +347,12 @@ class Commands(ToRos):
         turns.do(origin, size, partial(self._have_turn, command))
         return None
 
-    def _do_behind_its_own(self, command: _Command) -> Objection | None:
+    def _do_behind_its_own(self, command: _Command) -> PublishRejection | None:
         """A small command whose client has large ones queued waits for these, unless it stops: then
         it is they that come too late."""
         message, origin = command.message, command.origin
         cdr = self._convert(message, origin)
-        if isinstance(cdr, Objection):
+        if isinstance(cdr, PublishRejection):
             return cdr
         command.cdr = cdr
         if self.stops(cdr):
@@ -430,7 +430,7 @@ class Commands(ToRos):
             number = broker.counters.messages_received
             self._arrivals.look(session, self.rules.oldest, broker.now, number)
 
-    def inspect(self, message: Message, session: Session) -> Objection | None:
+    def inspect(self, message: Message, session: Session) -> PublishRejection | None:
         try:
             why = self._old_by_itself(message)
         except ValueError as error:
@@ -451,7 +451,7 @@ class Commands(ToRos):
 
     def _carry_out(
         self, message: Message, cdr: bytes, origin: Session | None, number: int
-    ) -> Objection | None:
+    ) -> PublishRejection | None:
         objection = self._publish(cdr, message, origin, number)
         if objection is None:
             self._commanded(cdr, origin)
@@ -500,12 +500,12 @@ class Commands(ToRos):
         is_old = is_will or is_unknown or message.age > oldest
         return "it was sent some time before" if is_old else ""
 
-    def _refuse(self, command: _Command, why: str) -> Objection:
+    def _refuse(self, command: _Command, why: str) -> PublishRejection:
         if command.is_wrong:
             return self._object(command.message, f"was refused: {why}")
         return self._expire(command.message, why, command.origin)
 
-    def _expire(self, message: Message, why: str, origin: Session | None) -> Objection:
+    def _expire(self, message: Message, why: str, origin: Session | None) -> PublishRejection:
         self._count_expired(why, origin)
         return self.objection(message, f"{'may be' if why == BEGINS else 'is too'} old: {why}")
 
@@ -517,7 +517,7 @@ class Commands(ToRos):
         self.counters.last_error = f"a command was too old: {why}"
         self._mention("expired", "%s: a command of %s was not published: %s", origin, why)
 
-    def _let_wait(self, command: _Command, cdr: bytes, origin: Session) -> Objection | None:
+    def _let_wait(self, command: _Command, cdr: bytes, origin: Session) -> PublishRejection | None:
         """Keep a first command until it is known whether others are behind it."""
         message = command.message
         accounting = self._around.broker.accounting
@@ -570,9 +570,9 @@ class Commands(ToRos):
         now = self._around.entries.time()
         waiting = self._waiting[origin]
         self._around.broker.accounting.now = now
-        contact = HERE if origin.link is None else origin.link.contact()
+        peer = LOCAL_PEER if origin.link is None else origin.link.peer_status()
         # What comes with it may be something else than commands.
-        if contact.has_unread or contact.flowing >= now - waiting.came_at:
+        if peer.has_unread or peer.flowing >= now - waiting.came_at:
             if now < waiting.due + self.rules.oldest:
                 waiting.timer = self._wait_until(now + READ_SOON, origin)
             else:
@@ -782,7 +782,7 @@ class Commands(ToRos):
         has_closed = False
         for session, asked in list(self._asked.items()):
             link = session.link
-            if link is None or link.contact().silence + COARSE < now - asked:
+            if link is None or link.peer_status().silence + COARSE < now - asked:
                 del self._asked[session]
             elif now - asked >= ANSWERED:
                 del self._asked[session]

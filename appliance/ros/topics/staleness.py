@@ -49,7 +49,7 @@ from datetime import datetime, timezone
 from enum import Enum
 from typing import Protocol
 
-from appliance.broker.ports import HERE, Contact
+from appliance.broker.ports import LOCAL_PEER, PeerStatus
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, quote
 
@@ -230,7 +230,7 @@ class StalenessDetector:
     def _time(self, pace: _Pace, origin: Session, qos: int, gap: float, now: float) -> None:
         """Does it come at the pace of somebody who steers, and does not wait for an answer?"""
         # Other messages may come between the two, and all of them without a pause.
-        is_steady = gap >= BURST and _contact(origin).flowing < gap
+        is_steady = gap >= BURST and _peer_status(origin).flowing < gap
         pace.steady = pace.steady + 1 if is_steady else 0
         if qos and pace.steady and now > pace.withheld_until:
             # It may have waited for what it was sent meanwhile.
@@ -258,7 +258,7 @@ class StalenessDetector:
 
     def waiting_time(self, origin: Session, oldest: float) -> float:
         """Seconds that a first command waits: until then the next of a queue would have come."""
-        return min(WAIT + 2 * _contact(origin).round_trip, oldest)
+        return min(WAIT + 2 * _peer_status(origin).round_trip, oldest)
 
     def look(self, origin: Session, oldest: float, now: float, number: int = -1) -> None:
         """A command of QoS 2 has come that is not released yet: only now its pace can be told, and
@@ -324,13 +324,13 @@ class StalenessDetector:
         self._coming.pop(session, None)
 
 
-def _contact(origin: Session) -> Contact:
-    return HERE if origin.link is None else origin.link.contact()
+def _peer_status(origin: Session) -> PeerStatus:
+    return LOCAL_PEER if origin.link is None else origin.link.peer_status()
 
 
 def _is_held(origin: Session, oldest: float) -> bool:
     """Whether what it sends now may have been in here for too long, before it was read."""
-    return _contact(origin).held > oldest
+    return _peer_status(origin).held > oldest
 
 
 def said_age(properties: Properties | None, now: float) -> float | None:

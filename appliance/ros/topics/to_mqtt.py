@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable
 from time import monotonic
 
-from appliance.broker.message import Message, Watched
+from appliance.broker.message import CountedMessage, Message
 from appliance.mqtt.codec import Properties, encode_property_list, encode_string
 from appliance.ros.mailbox import LARGE, Lane, Mailbox
 from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
@@ -223,7 +223,7 @@ class ToMqtt(Flow):
             self._budget -= len(payload)
         if properties is not self._properties:
             self._properties, self._properties_wire = properties, encode_property_list(properties)
-        message = Watched(
+        message = CountedMessage(
             self.mqtt,
             payload,
             self._qos,
@@ -233,7 +233,7 @@ class ToMqtt(Flow):
             self._topic_wire,
             self._properties_wire,
         )
-        message.watcher = self.counters
+        message.skip_counter = self.counters
         if published_at:
             self._lane.timed = message, published_at
         return message

@@ -8,7 +8,7 @@ from functools import partial
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Decision, Objection
+from appliance.broker.ports import Decision, PublishRejection
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.reason import ReasonCode
@@ -137,7 +137,7 @@ class ToRos(Flow):
 
     def receive(
         self, message: Message, retain: bool, origin: Session | None, number: int
-    ) -> Objection | None:
+    ) -> PublishRejection | None:
         """A message from MQTT, of that session, which came with that number; returns what is wrong
         with it, which is told.
 
@@ -150,9 +150,13 @@ class ToRos(Flow):
             self._tell_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
             return None
         cdr = self._convert(message, origin)
-        return cdr if isinstance(cdr, Objection) else self._publish(cdr, message, origin, number)
+        return (
+            cdr
+            if isinstance(cdr, PublishRejection)
+            else self._publish(cdr, message, origin, number)
+        )
 
-    def _convert(self, message: Message, origin: Session | None) -> bytes | Objection:
+    def _convert(self, message: Message, origin: Session | None) -> bytes | PublishRejection:
         """The message's CDR, or what is wrong with it, which is told."""
         out = self._out
         if out is None:
@@ -169,7 +173,7 @@ class ToRos(Flow):
 
     def _publish(
         self, cdr: bytes, message: Message, origin: Session | None, number: int
-    ) -> Objection | None:
+    ) -> PublishRejection | None:
         """Publish on ROS what the message was converted to; returns why that failed."""
         out = self._out
         if out is None:
@@ -191,7 +195,7 @@ class ToRos(Flow):
         message: Message,
         problem: str,
         code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
-    ) -> Objection:
+    ) -> PublishRejection:
         self.fail(problem)
         return self.objection(message, problem, code)
 
@@ -200,11 +204,13 @@ class ToRos(Flow):
         message: Message,
         problem: str,
         code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
-    ) -> Objection:
+    ) -> PublishRejection:
         """What the client is told: the code, and why."""
-        return Objection(message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
+        return PublishRejection(
+            message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH]
+        )
 
-    def fault(self, message: Message, error: Exception) -> Objection:
+    def fault(self, message: Message, error: Exception) -> PublishRejection:
         """What the client is told when it is the appliance that failed, which is reported."""
         self._around.broker.faults.caught("bridge.receive", error, self)
         self.counters.errors += 1
@@ -219,7 +225,7 @@ class ToRos(Flow):
     def announced(self, message: Message, session: Session) -> None:
         """A message of QoS 2 has come: where there are rules, its time may say something."""
 
-    def inspect(self, message: Message, session: Session) -> Objection | None:
+    def inspect(self, message: Message, session: Session) -> PublishRejection | None:
         """Whether a message of QoS 2 can be converted; of a large one that is found out when it is
         its turn, unless that is now."""
         turns = self._around.turns
@@ -229,7 +235,7 @@ class ToRos(Flow):
             return None
         else:
             cdr = turns.now(partial(self._convert, message, session)) or b""
-        return cdr if isinstance(cdr, Objection) else None
+        return cdr if isinstance(cdr, PublishRejection) else None
 
     def refused(self, session: Session) -> None:
         """A message of the session was refused, by this guard or another."""

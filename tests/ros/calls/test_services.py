@@ -14,7 +14,7 @@ from waiting import until
 pytest.importorskip("std_srvs.srv")
 from call_harness import AllTypes, CallHarness, call_routes, service
 
-from appliance.broker.message import Late, Message
+from appliance.broker.message import DelayedMessage, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
@@ -316,12 +316,13 @@ async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(harn
     switch = Switch(harness)
     client = harness.client("alice")
     again = Message(CALL, b"", 1, properties={Property.RESPONSE_TOPIC: "answers/alice"})
-    harness.broker.publish(Late(again, 60.0), client.session)
+    harness.broker.publish(DelayedMessage(again, 60.0), client.session)
     client.send(CALL, {"data": True}, response_topic="answers/alice")
     await until(lambda: len(client.on("answers/alice")) == 2, "the errors")
     codes = [answer["error"]["code"] for answer in client.payloads("answers/alice")]
     assert codes == ["expired", "expired"] and switch.asked == []
-    harness.broker.publish(Late(again, 1.0), harness.client("bob").session)  # within its time
+    late = DelayedMessage(again, 1.0)  # within its time
+    harness.broker.publish(late, harness.client("bob").session)
     await until(lambda: switch.asked, "another client's call")
 
 

@@ -337,7 +337,7 @@ async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     alice = harness.client("alice")
     for _ in range(6):
         alice.send("r2d2/a", {"data": "a" * 5000})
-    objection = harness.broker.objection
+    objection = harness.broker.rejection
     assert objection.code == 0x97 and "waits to be converted" in objection.reason
     await until(lambda: len(peer.received) == 4, "those that had room")
     assert harness.bridge.topics()[0].errors == 2

@@ -16,8 +16,8 @@ from zstandard import ZstdCompressor
 from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
 from appliance.broker.client import Client as NetworkClient
-from appliance.broker.message import Late, Message
-from appliance.broker.ports import Action, Contact, Decision
+from appliance.broker.message import DelayedMessage, Message
+from appliance.broker.ports import Action, Decision, PeerStatus
 from appliance.mqtt.codec import Property, decode_varint
 from appliance.mqtt.packets import (
     Connect,
@@ -95,7 +95,7 @@ class Wire:
     def __init__(self):
         self.written = b""
         self.closed = False
-        self.connection = Contact(silence=math.inf)
+        self.connection = PeerStatus(silence=math.inf)
         self.probed = False
         self.withheld = []
 
@@ -114,7 +114,7 @@ class Wire:
     def later(self):
         pass
 
-    def contact(self):
+    def peer_status(self):
         return self.connection
 
     def probe(self):
@@ -242,7 +242,7 @@ async def test_what_is_sent_again_is_old(house):
 class Asks(AllAllowed):
     """As a topic plugin that asks over HTTP: it has no answer yet, and then allows all."""
 
-    patience = 60.0
+    timeout = 60.0
 
     def __init__(self, action):
         self.action = action
@@ -253,7 +253,7 @@ class Asks(AllAllowed):
             return Decision(False, "asked", pending=True)
         return super().decide(identity, action, topic)
 
-    def waits(self, question, wake):
+    def is_pending(self, query, wake):
         return not self.has_answered
 
 
@@ -261,7 +261,7 @@ def asks(house, action):
     """The house has a plugin that has to ask about such; gives what answers after some seconds."""
     plugin = Asks(action)
     house.broker.access = plugin
-    house.broker.router.asked = plugin
+    house.broker.router.pending_decisions = plugin
 
     def answer(driver, seconds):
         plugin.has_answered = True
@@ -413,7 +413,7 @@ async def test_late_messages_are_as_others_to_other_clients(house):
     properties = {Property.USER_PROPERTY: [("a", "b")]}
     driver.drive(qos=1, dup=True, properties=properties)
     message, qos = house.client.received[-1]
-    assert isinstance(message, Late)
+    assert isinstance(message, DelayedMessage)
     assert (message.payload, message.properties, qos) == (GO, properties, 1)
 
 
@@ -519,7 +519,7 @@ async def test_who_rests_before_it_drives_is_stopped_as_early(house, disconnect)
     rules = CommandRules(exclusive=True, lease=600, on_silence=OnSilence(AFTER, "{}", disconnect))
     house.start(rules)
     driver, flow = Driver(house.broker, "a"), house.commands
-    driver.wire.connection = Contact(silence=0.0)
+    driver.wire.connection = PeerStatus(silence=0.0)
     driver.steer()
     driver.steer(b"{}")
     await until(lambda: flow._timer.when() > flow._heard_at + 500)
@@ -585,11 +585,11 @@ async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_an
     house.start(CommandRules(on_silence=OnSilence(AFTER)))
     driver = Driver(house.broker, "a")
     for round_ in range(1, 4):
-        driver.wire.connection = Contact(silence=math.inf)
+        driver.wire.connection = PeerStatus(silence=math.inf)
         driver.drive()
         await until(lambda: driver.wire.probed)
         driver.wire.probed = False
-        driver.wire.connection = Contact(silence=0.0)
+        driver.wire.connection = PeerStatus(silence=0.0)
         await until(lambda: not house.commands._asked)
         await asyncio.sleep(0.4)
         assert house.robot.received == [twist(0.5), STOP] * round_
@@ -604,8 +604,8 @@ async def test_who_answered_before_it_was_asked_is_asked(house, impatient):
     begun = time.monotonic()
 
     class Wire(type(driver.wire)):
-        def contact(self):
-            return Contact(silence=time.monotonic() - begun)
+        def peer_status(self):
+            return PeerStatus(silence=time.monotonic() - begun)
 
     driver.wire.__class__ = Wire
     driver.steer()
@@ -942,7 +942,7 @@ class TestBacklog:
 
     def begin(self):
         backlog = ReplayGuard()
-        assert backlog.has(Late(self.NEW, math.inf), self, 0.5, 100.0)
+        assert backlog.has(DelayedMessage(self.NEW, math.inf), self, 0.5, 100.0)
         return backlog
 
     def test_it_takes_longer_than_a_command_may(self):
@@ -1064,8 +1064,8 @@ class FarLink:
         self.withheld = []
         self.flowing = self.held = 0.0
 
-    def contact(self):
-        return Contact(self.round_trip, flowing=self.flowing, held=self.held)
+    def peer_status(self):
+        return PeerStatus(self.round_trip, flowing=self.flowing, held=self.held)
 
     def withhold(self, seconds):
         self.withheld.append(seconds)
@@ -1498,7 +1498,7 @@ async def test_who_drives_and_was_not_read_for_a_time(house, qos):
     """Of QoS 2, that is known when the command comes, and not when it is released."""
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     for _ in range(5):
         driver.drive(qos=qos)
         if qos == 2:
@@ -1506,10 +1506,10 @@ async def test_who_drives_and_was_not_read_for_a_time(house, qos):
         await asyncio.sleep(0.06)
     assert house.robot.received
     house.robot.received.clear()
-    driver.wire.connection = Contact(held=3.0)
+    driver.wire.connection = PeerStatus(held=3.0)
     commands = [Publish(TOPIC, GO, qos=qos, packet_id=n if qos else None) for n in (1, 2)]
     driver.say(*commands)
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     if qos == 2:
         driver.say(Pubrel(1), Pubrel(2))
     await asyncio.sleep(0.3)
@@ -1536,7 +1536,7 @@ async def test_a_stream_that_begins_is_no_reason_to_warn(house, caplog, qos):
     house.start(CommandRules(expire=5))
     caplog.set_level(logging.INFO)
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     for number in range(5):
         driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None))
         if qos == 2:
@@ -1558,12 +1558,12 @@ async def test_a_command_with_something_else_behind_it(house, pauses):
     """A first command waits for what else there is, and that may be a picture."""
     house.start(CommandRules(expire=0.3))
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact(flowing=60.0)
+    driver.wire.connection = PeerStatus(flowing=60.0)
     driver.drive()
     await asyncio.sleep(0.2)
     assert house.robot.received == []
     if pauses:
-        driver.wire.connection = Contact(flowing=0.05)
+        driver.wire.connection = PeerStatus(flowing=0.05)
         await until(lambda: house.robot.received == [twist(0.5)])
     else:
         await until(lambda: house.counters().expired == 1)
@@ -1613,10 +1613,10 @@ async def test_a_stop_message_that_waited_behind_a_slow_reader_is_carried_out(ho
     house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
     driver = Driver(house.broker, "a")
     driver.steer()
-    late = Late(Message(TOPIC, b"{}", 1), 5.0)
+    late = DelayedMessage(Message(TOPIC, b"{}", 1), 5.0)
     assert house.commands.receive(late, False, driver.client.session, 9) is None
     assert house.robot.received == [twist(0.5), STOP]
-    late = Late(Message(TOPIC, GO, 1), 5.0)
+    late = DelayedMessage(Message(TOPIC, GO, 1), 5.0)
     assert house.commands.receive(late, False, driver.client.session, 9) is not None
     assert house.robot.received == [twist(0.5), STOP]
 
@@ -1650,11 +1650,11 @@ async def test_what_has_come_and_was_not_read_is_behind_it(house):
     """The loop was busy: its timers are early, and its clients late."""
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact(has_unread=True)
+    driver.wire.connection = PeerStatus(has_unread=True)
     driver.drive()
     await asyncio.sleep(0.2)
     driver.drive()
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     await asyncio.sleep(0.2)
     assert house.robot.received == []
     assert house.counters().expired == 2
@@ -1663,7 +1663,7 @@ async def test_what_has_come_and_was_not_read_is_behind_it(house):
 async def test_what_waits_for_ever_behind_it(house):
     house.start(CommandRules(expire=0.15))
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact(has_unread=True)
+    driver.wire.connection = PeerStatus(has_unread=True)
     driver.drive()
     await until(lambda: house.counters().expired == 1)
     assert house.robot.received == []
@@ -2224,7 +2224,7 @@ async def test_the_bridges_own_stop_overtakes_what_has_come(house, cause):
     source, other = Driver(house.broker, "source"), Driver(house.broker, "other")
     stop_beside(source, GO, properties=made(0))
     if cause == "silent":
-        other.wire.connection = Contact(has_unread=True)  # until the silence is too long
+        other.wire.connection = PeerStatus(has_unread=True)  # until the silence is too long
     other.drive(GO)
     if cause == "left":
         source.leave()
@@ -2233,7 +2233,7 @@ async def test_the_bridges_own_stop_overtakes_what_has_come(house, cause):
     elif cause == "reload":
         bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=RULES)])
     await until(lambda: house.robot.received == [twist(0.5), STOP])
-    other.wire.connection = Contact()
+    other.wire.connection = PeerStatus()
     await until(lambda: total(house, "expired") == 1)
     assert house.robot.received == [twist(0.5), STOP]
 
@@ -2390,11 +2390,11 @@ async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, 
         )
         lamp = house.node.add_subscriber("/lamp", TWIST)
         await house.settle()
-        driver.wire.connection = Contact(has_unread=True)
+        driver.wire.connection = PeerStatus(has_unread=True)
         driver.say(Publish("r2d2/lamp", GO))
         await until(lambda: total(house, "expired") == 1)
         assert lamp.received == []
-        driver.wire.connection = Contact()
+        driver.wire.connection = PeerStatus()
     elif way == "fault":
         with monkeypatch.context() as patch:
             patch.setattr(Commands, "_read", lambda *_: 1 / 0)
@@ -2639,9 +2639,9 @@ async def test_who_leaves_is_followed_by_a_stop_though_its_last_is_not_carried_o
 async def test_the_first_command_of_a_connection_that_was_not_read_for_a_time(house, qos):
     house.start(CommandRules(expire=0.5))
     driver = Driver(house.broker, "a")
-    driver.wire.connection = Contact(held=1.2)
+    driver.wire.connection = PeerStatus(held=1.2)
     driver.say(Publish(TOPIC, GO, qos=qos, packet_id=7 if qos else None))
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     if qos == 2:
         driver.say(Pubrel(7))
     await until(lambda: house.counters().expired == 1)
