@@ -16,9 +16,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from arena import MIB, Arena, Outcome
 from attacks import ATTACKS
-from combat import BOTH
+from load import BOTH
+from server import MIB, Outcome, Server
 from witness import Over
 
 _HEAD = (
@@ -34,7 +34,7 @@ def row(outcome: Outcome) -> str:
     return (
         f"{outcome.attack.name:<26} {outcome.transport:<9} {times[0]:>15.1f} {times[1]:>7.1f} "
         f"{times[2]:>7.1f}  {outcome.base // MIB:>10} {outcome.peak // MIB:>6} "
-        f"{outcome.bound // MIB:>6}  {outcome.log_lines:>9} {outcome.about_it:>6}"
+        f"{outcome.bound // MIB:>6}  {outcome.log_lines:>9} {outcome.matching_lines:>6}"
         f"  {'FAILED' if outcome.problems else 'ok'}"
     )
 
@@ -68,14 +68,14 @@ def main() -> int:
     print(_HEAD)
     with (
         tempfile.TemporaryDirectory() as directory,
-        contextlib.closing(Arena(Path(directory))) as arena,
+        contextlib.closing(Server(Path(directory))) as server,
     ):
         for attack in chosen:
             for ways in arguments.ways:
                 if attack.over is not None and attack.over not in ways:
                     continue
                 try:
-                    outcome = arena.run(attack, ways, arguments.seconds)
+                    outcome = server.run(attack, ways, arguments.seconds)
                 except AssertionError as error:
                     print(f"{error}  FAILED", flush=True)
                     failed += 1

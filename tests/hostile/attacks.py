@@ -1,4 +1,4 @@
-"""The attacks. Each says in its docstring what it does, and in `says` what the log must tell."""
+"""The attacks. A docstring says what an attack does, `log_pattern` which line the log must have."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from combat import BOTH, PATIENCE, ROUND_TRIP, USER, Attack, Fight, Line, WebLine, encode4, encode5
+from load import BOTH, PATIENCE, ROUND_TRIP, USER, Attack, Line, Load, WebLine, encode4, encode5
 from witness import BINARY, CONTINUATION, PING, PONG, UPGRADE, Over, frame
 
 from appliance.mqtt.codec import Property, encode_varint
@@ -39,15 +39,15 @@ HEALTHY = "r2d2/healthy/echo"
 ADDRESS = r"127\.0\.0\.1:\d+"
 CLIENT = rf"client '[^']*' \(user '{USER}'\)"
 
-Run = Callable[[Fight], Awaitable[None]]
+Run = Callable[[Load], Awaitable[None]]
 
 
 def attack(
-    says: str,
+    log_pattern: str,
     *,
     at_least: float = 0.0,
     short: bool = True,
-    said_after: float = 0.0,
+    logged_after: float = 0.0,
     p99: float = math.inf,
     worst: float = ROUND_TRIP,
     over: Over | None = None,
@@ -59,7 +59,9 @@ def attack(
         name = run.__name__.replace("_", "-")
         what = " ".join((run.__doc__ or "").split())
         bounds = p99, worst, over
-        ATTACKS[name] = Attack(name, what, run, says, limits, at_least, short, said_after, *bounds)
+        ATTACKS[name] = Attack(
+            name, what, run, log_pattern, limits, at_least, short, logged_after, *bounds
+        )
         return run
 
     return enter
@@ -69,62 +71,62 @@ def attack(
 
 
 @attack(rf"{ADDRESS}: no complete CONNECT within", at_least=1.4)
-async def slow_connects(fight: Fight) -> None:
+async def slow_connects(load: Load) -> None:
     """A thousand strangers say their CONNECT byte by byte, and come again when they are cut."""
-    packet = fight.connect_packet("slow")
+    packet = load.connect_packet("slow")
 
     async def drip(number: int) -> Line:
-        line = await fight.dial()
-        line.say(packet[:1])
+        line = await load.dial()
+        line.send_nowait(packet[:1])
         return line
 
     async def keep_on() -> None:
         said = 1
-        while fight.on:
-            lines = [line for line in fight.lines if line.open]
+        while load.on:
+            lines = [line for line in load.lines if line.open]
             for line in lines:
-                line.say(packet[said : said + 1])
+                line.send_nowait(packet[said : said + 1])
             said = min(said + 1, len(packet) - 2)
-            fight.counts["bytes"] += len(lines)
-            fight.lines.intersection_update(lines)
+            load.counts["bytes"] += len(lines)
+            load.lines.intersection_update(lines)
             await asyncio.sleep(0.1)
 
     async def come() -> None:
-        while fight.on:
-            await fight.crowd(900 - len(fight.lines), drip, 1.0)
+        while load.on:
+            await load.crowd(900 - len(load.lines), drip, 1.0)
             await asyncio.sleep(0.05)
 
-    await fight.together(keep_on(), come())
+    await load.together(keep_on(), come())
 
 
 @attack(rf"{ADDRESS}(: no complete CONNECT within| broke the protocol)", at_least=1.4)
-async def heavy_strangers(fight: Fight) -> None:
+async def heavy_strangers(load: Load) -> None:
     """Strangers send almost all of the largest CONNECT there can be, and wait."""
-    packet = fight.connect_packet("heavy", will=_heavy_will(MAXIMUM_CONTROL - 200))[:-1]
+    packet = load.connect_packet("heavy", will=_heavy_will(MAXIMUM_CONTROL - 200))[:-1]
 
     async def stay(number: int) -> Line:
-        line = await fight.dial()
+        line = await load.dial()
         await line.send(packet)
         return line
 
-    while fight.on:
-        await fight.crowd(900, stay, 1.0)
+    while load.on:
+        await load.crowd(900, stay, 1.0)
 
 
 @attack(rf"({ADDRESS} broke the protocol|user 'mallory'\) at 127\.0\.0\.1:\d+ refused)")
-async def costly_strangers(fight: Fight) -> None:
+async def costly_strangers(load: Load) -> None:
     """CONNECTs that are long to take apart, full of user properties, with a wrong password."""
     pairs = [("", "")] * ((MAXIMUM_CONTROL - 400) // 5)
     will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
-    packet = fight.connect_packet("costly", password=b"wrong", will=will)
+    packet = load.connect_packet("costly", password=b"wrong", will=will)
 
-    async def say(number: int) -> Line:
-        line = await fight.dial()
+    async def send(number: int) -> Line:
+        line = await load.dial()
         await line.send(packet)
         return line
 
-    while fight.on:
-        await fight.crowd(200, say, 1.0)
+    while load.on:
+        await load.crowd(200, send, 1.0)
 
 
 #: What the healthy client may have to wait while work is made that is large for its bytes.
@@ -135,30 +137,30 @@ STRANGERS_PAIRS = 64
 PAIRS = 1000
 
 
-async def _last_bytes(fight: Fight, packet: bytes, answer: int) -> None:
+async def _last_bytes(load: Load, packet: bytes, answer: int) -> None:
     """Crowds whose CONNECTs miss their last byte, which then comes from all in one moment."""
 
     async def wait(number: int) -> Line:
-        line = await fight.dial()
+        line = await load.dial()
         await line.send(packet[:-1])
         return line
 
-    async def hear(line: Line) -> None:
+    async def expect_answer(line: Line) -> None:
         with contextlib.suppress(asyncio.TimeoutError):
-            await line.hear(4)
+            await line.receive(4)
         code = line.first[3] if len(line.first) > 3 else -1
-        fight.counts["answered" if code == answer else f"answered {code:#04x}"] += 1
+        load.counts["answered" if code == answer else f"answered {code:#04x}"] += 1
 
-    while fight.on:
-        lines = await fight.crowd(245, wait, 1.0)
+    while load.on:
+        lines = await load.crowd(245, wait, 1.0)
         await asyncio.sleep(0.3)  # for the broker to have read them
         for line in lines:
-            line.say(packet[-1:])
-        await asyncio.gather(*(hear(line) for line in lines))
+            line.send_nowait(packet[-1:])
+        await asyncio.gather(*(expect_answer(line) for line in lines))
         for line in lines:
-            line.hang_up()
-            fight.lines.discard(line)
-    assert fight.counts["answered"], f"nobody was answered with {answer:#04x}"
+            line.abort()
+            load.lines.discard(line)
+    assert load.counts["answered"], f"nobody was answered with {answer:#04x}"
 
 
 def _pairs(count: int, size: int) -> list[tuple[str, str]]:
@@ -173,12 +175,12 @@ def _pairs(count: int, size: int) -> list[tuple[str, str]]:
     connect_timeout="10 s",
     **BOUNDED,
 )
-async def last_bytes(fight: Fight) -> None:
+async def last_bytes(load: Load) -> None:
     """The last byte of 245 CONNECTs with 2 x 9,900 empty user properties, all in one moment."""
     pairs = [("", "")] * 9_900
     will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
-    packet = fight.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
-    await _last_bytes(fight, packet, 0x97)
+    packet = load.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
+    await _last_bytes(load, packet, 0x97)
 
 
 @attack(
@@ -188,36 +190,36 @@ async def last_bytes(fight: Fight) -> None:
     connect_timeout="10 s",
     **BOUNDED,
 )
-async def last_bytes_allowed(fight: Fight) -> None:
+async def last_bytes_allowed(load: Load) -> None:
     """The same with as many user properties as are allowed, each of 1,500 bytes: all log in."""
     pairs = _pairs(STRANGERS_PAIRS // 2, 1500)
     will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
-    packet = fight.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
-    await _last_bytes(fight, packet, 0)
+    packet = load.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
+    await _last_bytes(load, packet, 0)
 
 
 @attack(r"\(0x97\)|more than \d+ User Properties", at_least=1.0, **BOUNDED)
-async def costly_connects(fight: Fight) -> None:
+async def costly_connects(load: Load) -> None:
     """A hundred CONNECTs a second with 2 x 9,900 empty user properties."""
     pairs = [("", "")] * 9_900
     will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
-    packet = fight.connect_packet("costly", will=will, properties={Property.USER_PROPERTY: pairs})
+    packet = load.connect_packet("costly", will=will, properties={Property.USER_PROPERTY: pairs})
 
     async def come(number: int) -> None:
-        async for _ in fight.rounds(0.1):
-            line = await fight.dial()
+        async for _ in load.rounds(0.1):
+            line = await load.dial()
             await line.send(packet)
-            if await line.hear(4):
+            if await line.receive(4):
                 assert line.first[3] == 0x97, line.first.hex()
-                fight.counts["answered"] += 1
-            line.hang_up()
-            fight.lines.discard(line)
+                load.counts["answered"] += 1
+            line.abort()
+            load.lines.discard(line)
 
-    await fight.together(*(come(number) for number in range(10)))
-    assert fight.counts["answered"]
+    await load.together(*(come(number) for number in range(10)))
+    assert load.counts["answered"]
 
 
-async def _forbidden_properties(fight: Fight, pairs: list[tuple[str, str]], clients: int) -> None:
+async def _forbidden_properties(load: Load, pairs: list[tuple[str, str]], clients: int) -> None:
     """Messages full of user properties, of clients that come again when they are cut off."""
     packet = encode5(
         Publish(
@@ -229,46 +231,46 @@ async def _forbidden_properties(fight: Fight, pairs: list[tuple[str, str]], clie
         )
     )
 
-    async def say(number: int) -> None:
-        async for turn in fight.rounds():
-            line = await fight.join(f"pairs-{number}-{turn}")
+    async def send(number: int) -> None:
+        async for turn in load.rounds():
+            line = await load.join(f"pairs-{number}-{turn}")
             before = line.received
-            await fight.flood(line, packet, 1, "packets")
-            fight.counts["answered"] += line.received > before
+            await load.flood(line, packet, 1, "packets")
+            load.counts["answered"] += line.received > before
 
-    await fight.together(*(say(number) for number in range(clients)))
-    assert fight.counts["packets"]
+    await load.together(*(send(number) for number in range(clients)))
+    assert load.counts["packets"]
 
 
 @attack(rf"{CLIENT}.*broke the protocol.*User Properties", **BOUNDED)
-async def too_many_pairs(fight: Fight) -> None:
+async def too_many_pairs(load: Load) -> None:
     """Twenty clients send messages with 9,900 user properties to where they may not write."""
-    await _forbidden_properties(fight, [("", "")] * 9_900, 20)
+    await _forbidden_properties(load, [("", "")] * 9_900, 20)
 
 
 @attack(r"may not publish to 'r2d2/forbidden", **BOUNDED)
-async def many_pairs(fight: Fight) -> None:
+async def many_pairs(load: Load) -> None:
     """The same with as many user properties as are allowed, empty ones."""
-    await _forbidden_properties(fight, [("", "")] * PAIRS, 20)
+    await _forbidden_properties(load, [("", "")] * PAIRS, 20)
 
 
 @attack(r"may not publish to 'r2d2/forbidden", **BOUNDED)
-async def long_pairs(fight: Fight) -> None:
+async def long_pairs(load: Load) -> None:
     """The same, of 300 bytes each, in characters that take the most memory."""
-    await _forbidden_properties(fight, _pairs(PAIRS, 300), 20)
+    await _forbidden_properties(load, _pairs(PAIRS, 300), 20)
 
 
 @attack(rf"{CLIENT}", at_least=2.0, over=Over.TLS, **BOUNDED)
-async def tls_records(fight: Fight) -> None:
+async def tls_records(load: Load) -> None:
     """Twenty clients whose TLS records hold one byte each."""
 
     async def send(number: int) -> None:
         loop = asyncio.get_running_loop()
         incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-        tls = fight.target.context().wrap_bio(incoming, outgoing, server_hostname="localhost")
-        with await fight.raw(Over.TLS) as sock:
+        tls = load.target.context().wrap_bio(incoming, outgoing, server_hostname="localhost")
+        with await load.raw(Over.TLS) as sock:
 
-            async def receive() -> None:
+            async def expect_answer() -> None:
                 data = await asyncio.wait_for(loop.sock_recv(sock, 65536), PATIENCE)
                 if not data:
                     raise ConnectionError("the broker closed")
@@ -280,37 +282,37 @@ async def tls_records(fight: Fight) -> None:
                     break
                 except ssl.SSLWantReadError:
                     await loop.sock_sendall(sock, outgoing.read())
-                    await receive()
-            tls.write(fight.connect_packet(f"records-{number}"))
+                    await expect_answer()
+            tls.write(load.connect_packet(f"records-{number}"))
             await loop.sock_sendall(sock, outgoing.read())
             answer = b""
             while len(answer) < 4:
                 try:
                     answer += tls.read(65536)
                 except ssl.SSLWantReadError:
-                    await receive()
+                    await expect_answer()
             assert answer[3] == 0, answer.hex()
-            fight.counts["logins"] += 1
+            load.counts["logins"] += 1
             ping = Pingreq().encode(5)
-            while fight.on:
+            while load.on:
                 for _ in range(2000):
                     tls.write(ping[:1])
                     tls.write(ping[1:])
-                    fight.counts["records"] += 2
+                    load.counts["records"] += 2
                 await asyncio.sleep(0)
                 await loop.sock_sendall(sock, outgoing.read())
                 with contextlib.suppress(BlockingIOError):
-                    fight.counts["bytes answered"] += len(sock.recv(65536))
+                    load.counts["bytes answered"] += len(sock.recv(65536))
 
-    await fight.together(*(send(number) for number in range(20)))
-    assert fight.counts["bytes answered"], "no ping was answered"
+    await load.together(*(send(number) for number in range(20)))
+    assert load.counts["bytes answered"], "no ping was answered"
 
 
 #: Logins a second with a wrong password.
 GUESSES = 1000
 
 
-async def _guess(fight: Fight) -> None:
+async def _guess(load: Load) -> None:
     """Wrong passwords of every kind of user, some of them again and again, and one right one.
 
     That comes from another address, for a user that is guessed at and was not here before.
@@ -322,21 +324,21 @@ async def _guess(fight: Fight) -> None:
     async def guess(number: int) -> None:
         password = b"123456" if number % 10 == 0 else b"guess %d" % number
         name = names[number % len(names)] if number % 3 else f"user{number}"
-        packet = fight.connect_packet(f"g{number}", username=name, password=password)
+        packet = load.connect_packet(f"g{number}", username=name, password=password)
         with contextlib.suppress(OSError, asyncio.TimeoutError):
-            line = await fight.dial()
+            line = await load.dial()
             try:
-                line.say(packet)
-                if await line.hear(4):
-                    fight.counts[f"answered 0x{line.first[3]:02x}"] += 1
+                line.send_nowait(packet)
+                if await line.receive(4):
+                    load.counts[f"answered 0x{line.first[3]:02x}"] += 1
             finally:
                 line.transport.abort()
-                fight.lines.discard(line)
+                load.lines.discard(line)
 
     async def flood() -> None:
         began = loop.time()
         number = 0
-        while fight.on:
+        while load.on:
             due = int((loop.time() - began) * GUESSES)
             while number < due:
                 number += 1
@@ -347,19 +349,19 @@ async def _guess(fight: Fight) -> None:
             await asyncio.sleep(0.005)
 
     async def log_in() -> None:
-        await asyncio.sleep(0.5 * fight.seconds)
+        await asyncio.sleep(0.5 * load.seconds)
         sock = socket.socket()
         sock.setblocking(False)
         sock.bind(("127.0.0.2", 0))
         began = loop.time()
-        await loop.sock_connect(sock, ("127.0.0.1", fight.target.plain_port))
+        await loop.sock_connect(sock, ("127.0.0.1", load.target.plain_port))
         _, line = await loop.create_connection(lambda: Line(sock), sock=sock)
-        line.say(fight.connect_packet("owner"))
-        assert await line.hear(4) and line.first[3] == 0, f"not let in: {line.first.hex()}"
-        fight.counts["ms for a right login"] = round((loop.time() - began) * 1000)
-        line.hang_up()
+        line.send_nowait(load.connect_packet("owner"))
+        assert await line.receive(4) and line.first[3] == 0, f"not let in: {line.first.hex()}"
+        load.counts["ms for a right login"] = round((loop.time() - began) * 1000)
+        line.abort()
 
-    await fight.together(flood(), log_in())
+    await load.together(flood(), log_in())
     for task in pending:
         task.cancel()
 
@@ -367,9 +369,9 @@ async def _guess(fight: Fight) -> None:
 @attack(
     r"refused: (too many (logins|passwords)|wrong password|unknown user)", at_least=2.0, p99=0.05
 )
-async def wrong_logins(fight: Fight) -> None:
+async def wrong_logins(load: Load) -> None:
     """A thousand wrong logins a second, of which no limit of connections keeps any away."""
-    await _guess(fight)
+    await _guess(load)
 
 
 @attack(
@@ -381,27 +383,27 @@ async def wrong_logins(fight: Fight) -> None:
     connections_per_address=250,
     connect_timeout="10 s",
 )
-async def wrong_logins_by_default(fight: Fight) -> None:
+async def wrong_logins_by_default(load: Load) -> None:
     """The same, with the limits of connections as they are by default."""
-    await _guess(fight)
+    await _guess(load)
 
 
 @attack(r"127\.0\.0\.1\S* .*connection_rate", connection_rate=100, connections_per_address=250)
-async def connect_flood(fight: Fight) -> None:
+async def connect_flood(load: Load) -> None:
     """Connections that are closed as soon as they are there, as fast as they can be made."""
 
     async def come_and_go() -> None:
-        while fight.on:
+        while load.on:
             try:
-                (await fight.raw()).close()
+                (await load.raw()).close()
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
 
-    await fight.together(*(come_and_go() for _ in range(16)))
+    await load.together(*(come_and_go() for _ in range(16)))
 
 
 @attack(rf"{ADDRESS} broke the protocol")
-async def garbage_flood(fight: Fight) -> None:
+async def garbage_flood(load: Load) -> None:
     """As many connections as can be made, each with bytes that are no MQTT."""
     rng = random.Random(1)
     garbage = [
@@ -415,100 +417,100 @@ async def garbage_flood(fight: Fight) -> None:
     ]
 
     async def come_and_go() -> None:
-        while fight.on:
+        while load.on:
             try:
-                line = await fight.dial()
+                line = await load.dial()
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
                 continue
-            line.say(rng.choice(garbage))
+            line.send_nowait(rng.choice(garbage))
             await asyncio.sleep(0)
             if rng.random() < 0.5:
-                line.hang_up()
+                line.abort()
             else:
                 line.transport.close()
-            fight.lines.discard(line)
+            load.lines.discard(line)
 
-    await fight.together(*(come_and_go() for _ in range(32)))
+    await load.together(*(come_and_go() for _ in range(32)))
 
 
 @attack(rf"{ADDRESS}: no TLS connection", over=Over.TLS)
-async def tls_flood(fight: Fight) -> None:
+async def tls_flood(load: Load) -> None:
     """TLS handshakes one behind the other, whole ones, and ones that end in the middle."""
 
     async def whole() -> None:
-        while fight.on:
+        while load.on:
             try:
-                line = await fight.dial(Over.TLS)
+                line = await load.dial(Over.TLS)
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
                 continue
-            fight.counts["handshakes"] += 1
-            line.hang_up()
-            fight.lines.discard(line)
+            load.counts["handshakes"] += 1
+            line.abort()
+            load.lines.discard(line)
 
-    hello = _client_hello(fight)
+    hello = _client_hello(load)
 
     async def half() -> None:
         loop = asyncio.get_running_loop()
-        while fight.on:
+        while load.on:
             try:
-                sock = await fight.raw(Over.TLS)
+                sock = await load.raw(Over.TLS)
             except (OSError, asyncio.TimeoutError):
                 await asyncio.sleep(0.001)
                 continue
             try:
                 await loop.sock_sendall(sock, hello)
                 await asyncio.wait_for(loop.sock_recv(sock, 100), 5)
-                fight.counts["half handshakes"] += 1
+                load.counts["half handshakes"] += 1
             except (OSError, asyncio.TimeoutError):
                 pass
             sock.close()
 
-    await fight.together(*(whole() for _ in range(12)), *(half() for _ in range(12)))
+    await load.together(*(whole() for _ in range(12)), *(half() for _ in range(12)))
 
 
 @attack(
     rf"{ADDRESS}: no (TLS connection|complete CONNECT)", at_least=1.4, short=False, over=Over.TLS
 )
-async def tls_half_open(fight: Fight) -> None:
+async def tls_half_open(load: Load) -> None:
     """Hundreds of TLS handshakes that stop after, or drip, their first message."""
-    hello = _client_hello(fight)
+    hello = _client_hello(load)
     loop = asyncio.get_running_loop()
     socks = []
     try:
-        async for round_ in fight.rounds(0.02):
-            if len(socks) < 900 and fight.within(0.8):
+        async for round_ in load.rounds(0.02):
+            if len(socks) < 900 and load.within(0.8):
                 for _ in range(20):
-                    sock = await fight.raw(Over.TLS)
+                    sock = await load.raw(Over.TLS)
                     socks.append(sock)
                     part = hello if round_ % 2 else hello[: len(hello) // 2]
                     await loop.sock_sendall(sock, part)
-        fight.counts["crowd"] = len(socks)
+        load.counts["crowd"] = len(socks)
     finally:
         for sock in socks:
             sock.close()
 
 
 @attack(r"(user|client) 'mallory.*refused: (wrong password|unknown user|too many passwords)")
-async def wrong_passwords(fight: Fight) -> None:
+async def wrong_passwords(load: Load) -> None:
     """Logins with wrong passwords and unknown names, as many as can be made."""
 
     async def guess(worker: int) -> None:
-        async for number in fight.rounds():
+        async for number in load.rounds():
             try:
-                line = await fight.dial(Over.PLAIN if fight.ways == BOTH else None)
+                line = await load.dial(Over.PLAIN if load.ways == BOTH else None)
             except (OSError, asyncio.TimeoutError):
                 continue
             user = USER if number % 2 else f"{USER}{number}"
             secret = b"%d.%d" % (worker, number)
-            line.say(fight.connect_packet(f"{USER}-guess", username=user, password=secret))
-            await line.hear(5)
-            fight.counts["guesses"] += 1
-            line.hang_up()
-            fight.lines.discard(line)
+            line.send_nowait(load.connect_packet(f"{USER}-guess", username=user, password=secret))
+            await line.receive(5)
+            load.counts["guesses"] += 1
+            line.abort()
+            load.lines.discard(line)
 
-    await fight.together(*(guess(number) for number in range(100)))
+    await load.together(*(guess(number) for number in range(100)))
 
 
 # --- over WebSocket
@@ -517,167 +519,165 @@ async def wrong_passwords(fight: Fight) -> None:
 WEB: dict[str, Any] = {"over": Over.WEBSOCKET, **BOUNDED}
 
 
-async def _web(fight: Fight, client_id: str) -> WebLine:
-    line = await fight.join(client_id)
+async def _web(load: Load, client_id: str) -> WebLine:
+    line = await load.join(client_id)
     assert isinstance(line, WebLine)
     return line
 
 
-async def _push_forever(fight: Fight, clients: int, data: bytes, count: int, what: str) -> None:
+async def _push_forever(load: Load, clients: int, data: bytes, count: int, what: str) -> None:
     """Clients that send the same frames again and again, and come again when they are cut off."""
 
     async def push(number: int) -> None:
-        async for turn in fight.rounds(0.02):
-            line = await _web(fight, f"web-{number}-{turn}")
-            while fight.on and line.open:
+        async for turn in load.rounds(0.02):
+            line = await _web(load, f"web-{number}-{turn}")
+            while load.on and line.open:
                 await line.push(data)
-                fight.counts[what] += count
-                fight.counts["pongs"] += line.pongs
+                load.counts[what] += count
+                load.counts["pongs"] += line.pongs
                 line.pongs = 0
                 await asyncio.sleep(0)
 
-    await fight.together(*(push(number) for number in range(clients)))
-    assert fight.counts[what]
+    await load.together(*(push(number) for number in range(clients)))
+    assert load.counts[what]
 
 
-async def _push_at_once(
-    fight: Fight, chunks: list[bytes], pause: float, begin: bytes = b""
-) -> None:
+async def _push_at_once(load: Load, chunks: list[bytes], pause: float, begin: bytes = b"") -> None:
     """245 clients that each send one of the chunks, all in one moment, again and again."""
 
     async def stay(number: int) -> Line:
-        line = await _web(fight, f"web-{number}")
+        line = await _web(load, f"web-{number}")
         await line.push(begin)
         return line
 
-    lines = await fight.crowd(245, stay, 0.5)
-    async for turn in fight.rounds(pause):
+    lines = await load.crowd(245, stay, 0.5)
+    async for turn in load.rounds(pause):
         for line in lines:
             if line.open:
                 line.transport.write(chunks[turn % len(chunks)])
-        fight.counts["chunks"] += len(lines)
+        load.counts["chunks"] += len(lines)
     assert any(line.open for line in lines), "nobody is left"
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **WEB)
-async def web_bytes(fight: Fight) -> None:
+async def web_bytes(load: Load) -> None:
     """Twenty clients whose frames hold one byte each, as fast as they are read."""
     ping = Pingreq().encode(5)
     data = (frame(ping[:1]) + frame(ping[1:])) * 5000
-    await _push_forever(fight, 20, data, 10_000, "frames")
+    await _push_forever(load, 20, data, 10_000, "frames")
 
 
 @attack(rf"{CLIENT}", at_least=2.5, **WEB)
-async def web_bytes_at_once(fight: Fight) -> None:
+async def web_bytes_at_once(load: Load) -> None:
     """245 clients that send 2,000 bytes of one-byte frames, all in one moment."""
     ping = Pingreq().encode(5)
-    await _push_at_once(fight, [(frame(ping[:1]) + frame(ping[1:])) * 142], 0.3)
+    await _push_at_once(load, [(frame(ping[:1]) + frame(ping[1:])) * 142], 0.3)
 
 
 @attack(rf"{CLIENT}", at_least=2.5, **WEB)
-async def web_segments(fight: Fight) -> None:
+async def web_segments(load: Load) -> None:
     """245 clients whose frames come a byte at a time, in segments of their own."""
     data = frame(encode5(Publish(AREA, bytes(10), 1, packet_id=1)))
-    await _push_at_once(fight, [data[at : at + 1] for at in range(len(data))], 0.01)
+    await _push_at_once(load, [data[at : at + 1] for at in range(len(data))], 0.01)
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **WEB)
-async def web_fragments(fight: Fight) -> None:
+async def web_fragments(load: Load) -> None:
     """Twenty clients with one message of empty fragments, without an end."""
     data = frame(b"", BINARY, last=False) + frame(b"", CONTINUATION, last=False) * 10_000
     again = data + frame(b"", CONTINUATION)
-    await _push_forever(fight, 20, again, 10_000, "fragments")
+    await _push_forever(load, 20, again, 10_000, "fragments")
 
 
 @attack(rf"{CLIENT}", at_least=2.5, **WEB)
-async def web_fragments_at_once(fight: Fight) -> None:
+async def web_fragments_at_once(load: Load) -> None:
     """245 clients that each send 2,040 bytes of empty fragments, all in one moment."""
     chunk = frame(b"", CONTINUATION, last=False) * 340
-    await _push_at_once(fight, [chunk], 0.3, frame(b"", BINARY, last=False))
+    await _push_at_once(load, [chunk], 0.3, frame(b"", BINARY, last=False))
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **WEB)
-async def web_pings(fight: Fight) -> None:
+async def web_pings(load: Load) -> None:
     """Twenty clients that send pings, empty ones and the largest, as fast as they are read."""
     data = frame(b"", PING) * 5000 + frame(bytes(125), PING) * 500
-    await _push_forever(fight, 20, data, 5500, "pings")
-    assert fight.counts["pongs"], "no ping was answered"
+    await _push_forever(load, 20, data, 5500, "pings")
+    assert load.counts["pongs"], "no ping was answered"
 
 
 @attack(rf"{CLIENT}", at_least=2.5, **WEB)
-async def web_pings_at_once(fight: Fight) -> None:
+async def web_pings_at_once(load: Load) -> None:
     """245 clients that each send 2,040 bytes of pings, or of pongs, all in one moment."""
-    await _push_at_once(fight, [frame(b"", PING) * 340, frame(b"", PONG) * 340], 0.3)
+    await _push_at_once(load, [frame(b"", PING) * 340, frame(b"", PONG) * 340], 0.3)
 
 
 @attack(r"not the WebSocket protocol: a frame that is too large", at_least=2.0, **WEB)
-async def web_giants(fight: Fight) -> None:
+async def web_giants(load: Load) -> None:
     """Frames that announce 2^63 bytes, or what is just allowed; those of the latter are dripped."""
     sizes = [1 << 63, (1 << 63) - 1, 1 << 31, 16 << 20]
     heads = [b"\x82\xff" + size.to_bytes(8, "big") + bytes(4) for size in sizes]
 
     async def come(number: int) -> Line:
-        line = await _web(fight, f"web-{number}")
+        line = await _web(load, f"web-{number}")
         await line.push(heads[number % 4] + bytes(2000))
-        fight.counts["heads"] += 1
+        load.counts["heads"] += 1
         return line
 
-    while fight.on:
-        await fight.crowd(245, come, 1.0)
-        for line in list(fight.lines):
+    while load.on:
+        await load.crowd(245, come, 1.0)
+        for line in list(load.lines):
             if line.open:
                 line.transport.write(bytes(1000))
             else:
-                fight.lines.discard(line)
+                load.lines.discard(line)
         await asyncio.sleep(0.05)
 
 
 @attack(rf"{ADDRESS}: no complete CONNECT within", at_least=2.0, **WEB)
-async def web_strangers(fight: Fight) -> None:
+async def web_strangers(load: Load) -> None:
     """245 strangers who send all kinds of frames and never log in."""
     chunks = [
         frame(b"", PING) * 340,
         frame(b"", BINARY) * 340,
         frame(b"", BINARY, last=False) + frame(b"", CONTINUATION, last=False) * 338,
-        frame(fight.connect_packet("stranger")[:1]) + frame(bytes(125), PONG) * 15,
+        frame(load.connect_packet("stranger")[:1]) + frame(bytes(125), PONG) * 15,
     ]
 
     async def come(number: int) -> Line:
-        line = await fight.dial()
+        line = await load.dial()
         assert isinstance(line, WebLine)
         await line.push(chunks[number % 4])
         return line
 
-    async for _ in fight.rounds(0.2):
-        await fight.crowd(245 - len(fight.lines), come, 1.0)
-        for number, line in enumerate(list(fight.lines)):
+    async for _ in load.rounds(0.2):
+        await load.crowd(245 - len(load.lines), come, 1.0)
+        for number, line in enumerate(list(load.lines)):
             if line.open:
                 line.transport.write(chunks[number % 2])
-                fight.counts["chunks"] += 1
+                load.counts["chunks"] += 1
             else:
-                fight.lines.discard(line)
+                load.lines.discard(line)
 
 
 @attack(rf"{ADDRESS}: no complete CONNECT within", at_least=2.0, **WEB)
-async def web_requests_dripped(fight: Fight) -> None:
+async def web_requests_dripped(load: Load) -> None:
     """245 strangers whose requests for a WebSocket come a byte at a time."""
     requests = itertools.cycle([UPGRADE, UPGRADE[:-2] + _headers(15_000)])
     loop = asyncio.get_running_loop()
 
     async def drip() -> None:
-        while fight.on:
+        while load.on:
             request = next(requests)
-            with contextlib.suppress(OSError, asyncio.TimeoutError), await fight.raw() as sock:
+            with contextlib.suppress(OSError, asyncio.TimeoutError), await load.raw() as sock:
                 for at in range(len(request)):
                     await loop.sock_sendall(sock, request[at : at + 1])
-                    fight.counts["bytes"] += 1
+                    load.counts["bytes"] += 1
                     await asyncio.sleep(0.005)
 
-    await fight.together(*(drip() for _ in range(245)))
+    await load.together(*(drip() for _ in range(245)))
 
 
 @attack(rf"{ADDRESS}: no WebSocket connection", at_least=2.0, connect_timeout="10 s", **WEB)
-async def web_headers(fight: Fight) -> None:
+async def web_headers(load: Load) -> None:
     """The last byte of 245 requests with as many headers as may be, all in one moment."""
     loop = asyncio.get_running_loop()
     begin = UPGRADE[:-2]
@@ -694,24 +694,24 @@ async def web_headers(fight: Fight) -> None:
     )
 
     async def wait(_: int) -> Line:
-        sock = await fight.raw()
+        sock = await load.raw()
         _, line = await loop.create_connection(lambda: Line(sock), sock=sock)
-        fight.lines.add(line)
+        load.lines.add(line)
         await line.send(next(requests))
         return line
 
-    while fight.on:
-        lines = await fight.crowd(245, wait, 1.0)
+    while load.on:
+        lines = await load.crowd(245, wait, 1.0)
         await asyncio.sleep(0.1)  # for the broker to have read them
         for line in lines:
-            line.say(b"\n")
-        fight.counts["requests"] += len(lines)
+            line.send_nowait(b"\n")
+        load.counts["requests"] += len(lines)
         await asyncio.sleep(0.2)
         for line in lines:
-            fight.counts["answered"] += line.received > 0
-            line.hang_up()
-            fight.lines.discard(line)
-    assert fight.counts["answered"]
+            load.counts["answered"] += line.received > 0
+            line.abort()
+            load.lines.discard(line)
+    assert load.counts["answered"]
 
 
 def _headers(size: int, count: int = 0) -> bytes:
@@ -724,84 +724,84 @@ def _headers(size: int, count: int = 0) -> bytes:
 # --- behind a login: who does not listen
 
 
-@attack(rf"{CLIENT}.*queue is full", said_after=3.0)
-async def never_acknowledging(fight: Fight) -> None:
+@attack(rf"{CLIENT}.*queue is full", logged_after=3.0)
+async def never_acknowledging(load: Load) -> None:
     """Subscribers that acknowledge nothing of QoS 1 and 2, with a flood of both behind them."""
 
     async def stay(number: int) -> Line:
         expiry = {Property.SESSION_EXPIRY_INTERVAL: 3600} if number % 2 else None
-        line = await fight.join(f"silent-{number}", clean_start=False, properties=expiry)
+        line = await load.join(f"silent-{number}", clean_start=False, properties=expiry)
         wanted = [Subscription(f"{AREA}/flood/#", 1 + number % 4 // 2)]
-        line.say(encode5(Subscribe(1, wanted)))
+        line.send_nowait(encode5(Subscribe(1, wanted)))
         return line
 
-    await fight.crowd(200, stay, 0.4)
-    await fight.together(
-        _publish_forever(fight, "flood-1", 1, 100), _publish_forever(fight, "flood-2", 2, 1000)
+    await load.crowd(200, stay, 0.4)
+    await load.together(
+        _publish_forever(load, "flood-1", 1, 100), _publish_forever(load, "flood-2", 2, 1000)
     )
 
 
-@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", said_after=3.0)
-async def never_reading_small(fight: Fight) -> None:
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", logged_after=3.0)
+async def never_reading_small(load: Load) -> None:
     """Subscribers with every QoS that never read, and a flood of small messages behind them."""
-    await _never_reading(fight, 200, 50)
+    await _never_reading(load, 200, 50)
 
 
-@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", said_after=3.0)
-async def never_reading_large(fight: Fight) -> None:
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|dropped)", logged_after=3.0)
+async def never_reading_large(load: Load) -> None:
     """Subscribers with every QoS that never read, and a flood of large messages behind them."""
-    await _never_reading(fight, 200, 200_000)
+    await _never_reading(load, 200, 200_000)
 
 
-@attack(rf"{CLIENT}.*(queue is full|does not read|slow|asks for more)", said_after=5.0)
-async def never_reading_qos0(fight: Fight) -> None:
+@attack(rf"{CLIENT}.*(queue is full|does not read|slow|asks for more)", logged_after=5.0)
+async def never_reading_qos0(load: Load) -> None:
     """Subscribers with QoS 0 that never read, for whom messages are replaced and dropped."""
-    await _never_reading(fight, 200, 2000, (0,))
+    await _never_reading(load, 200, 2000, (0,))
 
 
 async def _never_reading(
-    fight: Fight, readers: int, size: int, levels: tuple[int, ...] = (0, 1, 2)
+    load: Load, readers: int, size: int, levels: tuple[int, ...] = (0, 1, 2)
 ) -> None:
     async def stay(number: int) -> Line:
-        line = await fight.join(f"deaf-{number}", receive_buffer=4096)
+        line = await load.join(f"unread-{number}", receive_buffer=4096)
         qos = levels[number % len(levels)]
-        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", qos)])))
-        line.deaf()
+        line.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", qos)])))
+        line.stop_reading()
         return line
 
-    await fight.crowd(readers, stay, 0.4)
-    await fight.together(*(_publish_forever(fight, f"flood-{qos}", qos, size) for qos in levels))
+    await load.crowd(readers, stay, 0.4)
+    await load.together(*(_publish_forever(load, f"flood-{qos}", qos, size) for qos in levels))
 
 
 @attack(rf"{CLIENT}", short=False)
-async def fan_out(fight: Fight) -> None:
+async def fan_out(load: Load) -> None:
     """Subscribers that read all, and so many small messages for each that it takes forever."""
 
     async def stay(number: int) -> Line:
-        line = await fight.join(f"reader-{number}", version=V311)
-        line.say(encode4(Subscribe(1, [Subscription(f"{AREA}/flood/#")])))
+        line = await load.join(f"reader-{number}", version=V311)
+        line.send_nowait(encode4(Subscribe(1, [Subscription(f"{AREA}/flood/#")])))
         return line
 
-    await fight.crowd(100, stay, 0.4)
-    await fight.together(*(_publish_forever(fight, f"flood-{n}", 0, 1) for n in range(3)))
+    await load.crowd(100, stay, 0.4)
+    await load.together(*(_publish_forever(load, f"flood-{n}", 0, 1) for n in range(3)))
 
 
-@attack(rf"{CLIENT}.*(does not read|asks for more|slow)", said_after=5.0)
-async def ping_flood(fight: Fight) -> None:
+@attack(rf"{CLIENT}.*(does not read|asks for more|slow)", logged_after=5.0)
+async def ping_flood(load: Load) -> None:
     """PINGREQs without end, and nobody who reads the answers."""
     pings = Pingreq().encode(4) * 60_000
 
     async def stay(number: int) -> Line:
-        line = await fight.join(f"ping-{number}", version=V311, receive_buffer=4096)
-        line.deaf()
+        line = await load.join(f"ping-{number}", version=V311, receive_buffer=4096)
+        line.stop_reading()
         return line
 
-    lines = await fight.crowd(50, stay, 0.3)
-    await fight.together(*(fight.flood(line, pings, 60_000, "pings") for line in lines))
+    lines = await load.crowd(50, stay, 0.3)
+    await load.together(*(load.flood(line, pings, 60_000, "pings") for line in lines))
 
 
 @attack(rf"{CLIENT}")
-async def small_packets(fight: Fight) -> None:
+async def small_packets(load: Load) -> None:
     """A hundred clients that send the smallest packets there are, as fast as they are read."""
     ids = range(1, 10_000)
     chunks = [
@@ -812,104 +812,103 @@ async def small_packets(fight: Fight) -> None:
     ]
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"small-{number}", version=V311)
+        return await load.join(f"small-{number}", version=V311)
 
-    lines = await fight.crowd(100, stay, 0.4)
+    lines = await load.crowd(100, stay, 0.4)
     floods = (
-        fight.flood(line, chunks[number % 4], 20_000, "packets")
-        for number, line in enumerate(lines)
+        load.flood(line, chunks[number % 4], 20_000, "packets") for number, line in enumerate(lines)
     )
-    await fight.together(*floods)
+    await load.together(*floods)
 
 
 @attack(rf"{CLIENT}")
-async def costly_filters(fight: Fight) -> None:
+async def costly_filters(load: Load) -> None:
     """SUBSCRIBE and UNSUBSCRIBE with as many filters as one packet can hold."""
     many = MAXIMUM_CONTROL // 4 - 100
     packets = [
         encode5(Subscribe(1, [Subscription("x", 0)] * many)),
         encode5(Unsubscribe(1, ["x"] * many)),
     ]
-    await _say_often(fight, packets)
+    await _send_often(load, packets)
 
 
 @attack(rf"{CLIENT}")
-async def costly_properties(fight: Fight) -> None:
+async def costly_properties(load: Load) -> None:
     """Messages that are nothing but user properties, three million of them."""
     topic = len(AREA).to_bytes(2, "big") + AREA.encode()
     pairs = 3_000_000
     body = topic + encode_varint(pairs * 5) + b"\x26\0\0\0\0" * pairs
-    await _say_often(fight, [b"\x30" + encode_varint(len(body)) + body])
+    await _send_often(load, [b"\x30" + encode_varint(len(body)) + body])
 
 
-async def _say_often(fight: Fight, packets: list[bytes]) -> None:
+async def _send_often(load: Load, packets: list[bytes]) -> None:
     """Many clients that send one of the packets again and again, and come again when cut off."""
 
-    async def say(number: int) -> None:
-        async for turn in fight.rounds():
-            line = await fight.join(f"costly-{number}-{turn}")
-            await fight.flood(line, packets[number % len(packets)], 1, "packets")
+    async def send(number: int) -> None:
+        async for turn in load.rounds():
+            line = await load.join(f"costly-{number}-{turn}")
+            await load.flood(line, packets[number % len(packets)], 1, "packets")
 
-    await fight.together(*(say(number) for number in range(8)))
+    await load.together(*(send(number) for number in range(8)))
 
 
 # --- subscriptions
 
 
 @attack(r"may not subscribe to .*limits\.(subscriptions|queue_bytes|(user\.)?memory)")
-async def subscription_bomb(fight: Fight) -> None:
+async def subscription_bomb(load: Load) -> None:
     """A hundred thousand filters, 1,000 a client and one more, in packets as large as may be."""
 
     async def subscribe(number: int) -> Line:
-        line = await fight.join(f"bomb-{number}")
+        line = await load.join(f"bomb-{number}")
         wanted = [Subscription(f"{AREA}/{number}/{index}/+") for index in range(1001)]
         await line.send(encode5(Subscribe(1, wanted)))
-        fight.counts["filters"] += len(wanted)
+        load.counts["filters"] += len(wanted)
         return line
 
     # All take turns: when there are seconds, one of them comes to its one more without the others.
     await subscribe(100)
     await asyncio.sleep(0.1)
-    await fight.crowd(100, subscribe, 1.0)
+    await load.crowd(100, subscribe, 1.0)
 
 
 @attack(r"client 'deep.*levels")
-async def deep_filters(fight: Fight) -> None:
+async def deep_filters(load: Load) -> None:
     """Filters of 200 levels that share none but the first ones, and of more levels than allowed."""
 
     async def subscribe(number: int) -> Line:
-        line = await fight.join(f"deep-{number}")
+        line = await load.join(f"deep-{number}")
         for start in range(0, 1000, 250):
             wanted = [
                 Subscription(f"{AREA}/{number}/{index}" + "/+" * 196)
                 for index in range(start, start + 250)
             ]
             await line.send(encode5(Subscribe(1, wanted)))
-            fight.counts["filters"] += len(wanted)
-        line.say(encode5(Subscribe(1, [Subscription(AREA + "/+" * 200)])))
+            load.counts["filters"] += len(wanted)
+        line.send_nowait(encode5(Subscribe(1, [Subscription(AREA + "/+" * 200)])))
         return line
 
-    await fight.crowd(200, subscribe, 1.0)
+    await load.crowd(200, subscribe, 1.0)
 
 
 @attack(r"may not subscribe to .*limits\.(subscriptions|queue_bytes|(user\.)?memory)")
-async def long_filters(fight: Fight) -> None:
+async def long_filters(load: Load) -> None:
     """Filters of 65,535 bytes, a thousand a client, one of their characters beyond the BMP."""
 
     async def subscribe(number: int) -> Line:
-        line = await fight.join(f"long-{number}")
+        line = await load.join(f"long-{number}")
         for index in range(1001):
             topic = f"{AREA}/\U0001f916{number}/{index}/"
             wanted = [Subscription(topic + "x" * (65535 - len(topic.encode())))]
             await line.send(encode5(Subscribe(1, wanted)))
-            fight.counts["filters"] += 1
+            load.counts["filters"] += 1
         return line
 
-    await fight.crowd(50, subscribe, 1.0)
+    await load.crowd(50, subscribe, 1.0)
 
 
 @attack(rf"{CLIENT}")
-async def matching_filters(fight: Fight) -> None:
+async def matching_filters(load: Load) -> None:
     """All filters that match one topic of 14 levels, and messages to ever new ones of these."""
     levels = 12
     combinations = [
@@ -918,23 +917,23 @@ async def matching_filters(fight: Fight) -> None:
     ]
 
     async def subscribe(number: int) -> Line:
-        line = await fight.join(f"match-{number}")
+        line = await load.join(f"match-{number}")
         mine = combinations[number * 1000 : (number + 1) * 1000]
         await line.send(encode5(Subscribe(1, [Subscription(text) for text in mine])))
-        fight.counts["filters"] += len(mine)
+        load.counts["filters"] += len(mine)
         return line
 
-    await fight.crowd(-(-len(combinations) // 1000), subscribe, 0.4)
-    publisher = await fight.join("match-publisher")
-    async for number in fight.rounds():
+    await load.crowd(-(-len(combinations) // 1000), subscribe, 0.4)
+    publisher = await load.join("match-publisher")
+    async for number in load.rounds():
         # Each topic is a new one: nothing that was looked up for the last helps.
         topics = [f"{AREA}{'/a' * (levels - 1)}/{number}-{index}" for index in range(500)]
         await publisher.send(encode5(*(Publish(topic, b"") for topic in topics)))
-        fight.counts["messages"] += len(topics)
+        load.counts["messages"] += len(topics)
 
 
 @attack(rf"{CLIENT}", short=False)
-async def everybody_listens(fight: Fight) -> None:
+async def everybody_listens(load: Load) -> None:
     """Hundreds of clients that subscribe to the healthy client's topic in every way there is."""
     healthy = HEALTHY.split("/")
     ways = [
@@ -944,39 +943,39 @@ async def everybody_listens(fight: Fight) -> None:
     ways += ["#", "+/#", "+/+/#", "+/+/+/#", "r2d2/#", "r2d2/healthy/#", f"{HEALTHY}/#"]
 
     async def subscribe(number: int) -> Line:
-        line = await fight.join(f"listen-{number}")
-        line.say(encode5(Subscribe(1, [Subscription(way, number % 3) for way in ways])))
+        line = await load.join(f"listen-{number}")
+        line.send_nowait(encode5(Subscribe(1, [Subscription(way, number % 3) for way in ways])))
         return line
 
-    await fight.crowd(300, subscribe, 0.8)
-    async for _ in fight.rounds(0.1):
+    await load.crowd(300, subscribe, 0.8)
+    async for _ in load.rounds(0.1):
         pass
 
 
 @attack(rf"{CLIENT}")
-async def subscription_churn(fight: Fight) -> None:
+async def subscription_churn(load: Load) -> None:
     """Subscribe and unsubscribe without end, so that nothing that was looked up holds for long."""
     wanted = [Subscription(f"{AREA}/{index}/#", 1) for index in range(100)]
     names = [one.filter for one in wanted]
     chunk = encode5(Subscribe(1, wanted), Unsubscribe(2, names)) * 20
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"churn-{number}")
+        return await load.join(f"churn-{number}")
 
-    lines = await fight.crowd(20, stay, 0.3)
-    await fight.together(*(fight.flood(line, chunk, 4000, "changes") for line in lines))
+    lines = await load.crowd(20, stay, 0.3)
+    await load.together(*(load.flood(line, chunk, 4000, "changes") for line in lines))
 
 
 # --- topics
 
 
 @attack(r"may not publish to .*levels|(connection|limits)\.?_?topic_levels")
-async def deep_topics(fight: Fight) -> None:
+async def deep_topics(load: Load) -> None:
     """Topics of 200 levels, of 65,535 bytes, of more levels than allowed; never the same twice."""
 
     async def publish(number: int) -> None:
-        line = await fight.join(f"deep-{number}")
-        async for turn in fight.rounds():
+        line = await load.join(f"deep-{number}")
+        async for turn in load.rounds():
             begin = f"{AREA}/{number}/{turn}"
             packets = [
                 Publish(begin + "/a" * (200 - begin.count("/") - 1), b"x", 1, packet_id=1),
@@ -986,252 +985,252 @@ async def deep_topics(fight: Fight) -> None:
             if not turn % 100:
                 packets.append(Publish(begin + "/" * 60000, b"x", 1, packet_id=4))
             await line.send(encode5(*packets))
-            fight.counts["messages"] += len(packets)
+            load.counts["messages"] += len(packets)
 
-    await fight.together(*(publish(number) for number in range(50)))
+    await load.together(*(publish(number) for number in range(50)))
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
-async def new_deep_topics(fight: Fight) -> None:
+async def new_deep_topics(load: Load) -> None:
     """Twenty clients that publish to ever new topics of 100 levels, as fast as they are read."""
 
     async def publish(number: int) -> None:
-        line = await fight.join(f"new-{number}")
-        async for turn in fight.rounds():
+        line = await load.join(f"new-{number}")
+        async for turn in load.rounds():
             topics = (f"{AREA}/{number}/{turn}/{index}" + "/abcd" * 95 for index in range(20))
             await line.send(encode5(*(Publish(topic, b"x", 1, packet_id=1) for topic in topics)))
-            await line.hear(line.received + 20 * 4)
-            fight.counts["messages"] += 20
+            await line.receive(line.received + 20 * 4)
+            load.counts["messages"] += 20
 
-    await fight.together(*(publish(number) for number in range(20)))
+    await load.together(*(publish(number) for number in range(20)))
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
-async def little_chunks(fight: Fight) -> None:
+async def little_chunks(load: Load) -> None:
     """A hundred clients that each send 15 kB to new topics, all in one moment, again and again."""
 
     def make(number: int) -> bytes:
         return encode5(*(Publish(f"{AREA}/{number}/{index}", b"") for index in range(600)))
 
-    await _at_once(fight, 100, 0.5, make)
+    await _at_once(load, 100, 0.5, make)
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
-async def near_misses(fight: Fight) -> None:
+async def near_misses(load: Load) -> None:
     """Twenty clients, each message of which passes two thousand filters that do not match."""
     levels = 11
     for number in range(3):
-        line = await fight.join(f"filters-{number}")
+        line = await load.join(f"filters-{number}")
         await line.send(encode5(Subscribe(1, _near_misses(levels, number * 1000, 1000))))
 
     def make(number: int) -> bytes:
         topics = (f"{AREA}{'/a' * levels}/{number}-{index}" for index in range(5))
         return encode5(*(Publish(topic, b"") for topic in topics))
 
-    await _at_once(fight, 20, 0.3, make)
+    await _at_once(load, 20, 0.3, make)
 
 
 @attack(rf"{CLIENT}", short=False)
-async def invented_topics(fight: Fight) -> None:
+async def invented_topics(load: Load) -> None:
     """Each client publishes to a thousand topics of its own, so that all of them are remembered."""
     filler = "x" * 440
 
     async def publish(number: int) -> Line:
-        line = await fight.join(f"many-{number}")
-        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/none/{number}/#")])))
+        line = await load.join(f"many-{number}")
+        line.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/none/{number}/#")])))
         for start in range(0, 1000, 100):
             topics = (f"{AREA}/{number}/{start + index}/{filler}" for index in range(100))
             await line.send(encode5(*(Publish(topic, b"") for topic in topics)))
-        fight.counts["topics"] += 1000
+        load.counts["topics"] += 1000
         return line
 
-    await fight.crowd(400, publish, 1.0)
+    await load.crowd(400, publish, 1.0)
 
 
 @attack(r"topic alias (11|0|7)|TOPIC_ALIAS must not be")
-async def topic_aliases(fight: Fight) -> None:
+async def topic_aliases(load: Load) -> None:
     """All the aliases there are, each for a topic of 65,535 bytes; and ones that there are not."""
 
     async def keep(number: int) -> Line:
-        line = await fight.join(f"alias-{number}")
+        line = await load.join(f"alias-{number}")
         for alias in range(1, 11):
             begin = f"{AREA}/\U0001f916{number}/{alias}/"
             topic = begin + "x" * (65535 - len(begin.encode()))
             await line.send(encode5(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias})))
-        fight.counts["aliases"] += 10
+        load.counts["aliases"] += 10
         return line
 
     async def abuse() -> None:
-        async for number in fight.rounds(0.01):
-            line = await fight.join(f"alias-abuse-{number % 50}")
+        async for number in load.rounds(0.01):
+            line = await load.join(f"alias-abuse-{number % 50}")
             alias = (0, 7, 11, 65535)[number % 4]
             topic = "" if alias == 7 else AREA
-            line.say(encode5(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias})))
+            line.send_nowait(encode5(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias})))
             await line.closed.wait()
-            fight.lines.discard(line)
-            fight.counts["wrong aliases"] += 1
+            load.lines.discard(line)
+            load.counts["wrong aliases"] += 1
 
     async def crowd() -> None:
-        await fight.crowd(400, keep, 1.0)
+        await load.crowd(400, keep, 1.0)
 
-    await fight.together(crowd(), abuse())
+    await load.together(crowd(), abuse())
 
 
 # --- retained messages
 
 
-@attack(r"no room to retain", said_after=3.0)
-async def retained_flood(fight: Fight) -> None:
+@attack(r"no room to retain", logged_after=3.0)
+async def retained_flood(load: Load) -> None:
     """Retained messages, small ones to ever new topics and large ones, beyond the limit."""
 
     async def publish(number: int) -> None:
-        line = await fight.join(f"retain-{number}")
+        line = await load.join(f"retain-{number}")
         size = (10, 100, 100_000)[number % 3]
-        async for turn in fight.rounds():
+        async for turn in load.rounds():
             packets = [
                 Publish(f"{AREA}/{number}/{turn}-{index}", b"x" * size, retain=True)
                 for index in range(max(1, min(100, 100_000 // size)))
             ]
             await line.send(encode5(*packets))
-            fight.counts["messages"] += len(packets)
+            load.counts["messages"] += len(packets)
 
-    await fight.together(*(publish(number) for number in range(6)))
+    await load.together(*(publish(number) for number in range(6)))
 
 
 @attack(r"no room to retain|may not publish")
-async def retained_deep(fight: Fight) -> None:
+async def retained_deep(load: Load) -> None:
     """Retained messages of one byte to ever new topics of 200 levels."""
 
     async def publish(number: int) -> None:
-        line = await fight.join(f"retain-{number}")
-        async for turn in fight.rounds():
+        line = await load.join(f"retain-{number}")
+        async for turn in load.rounds():
             packets = [
                 Publish(f"{AREA}/{number}/{turn}/{index}" + "/a" * 194, b"x", retain=True)
                 for index in range(50)
             ]
             await line.send(encode5(*packets))
-            fight.counts["messages"] += len(packets)
+            load.counts["messages"] += len(packets)
 
-    await fight.together(*(publish(number) for number in range(6)))
+    await load.together(*(publish(number) for number in range(6)))
 
 
 @attack(rf"{CLIENT}")
-async def retained_replays(fight: Fight) -> None:
+async def retained_replays(load: Load) -> None:
     """Clients that ask for all retained messages again and again, with every QoS."""
-    publisher = await fight.join("retain")
+    publisher = await load.join("retain")
     for start in range(0, 10_000, 500):
-        if not fight.within(0.4):
+        if not load.within(0.4):
             break
         numbers = range(start, start + 500)
         packets = [Publish(f"{AREA}/{n % 10}/{n}", b"x" * 50, retain=True) for n in numbers]
         await publisher.send(encode5(*packets))
-        fight.counts["retained"] += 500
+        load.counts["retained"] += 500
 
     async def ask(number: int) -> None:
-        line = await fight.join(f"replay-{number}")
+        line = await load.join(f"replay-{number}")
         if number % 2:
-            line.deaf()
+            line.stop_reading()
         wanted = [Subscription(way, number % 3) for way in ("#", "+/#", "r2d2/#", "+/+/+/+")]
         packet = encode5(Subscribe(1, wanted))
-        async for _ in fight.rounds(0.02):
+        async for _ in load.rounds(0.02):
             await line.send(packet)
-            fight.counts["subscriptions"] += len(wanted)
+            load.counts["subscriptions"] += len(wanted)
 
-    await fight.together(*(ask(number) for number in range(20)))
+    await load.together(*(ask(number) for number in range(20)))
 
 
 @attack(rf"{CLIENT}")
-async def retained_needles(fight: Fight) -> None:
+async def retained_needles(load: Load) -> None:
     """Filters whose search goes through all retained messages and finds none."""
-    publisher = await fight.join("retain")
+    publisher = await load.join("retain")
     for start in range(0, 15_000, 500):
-        if not fight.within(0.5):
+        if not load.within(0.5):
             break
         numbers = range(start, start + 500)
         packets = [Publish(f"{AREA}/{n}/a/b", b"x", retain=True) for n in numbers]
         await publisher.send(encode5(*packets))
-        fight.counts["retained"] += 500
+        load.counts["retained"] += 500
 
     async def ask(number: int) -> None:
-        line = await fight.join(f"needle-{number}")
+        line = await load.join(f"needle-{number}")
         wanted = [Subscription(f"{AREA}/+/a/+/{index}") for index in range(100)]
         packet = encode5(Subscribe(1, wanted))
-        async for _ in fight.rounds(0.01):
+        async for _ in load.rounds(0.01):
             await line.send(packet)
-            fight.counts["searches"] += len(wanted)
+            load.counts["searches"] += len(wanted)
 
-    await fight.together(*(ask(number) for number in range(10)))
+    await load.together(*(ask(number) for number in range(10)))
 
 
 # --- large packets
 
 
 @attack(r"client '.*more than the limit of")
-async def announced_giants(fight: Fight) -> None:
+async def announced_giants(load: Load) -> None:
     """Packets that announce 256 MB and drip; and ones that announce what is just allowed."""
     huge = b"\x30" + encode_varint(268_435_455)
     allowed = b"\x32" + encode_varint((16 << 20) - 5)
     topic = len(AREA).to_bytes(2, "big") + AREA.encode()
 
     async def announce(number: int) -> Line:
-        line = await fight.join(f"giant-{number}")
-        line.say((allowed if number % 4 else huge) + topic)
+        line = await load.join(f"giant-{number}")
+        line.send_nowait((allowed if number % 4 else huge) + topic)
         return line
 
-    await fight.crowd(400, announce, 0.6)
-    async for _ in fight.rounds(0.05):
-        lines = [line for line in fight.lines if line.open]
+    await load.crowd(400, announce, 0.6)
+    async for _ in load.rounds(0.05):
+        lines = [line for line in load.lines if line.open]
         for line in lines:
-            line.say(b"x" * 10)
-        fight.counts["drips"] += len(lines)
+            line.send_nowait(b"x" * 10)
+        load.counts["drips"] += len(lines)
 
 
 @attack(rf"{CLIENT}")
-async def unfinished_giants(fight: Fight) -> None:
+async def unfinished_giants(load: Load) -> None:
     """Many clients that send packets of 16 MB but for the last byte, all at the same time."""
     body = len(AREA).to_bytes(2, "big") + AREA.encode() + b"\0"
     size = (16 << 20) - 5
     packet = b"\x30" + encode_varint(size) + body + bytes(size - len(body) - 1)
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"giant-{number}")
+        return await load.join(f"giant-{number}")
 
-    lines = await fight.crowd(50, stay, 0.3)
+    lines = await load.crowd(50, stay, 0.3)
 
     async def send(line: Line) -> None:
         for start in range(0, len(packet), 1 << 18):
             await line.send(packet[start : start + (1 << 18)])
-            fight.counts["MiB"] = round(fight.counts["bytes"] / (1 << 20))
-            fight.counts["bytes"] += 1 << 18
+            load.counts["MiB"] = round(load.counts["bytes"] / (1 << 20))
+            load.counts["bytes"] += 1 << 18
 
-    await fight.together(*(send(line) for line in lines))
+    await load.together(*(send(line) for line in lines))
 
 
 @attack(rf"{CLIENT}")
-async def giants(fight: Fight) -> None:
+async def giants(load: Load) -> None:
     """Messages of 16 MB, many at the same time, to receivers of which most do not read."""
     packet = encode5(Publish(f"{AREA}/giant", bytes((16 << 20) - 100)))
 
     async def receive(number: int) -> Line:
-        line = await fight.join(f"giant-reader-{number}", receive_buffer=65536)
-        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/giant", number % 3)])))
+        line = await load.join(f"giant-reader-{number}", receive_buffer=65536)
+        line.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/giant", number % 3)])))
         if number % 4:
-            line.deaf()
+            line.stop_reading()
         return line
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"giant-{number}")
+        return await load.join(f"giant-{number}")
 
-    await fight.crowd(20, receive, 0.3)
-    lines = await fight.crowd(10, stay, 0.4)
-    await fight.together(*(fight.flood(line, packet, 1, "messages") for line in lines))
+    await load.crowd(20, receive, 0.3)
+    lines = await load.crowd(10, stay, 0.4)
+    await load.together(*(load.flood(line, packet, 1, "messages") for line in lines))
 
 
 # --- packet ids, QoS 2
 
 
-@attack(r"client '.*(no room for its unfinished|unfinished QoS 2|packet ids)", said_after=3.0)
-async def packet_ids(fight: Fight) -> None:
+@attack(r"client '.*(no room for its unfinished|unfinished QoS 2|packet ids)", logged_after=3.0)
+async def packet_ids(load: Load) -> None:
     """65,535 messages of QoS 2 that are never released, of 3.1.1 clients and of 5.0 ones."""
     every = [
         encode4(
@@ -1242,130 +1241,130 @@ async def packet_ids(fight: Fight) -> None:
     fives = encode5(*(Publish(AREA, b"x", 2, packet_id=number) for number in range(1, 100)))
 
     async def exhaust(number: int) -> None:
-        async for turn in fight.rounds():
-            line = await fight.join(f"ids-{number}-{turn}", version=V311, clean_start=False)
+        async for turn in load.rounds():
+            line = await load.join(f"ids-{number}-{turn}", version=V311, clean_start=False)
             for chunk in every:
                 await line.send(chunk)
-                fight.counts["ids"] += 4369
-            five = await fight.join(f"ids5-{number}-{turn}")
+                load.counts["ids"] += 4369
+            five = await load.join(f"ids5-{number}-{turn}")
             await five.send(fives)
             await five.closed.wait()
 
-    await fight.together(*(exhaust(number) for number in range(5)))
+    await load.together(*(exhaust(number) for number in range(5)))
 
 
 @attack(rf"{CLIENT}", at_least=2.0, **BOUNDED)
-async def unreleased(fight: Fight) -> None:
+async def unreleased(load: Load) -> None:
     """Twenty clients of 3.1.1 that send 180 kB of the smallest messages of QoS 2 in one moment."""
     chunk = encode4(*(Publish("r2d2/q2", b"", 2, packet_id=1 + n) for n in range(14_000)))
-    await _at_once(fight, 20, 0.7, lambda number: chunk, version=V311)
+    await _at_once(load, 20, 0.7, lambda number: chunk, version=V311)
 
 
 @attack(rf"{CLIENT}")
-async def never_completing(fight: Fight) -> None:
+async def never_completing(load: Load) -> None:
     """Subscribers that answer a QoS 2 message with PUBREC and never with PUBCOMP."""
 
     async def stay(number: int) -> Line:
-        line = await fight.join(f"half-{number}")
-        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 2)])))
-        line.say(encode5(*(Pubrec(packet_id) for packet_id in range(1, 21))))
+        line = await load.join(f"half-{number}")
+        line.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 2)])))
+        line.send_nowait(encode5(*(Pubrec(packet_id) for packet_id in range(1, 21))))
         return line
 
-    lines = await fight.crowd(50, stay, 0.4)
+    lines = await load.crowd(50, stay, 0.4)
 
     async def half() -> None:
         answer = encode5(*(Pubrec(packet_id) for packet_id in range(1, 21)))
-        async for _ in fight.rounds(0.05):
+        async for _ in load.rounds(0.05):
             for line in lines:
-                line.say(answer)
+                line.send_nowait(answer)
 
-    await fight.together(half(), _publish_forever(fight, "flood", 2, 1000))
+    await load.together(half(), _publish_forever(load, "flood", 2, 1000))
 
 
 # --- connections that are not what they seem
 
 
 @attack(rf"{CLIENT}.*(connection lost|closed)")
-async def half_closed(fight: Fight) -> None:
+async def half_closed(load: Load) -> None:
     """Clients that end their half of the connection and stay, before the login and behind it."""
 
     async def close(number: int) -> Line:
         if number % 3:
-            line = await fight.join(f"half-{number}", receive_buffer=4096)
-            line.say(encode5(Subscribe(1, [Subscription(HEALTHY, 1)])))
+            line = await load.join(f"half-{number}", receive_buffer=4096)
+            line.send_nowait(encode5(Subscribe(1, [Subscription(HEALTHY, 1)])))
         else:
-            line = await fight.dial()
-            line.say(fight.connect_packet(f"half-{number}")[:20])
-        line.deaf()
+            line = await load.dial()
+            line.send_nowait(load.connect_packet(f"half-{number}")[:20])
+        line.stop_reading()
         line.half_close()
         return line
 
-    while fight.on:
-        await fight.crowd(300, close, 1.0)
+    while load.on:
+        await load.crowd(300, close, 1.0)
 
 
 @attack(rf"{CLIENT}.*silent for", at_least=4.0)
-async def dripping_keep_alive(fight: Fight) -> None:
+async def dripping_keep_alive(load: Load) -> None:
     """Clients that drip the bytes of one long packet so as to be kept alive for ever."""
     packet = encode5(Publish(AREA, bytes(10_000)))
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"drip-{number}", keep_alive=1)
+        return await load.join(f"drip-{number}", keep_alive=1)
 
-    lines = await fight.crowd(300, stay, 0.3)
-    async for number in fight.rounds(0.1):
+    lines = await load.crowd(300, stay, 0.3)
+    async for number in load.rounds(0.1):
         for line in lines:
-            line.say(packet[number : number + 1])
+            line.send_nowait(packet[number : number + 1])
     alive = sum(line.open for line in lines)
     assert not alive, f"{alive} of {len(lines)} clients are still there"
 
 
 @attack(rf"{CLIENT}.*connection lost")
-async def wills(fight: Fight) -> None:
+async def wills(load: Load) -> None:
     """Clients with the largest wills, all gone in one moment, and again; some of them listen."""
-    large = fight.connect_packet("will-000000", will=_heavy_will(MAXIMUM_CONTROL - 300))
-    watcher = await fight.join("will-watcher")
-    watcher.say(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
-    watcher.deaf()
+    large = load.connect_packet("will-000000", will=_heavy_will(MAXIMUM_CONTROL - 300))
+    watcher = await load.join("will-watcher")
+    watcher.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
+    watcher.stop_reading()
 
     async def stay(number: int) -> Line:
         if number % 2:
             packet = large.replace(b"will-000000", b"will-%06d" % number)
-            return await fight.join("", packet=packet)
+            return await load.join("", packet=packet)
         small = Will(f"{AREA}/will/{number}", b"gone", 1, retain=True)
-        return await fight.join(f"will-{number}", will=small)
+        return await load.join(f"will-{number}", will=small)
 
-    while fight.on:
-        lines = await fight.crowd(500, stay, 0.9)
+    while load.on:
+        lines = await load.crowd(500, stay, 0.9)
         for line in lines:
-            line.hang_up()
-        fight.counts["wills"] += len(lines)
+            line.abort()
+        load.counts["wills"] += len(lines)
         await asyncio.sleep(0.2)
 
 
 @attack(rf"{CLIENT}", at_least=3.0, **BOUNDED)
-async def costly_wills(fight: Fight) -> None:
+async def costly_wills(load: Load) -> None:
     """Hundreds of wills that are due in one moment, each to a topic whose search is long."""
     levels = 11
     topic = AREA + "/a" * levels
     for number in range(2):
-        line = await fight.join(f"filters-{number}")
+        line = await load.join(f"filters-{number}")
         await line.send(encode5(Subscribe(1, _near_misses(levels, number * 1000, 1000))))
 
     async def leave(number: int) -> Line:
         delay = {Property.WILL_DELAY_INTERVAL: 1}
-        return await fight.join(
+        return await load.join(
             f"will-{number}",
             will=Will(f"{topic}/{number}", b"gone", properties=delay),
             properties={Property.SESSION_EXPIRY_INTERVAL: 60},
         )
 
-    while fight.on:
-        lines = await fight.crowd(300, leave, 1.0)
+    while load.on:
+        lines = await load.crowd(300, leave, 1.0)
         for line in lines:
-            line.hang_up()
-            fight.lines.discard(line)
-        fight.counts["wills"] += len(lines)
+            line.abort()
+            load.lines.discard(line)
+        load.counts["wills"] += len(lines)
         await asyncio.sleep(1.2)
 
 
@@ -1376,93 +1375,93 @@ async def costly_wills(fight: Fight) -> None:
     sessions=200,
     retained_messages=300,
 )
-async def hoarder(fight: Fight) -> None:
+async def hoarder(load: Load) -> None:
     """All sessions, connections, memory and retained messages for one user; others come and go."""
 
     async def stay(number: int) -> Line:
-        line = await fight.join(f"stays-{number}")
-        line.say(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
-        line.deaf()
+        line = await load.join(f"stays-{number}")
+        line.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
+        line.stop_reading()
         return line
 
     async def leave(number: int) -> Line:
-        line = await fight.join(
+        line = await load.join(
             f"leaves-{number}", properties={Property.SESSION_EXPIRY_INTERVAL: 604800}
         )
         await line.send(encode5(Subscribe(1, [Subscription(f"{AREA}/#", 1)])))
-        await line.hear(line.received + 5)
-        line.hang_up()
-        fight.lines.discard(line)
-        fight.counts["sessions"] += 1
+        await line.receive(line.received + 5)
+        line.abort()
+        load.lines.discard(line)
+        load.counts["sessions"] += 1
         return line
 
     async def fill() -> None:
-        publisher = await fight.join("fills")
-        async for turn in fight.rounds(0.02):
+        publisher = await load.join("fills")
+        async for turn in load.rounds(0.02):
             if not publisher.open:
-                publisher = await fight.join("fills")
+                publisher = await load.join("fills")
             numbers = range(20 * turn, 20 * turn + 20)
             await publisher.send(
                 encode5(
                     *(Publish(f"{AREA}/{n}", bytes(2000), 1, True, packet_id=1) for n in numbers)
                 )
             )
-            fight.counts["messages"] += 20
+            load.counts["messages"] += 20
 
     async def again_and_again(count: int, make: Callable[[int], Awaitable[Line]]) -> None:
-        while fight.on:
-            await fight.crowd(count, make, 1.0)
+        while load.on:
+            await load.crowd(count, make, 1.0)
             await asyncio.sleep(0.05)
 
     async def alice() -> None:
         """With a session of her own, which is to be there each time, and a retained message."""
-        password = fight.target.passwords["alice"].encode()
+        password = load.target.passwords["alice"].encode()
         who: dict[str, Any] = {"username": "alice", "password": password}
         kept = {"clean_start": False, "properties": {Property.SESSION_EXPIRY_INTERVAL: 604800}}
         news, plan = "r2d2/alice/news", "r2d2/alice/plan"
         present = False
-        async for turn in fight.rounds(0.05):
-            line = await fight.join("alice-keeps", **who, **kept)
+        async for turn in load.rounds(0.05):
+            line = await load.join("alice-keeps", **who, **kept)
             assert line.first[2] == present, "alice's session was gone"
             heard = line.received
-            line.say(encode5(Subscribe(1, [Subscription(news, 1, retain_handling=2)])))
-            assert await line.hear(heard + 6), "alice's SUBSCRIBE was not answered"
-            line.hang_up()
+            line.send_nowait(encode5(Subscribe(1, [Subscription(news, 1, retain_handling=2)])))
+            assert await line.receive(heard + 6), "alice's SUBSCRIBE was not answered"
+            line.abort()
             present = True
-            other = await fight.join(f"alice-{turn}", **who)
+            other = await load.join(f"alice-{turn}", **who)
             heard = other.received
             publish = Publish(plan, b"%d" % turn, 1, True, packet_id=1)
-            other.say(encode5(publish, Publish(news, b"%d" % turn, 1, packet_id=2)))
-            # A PUBACK that says more than that it was taken is longer.
-            assert await other.hear(heard + 8), "alice's messages were not acknowledged"
+            other.send_nowait(encode5(publish, Publish(news, b"%d" % turn, 1, packet_id=2)))
+            # A PUBACK with a reason code other than success is longer.
+            assert await other.receive(heard + 8), "alice's messages were not acknowledged"
             answer = bytes(other.first[heard : heard + 12])
             assert 0x97 not in answer, f"alice's messages were refused: {answer.hex()}"
-            other.hang_up()
-            fight.lines -= {line, other}
-            fight.counts["visits of alice"] += 1
+            other.abort()
+            load.lines -= {line, other}
+            load.counts["visits of alice"] += 1
 
     visits = asyncio.ensure_future(alice())
-    await fight.together(fill(), again_and_again(100, stay), again_and_again(400, leave))
+    await load.together(fill(), again_and_again(100, stay), again_and_again(400, leave))
     if not visits.done():
         visits.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await visits
-    assert fight.counts["visits of alice"] >= 2, "alice hardly came"
+    assert load.counts["visits of alice"] >= 2, "alice hardly came"
 
 
 @attack(
     r"client '.*limits\.(user\.)?(sessions|memory)",
-    said_after=3.0,
+    logged_after=3.0,
     sessions=300,
 )
-async def session_bomb(fight: Fight) -> None:
+async def session_bomb(load: Load) -> None:
     """Ever new client ids, each with a session to be kept for days, with all that may be in it."""
     long = "\U0001f916" + "x" * 60_000
 
     async def leave(number: int) -> Line:
         # Every other id is as long as may be.
         client_id = f"session-{number}" + (long if number % 2 else "")
-        line = await fight.join(
+        line = await load.join(
             client_id,
             clean_start=False,
             properties={Property.SESSION_EXPIRY_INTERVAL: 604800},
@@ -1470,33 +1469,33 @@ async def session_bomb(fight: Fight) -> None:
         )
         wanted = [Subscription(f"{AREA}/{number}/{index}/#", 1) for index in range(100)]
         await line.send(encode5(Subscribe(1, wanted)))
-        await line.hear(line.received + 50)
-        line.hang_up()
-        fight.lines.discard(line)
-        fight.counts["sessions"] += 1
+        await line.receive(line.received + 50)
+        line.abort()
+        load.lines.discard(line)
+        load.counts["sessions"] += 1
         return line
 
-    while fight.on:
-        await fight.crowd(2000, leave, 1.0)
+    while load.on:
+        await load.crowd(2000, leave, 1.0)
 
 
 @attack(rf"{CLIENT}.*taken over")
-async def take_overs(fight: Fight) -> None:
+async def take_overs(load: Load) -> None:
     """Many connections at a time for one client id, with a full queue to be sent to each."""
     kept = {"clean_start": False, "properties": {Property.SESSION_EXPIRY_INTERVAL: 600}}
-    first = await fight.join("one", **kept)
-    first.say(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 1)])))
+    first = await load.join("one", **kept)
+    first.send_nowait(encode5(Subscribe(1, [Subscription(f"{AREA}/flood/#", 1)])))
 
     async def take() -> None:
-        while fight.on:
-            line = await fight.dial()
-            line.say(fight.connect_packet("one", **kept))
-            fight.counts["take-overs"] += 1
-            await line.hear(4)
-            fight.lines.discard(line)
+        while load.on:
+            line = await load.dial()
+            line.send_nowait(load.connect_packet("one", **kept))
+            load.counts["take-overs"] += 1
+            await line.receive(4)
+            load.lines.discard(line)
 
-    await fight.together(
-        *(take() for _ in range(20)), _publish_forever(fight, "take-flood", 1, 50_000)
+    await load.together(
+        *(take() for _ in range(20)), _publish_forever(load, "take-flood", 1, 50_000)
     )
 
 
@@ -1504,79 +1503,79 @@ async def take_overs(fight: Fight) -> None:
 
 
 @attack(r"client 'forbidden.*may not publish|may not publish.*forbidden", at_least=2.0)
-async def refused_publishes(fight: Fight) -> None:
+async def refused_publishes(load: Load) -> None:
     """Messages that the rules refuse, thousands a second, to the same topic and to new ones."""
 
     async def publish(number: int) -> None:
-        line = await fight.join(f"forbidden-{number}")
-        async for turn in fight.rounds():
+        line = await load.join(f"forbidden-{number}")
+        async for turn in load.rounds():
             topics = (f"r2d2/forbidden/{turn}/{index // 10}" for index in range(500))
             packets = [Publish(topic, b"x", 1, packet_id=1) for topic in topics]
             packets.append(Publish("r2d2/forbidden/" + "long" * 15_000, b"x"))
             packets.append(Publish("$SYS/broker/version", b"x", 1, packet_id=2))
             await line.send(encode5(*packets))
-            fight.counts["messages"] += len(packets)
+            load.counts["messages"] += len(packets)
 
-    await fight.together(*(publish(number) for number in range(10)))
+    await load.together(*(publish(number) for number in range(10)))
 
 
 @attack(r"client 'curious.*may not subscribe", at_least=2.0)
-async def refused_subscriptions(fight: Fight) -> None:
+async def refused_subscriptions(load: Load) -> None:
     """Filters that the rules refuse, thousands a second, and ones that are wrong."""
     wrong = [AREA + "/a#b", "$share//x", "$share/g", "a+/b"]
 
     async def subscribe(number: int) -> None:
-        line = await fight.join(f"curious-{number}")
-        async for turn in fight.rounds():
+        line = await load.join(f"curious-{number}")
+        async for turn in load.rounds():
             wanted = [Subscription(f"c3po/{turn}/{index}") for index in range(500)]
             wanted += [Subscription("c3po/" + "long" * 15_000)]
             await line.send(encode5(Subscribe(1, wanted)))
-            fight.counts["filters"] += len(wanted)
+            load.counts["filters"] += len(wanted)
 
     async def blunder() -> None:
-        async for turn in fight.rounds(0.01):
-            line = await fight.join("blunder")
-            line.say(encode5(Subscribe(1, [Subscription(wrong[turn % 4])])))
+        async for turn in load.rounds(0.01):
+            line = await load.join("blunder")
+            line.send_nowait(encode5(Subscribe(1, [Subscription(wrong[turn % 4])])))
             await line.closed.wait()
-            fight.lines.discard(line)
+            load.lines.discard(line)
 
-    await fight.together(blunder(), *(subscribe(number) for number in range(10)))
+    await load.together(blunder(), *(subscribe(number) for number in range(10)))
 
 
 @attack(r"x{50}")
-async def long_names(fight: Fight) -> None:
+async def long_names(load: Load) -> None:
     """Client ids and user names of 60,000 bytes, which every line about the client would hold."""
     name = "x" * 60_000
 
     async def come(number: int) -> None:
-        async for turn in fight.rounds():
-            line = await fight.dial()
+        async for turn in load.rounds():
+            line = await load.dial()
             if turn % 2:
-                line.say(fight.connect_packet(f"{number}-{turn}-{name}"))
+                line.send_nowait(load.connect_packet(f"{number}-{turn}-{name}"))
             else:
-                line.say(fight.connect_packet("", username=name))
-            await line.hear(4)
-            line.hang_up()
-            fight.lines.discard(line)
-            fight.counts["names"] += 1
+                line.send_nowait(load.connect_packet("", username=name))
+            await line.receive(4)
+            line.abort()
+            load.lines.discard(line)
+            load.counts["names"] += 1
 
-    await fight.together(*(come(number) for number in range(10)))
+    await load.together(*(come(number) for number in range(10)))
 
 
 @attack(r"127\.0\.0\.1.*connections_per_address", connections_per_address=50, connection_rate=1000)
-async def one_address(fight: Fight) -> None:
+async def one_address(load: Load) -> None:
     """More connections from one address than it may have: only so many are let in."""
-    lines = await fight.crowd(200, lambda number: fight.join(f"crowd-{number}"), 0.7)
+    lines = await load.crowd(200, lambda number: load.join(f"crowd-{number}"), 0.7)
     await asyncio.sleep(0.1)
     there = sum(line.open for line in lines)
     assert 20 <= there <= 50, f"{there} of 200 connections are there; the healthy one is another"
 
 
 @attack(r"127\.0\.0\.1.*connection_rate", connection_rate=20, short=False)
-async def one_address_in_haste(fight: Fight) -> None:
+async def one_address_in_haste(load: Load) -> None:
     """More connections a second from one address than it may make."""
-    lines = await fight.crowd(1000, lambda number: fight.join(f"crowd-{number}"), 0.9)
-    allowed = 5 * 20 + 20 * fight.seconds  # a burst is five times the rate
+    lines = await load.crowd(1000, lambda number: load.join(f"crowd-{number}"), 0.9)
+    allowed = 5 * 20 + 20 * load.seconds  # a burst is five times the rate
     assert len(lines) <= allowed + 10, f"{len(lines)} connections, and {allowed} are allowed"
 
 
@@ -1594,18 +1593,18 @@ def _near_misses(levels: int, start: int, count: int) -> list[Subscription]:
 
 
 async def _at_once(
-    fight: Fight, clients: int, pause: float, make: Callable[[int], bytes], **fields: Any
+    load: Load, clients: int, pause: float, make: Callable[[int], bytes], **fields: Any
 ) -> None:
     """Clients that each send what is made for them, all in one moment, again and again."""
 
     async def stay(number: int) -> Line:
-        return await fight.join(f"burst-{number}", **fields)
+        return await load.join(f"burst-{number}", **fields)
 
-    lines = await fight.crowd(clients, stay, 0.4)
-    async for turn in fight.rounds(pause):
+    lines = await load.crowd(clients, stay, 0.4)
+    async for turn in load.rounds(pause):
         for number, line in enumerate(lines):
-            line.say(make(turn * clients + number))
-        fight.counts["bursts"] += 1
+            line.send_nowait(make(turn * clients + number))
+        load.counts["bursts"] += 1
         assert any(line.open for line in lines), "nobody is left"
 
 
@@ -1615,9 +1614,9 @@ def _heavy_will(size: int) -> Will:
     return Will(f"{AREA}/will", bytes(64_000), 1, properties={Property.USER_PROPERTY: pairs})
 
 
-def _client_hello(fight: Fight) -> bytes:
+def _client_hello(load: Load) -> bytes:
     outgoing = ssl.MemoryBIO()
-    tls = fight.target.context().wrap_bio(ssl.MemoryBIO(), outgoing, server_hostname="localhost")
+    tls = load.target.context().wrap_bio(ssl.MemoryBIO(), outgoing, server_hostname="localhost")
     try:
         tls.do_handshake()
     except ssl.SSLWantReadError:
@@ -1625,9 +1624,9 @@ def _client_hello(fight: Fight) -> bytes:
     raise AssertionError("a handshake without the other side")
 
 
-async def _publish_forever(fight: Fight, client_id: str, qos: int, size: int) -> None:
+async def _publish_forever(load: Load, client_id: str, qos: int, size: int) -> None:
     """A flood of messages to a hundred topics under flood/, each exchange brought to its end."""
-    line = await fight.join(client_id, version=V311)
+    line = await load.join(client_id, version=V311)
     count = max(1, min(1000, (1 << 18) // (size + 50)))
     chunk = b""
     for index in range(count):
@@ -1637,4 +1636,4 @@ async def _publish_forever(fight: Fight, client_id: str, qos: int, size: int) ->
         if qos == 2:
             assert packet_id is not None
             chunk += encode4(Pubrel(packet_id))
-    await fight.flood(line, chunk, count, "messages")
+    await load.flood(line, chunk, count, "messages")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from arena import Arena
 from attacks import ATTACKS
-from combat import BOTH, Attack
+from load import BOTH, Attack
+from server import Server
 
 pytestmark = pytest.mark.timed
 
@@ -16,15 +16,15 @@ SHORT = [attack for attack in ATTACKS.values() if attack.short]
 
 
 @pytest.fixture(scope="module")
-def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Arena]:
-    arena = Arena(tmp_path_factory.mktemp("arena"))
-    yield arena
-    arena.close()
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    server = Server(tmp_path_factory.mktemp("server"))
+    yield server
+    server.close()
 
 
 @pytest.mark.parametrize("attack", SHORT, ids=lambda attack: attack.name)
-def test_the_broker_withstands(arena: Arena, attack: Attack) -> None:
+def test_the_broker_withstands(server: Server, attack: Attack) -> None:
     ways = BOTH if attack.over is None else (attack.over,)
-    outcome = arena.run(attack, ways, SECONDS)
+    outcome = server.run(attack, ways, SECONDS)
     if outcome.problems:
         pytest.fail("\n".join([attack.what, *outcome.problems]), pytrace=False)

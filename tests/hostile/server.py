@@ -1,4 +1,4 @@
-"""One attack on a real appliance, with a healthy client beside it, and what came of it."""
+"""Runs one attack on a real appliance, with a healthy client beside it, and judges the result."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 
 import yaml
 from appliance_process import ApplianceProcess
-from combat import USER, Attack, Attacker
+from load import USER, Attack, Attacker
 from witness import Over, Report, Target, Witness
 
 MIB = 1 << 20
 
-#: Round trips, in ten seconds, of which one in a hundred can be told.
+#: Round trips from which on the 99th percentile means something; some ten seconds of them.
 MANY = 500
 
-#: The rules for both: the attacker may do everything, so that only limits are in its way.
+#: Access rules of both users. The attacker may do everything, so that only limits stop it.
 ACL = f"""\
 user alice
 topic readwrite {{robot}}/#
@@ -30,8 +30,8 @@ topic readwrite {{robot}}/#
 topic deny {{robot}}/forbidden/#
 """
 
-#: Where the defaults are not: less memory, so that its bound is reached in a short time, and all
-#: attackers come from one address here.
+#: Limits that differ from the defaults: less memory, so that the bound is reached soon, and more
+#: connections per address, because all attackers come from one address here.
 LIMITS: dict[str, Any] = {
     "memory": "64 MiB",
     "retained_bytes": "16 MiB",
@@ -40,20 +40,21 @@ LIMITS: dict[str, Any] = {
     "connect_timeout": "1 s",
 }
 
-#: That for WebSocket comes first: the appliance runs when it listens on the other two.
+#: The WebSocket listener comes before these: the appliance counts as started when it listens on
+#: these two.
 LISTENERS: list[dict[str, Any]] = [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
 
-#: What the process may take beyond the configured limits, in bytes: the objects and buffers of a
-#: thousand connections with TLS, and what the allocator does not give back at once.
+#: Bytes that the process may use beyond the configured limits: the objects and buffers of a
+#: thousand TLS connections, and memory that the allocator does not return at once.
 ALLOWANCE = 96 * MIB
 
-#: Lines that the log may grow by: a second, and a connection, whose number has limits of its own
-#: (that are raised here); and the bytes of a line.
+#: Lines that the log may grow by, per second and per connection (whose number has limits of its
+#: own, which are raised here), and the bytes per line.
 LOG_LINES = 100
 CONNECTION_LINES = 8
 LINE = 500
 
-#: Seconds that the healthy client is watched for after the attack: its end is a part of it.
+#: Seconds that the healthy client is measured after the attack, whose end is a part of it.
 AFTERMATH = 0.3
 
 
@@ -68,14 +69,14 @@ class Outcome:
     peak: int
     bound: int
     log_lines: int
-    about_it: int
+    matching_lines: int
     seconds: float
     counts: Counter[str]
     problems: list[str]
 
 
-class Arena:
-    """A directory with an appliance that is started anew for every attack, and two processes."""
+class Server:
+    """An appliance that is restarted for every attack, the attacker's process and the witness's."""
 
     def __init__(self, directory: Path) -> None:
         self._appliance = ApplianceProcess(
@@ -93,26 +94,26 @@ class Arena:
         self._attacker: Attacker | None = None
 
     def close(self) -> None:
-        """Leave nothing running; may be called twice."""
+        """End all processes; may be called twice."""
         for process in (self._witness, self._attacker):
             if process is not None:
                 process.end()
         self._witness = self._attacker = None
 
     def run(self, attack: Attack, ways: tuple[Over, ...], seconds: float) -> Outcome:
-        """The attack with its connections made over these in turn."""
+        """Run the attack; its connections alternate between these `ways`."""
         appliance = self._appliance
         limits = LIMITS | attack.limits
         self._settings["broker"]["limits"] = limits
         appliance.config.write_text(yaml.safe_dump(self._settings))
         logged_before = len(appliance.log)
         self._audit.unlink(missing_ok=True)
-        # What one attack has left in the store is not the next one's.
+        # Start with an empty store.
         shutil.rmtree(appliance.directory / "state", ignore_errors=True)
         problems: list[str] = []
         appliance.start()
         try:
-            fought = self._fight(attack, ways, max(seconds, attack.at_least))
+            measured = self._run_attack(attack, ways, max(seconds, attack.at_least))
         except (AssertionError, OSError, EOFError) as error:
             self.close()
             raise AssertionError(f"{attack.name}: {error!r}") from error
@@ -122,14 +123,14 @@ class Arena:
             except AssertionError as error:
                 problems.append(str(error)[-600:])
         log = appliance.log[logged_before:]
-        seen, counts, failure, base, peak, took = fought
+        seen, counts, failure, base, peak, took = measured
         if failure:
             problems.append(f"the attack failed: {failure}")
         if seen.failure:
             problems.append(seen.failure)
         if seen.worst > attack.worst:
             problems.append(f"a round trip took {seen.worst * 1000:.0f} ms")
-        # Of few the 99th percentile is the worst one, which has a bound of its own.
+        # With few round trips the 99th percentile is the worst one, which has a bound of its own.
         part = 0.99 if len(seen.round_trips) >= MANY else 0.9
         if seen.percentile(part) > attack.p99:
             took_most = seen.percentile(part) * 1000
@@ -138,9 +139,9 @@ class Arena:
         if peak > bound:
             problems.append(f"memory: {peak // MIB} MiB, over the bound of {bound // MIB} MiB")
         lines = log.splitlines()
-        about_it = sum(1 for line in lines if re.search(attack.says, line))
-        if not about_it and took >= attack.said_after:
-            problems.append(f"no line of the log matches {attack.says!r}")
+        matching_lines = sum(1 for line in lines if re.search(attack.log_pattern, line))
+        if not matching_lines and took >= attack.logged_after:
+            problems.append(f"no line of the log matches {attack.log_pattern!r}")
         allowed = LOG_LINES * (1 + took) + CONNECTION_LINES * counts["connections"]
         if len(lines) > allowed:
             problems.append(f"the log was flooded: {len(lines)} lines in {took:.1f} s")
@@ -157,12 +158,14 @@ class Arena:
                 break
         over = "+".join(way.value for way in ways)
         sizes = base, peak, bound
-        return Outcome(attack, over, seen, *sizes, len(lines), about_it, took, counts, problems)
+        return Outcome(
+            attack, over, seen, *sizes, len(lines), matching_lines, took, counts, problems
+        )
 
-    def _fight(
+    def _run_attack(
         self, attack: Attack, ways: tuple[Over, ...], seconds: float
     ) -> tuple[Report, Counter[str], str, int, int, float]:
-        """What the healthy client and the attacker report, memory before and at most, seconds."""
+        """Returns the witness's report, counts and failure of the attacker, RSS, peak, seconds."""
         appliance = self._appliance
         self._witness = witness = self._witness or Witness()
         self._attacker = attacker = self._attacker or Attacker()
@@ -189,4 +192,4 @@ def _size(text: str) -> int:
 
 def _status(pid: int, name: str) -> int:
     found = re.search(rf"^{name}:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.M)
-    return int(found[1]) * 1024 if found is not None else 0  # none of a process that has died
+    return int(found[1]) * 1024 if found is not None else 0  # the process has died

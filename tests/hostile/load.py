@@ -1,7 +1,7 @@
-"""What an attacker has at hand: connections that never block it, and bytes made beforehand.
+"""The attacker's tools: connections that never block it, and the process that it runs in.
 
-An attack runs in a process of its own, at a low priority: on this computer it would else take the
-broker's processor, which a client on the network cannot.
+The process has a low priority. Otherwise it would take CPU time from the broker on this computer,
+which a client on the network cannot do.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from witness import HEAD_END, PONG, UPGRADE, Over, Target, frame, take_frame
 
 from appliance.mqtt.packets import V5, V311, Connect, Packet
 
-#: Who attacks, with a right password and the right to read and write everything under the robot.
+#: The attacker: it has a valid password, and may read and write everything under the robot.
 USER = "mallory"
 
-#: Seconds for what takes milliseconds when nothing is attacked.
+#: Timeout in seconds for steps that take milliseconds on an idle broker.
 PATIENCE = 15.0
 
-#: Seconds that the healthy client may have to wait for its own message.
+#: Longest round trip of the healthy client, in seconds.
 ROUND_TRIP = 0.5
 
-#: Seconds that an attack may end later than it should.
+#: Seconds that an attack may overrun.
 LATEST = 1.0
 
-#: Connections that are opened at a time.
+#: Connections that are opened concurrently.
 AT_A_TIME = 32
 
 _spawn = multiprocessing.get_context("spawn")
 
 
 class Line(asyncio.Protocol):
-    """One connection; `received` counts what came, of which only a login's answer is kept."""
+    """One connection; `received` counts bytes, `first` has the answer to a login."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket = sock
@@ -85,57 +85,57 @@ class Line(asyncio.Protocol):
     def open(self) -> bool:
         return not self.closed.is_set() and not self.transport.is_closing()
 
-    def say(self, *packets: bytes) -> None:
-        """Send, without a care for how much waits; nothing when the broker has closed."""
+    def send_nowait(self, *packets: bytes) -> None:
+        """Send without backpressure; does nothing when the broker has closed."""
         if self.open:
             self.write(packets[0] if len(packets) == 1 else b"".join(packets))
 
     def write(self, data: bytes) -> None:
-        """Send so many bytes of MQTT."""
+        """Write bytes of MQTT to the transport."""
         self.transport.write(data)
 
     async def send(self, data: bytes) -> None:
         """Send as fast as the broker reads."""
-        self.say(data)
+        self.send_nowait(data)
         await self._room.wait()
 
     async def push(self, data: bytes) -> None:
-        """Send the bytes as they are, whatever is below MQTT, as fast as the broker reads."""
+        """Send raw bytes, without WebSocket frames around them, as fast as the broker reads."""
         if self.open:
             self.transport.write(data)
         await self._room.wait()
 
-    async def hear(self, count: int) -> bool:
-        """Wait until so many bytes came in all; False when the broker closed before."""
+    async def receive(self, count: int) -> bool:
+        """Wait until `count` bytes have come in all; False when the broker closed before."""
         self._expected = count
         if self.received < count and not self.closed.is_set():
             self._came.clear()
             await asyncio.wait_for(self._came.wait(), PATIENCE)
         return self.received >= count
 
-    def deaf(self) -> None:
-        """Read nothing more."""
+    def stop_reading(self) -> None:
+        """Stop reading from the socket."""
         if self.open:
             self.transport.pause_reading()
 
-    def hang_up(self) -> None:
-        """Be gone without a word."""
+    def abort(self) -> None:
+        """Reset the connection, without DISCONNECT."""
         with contextlib.suppress(OSError):
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.transport.abort()
 
     def half_close(self) -> None:
-        """Say on the network that nothing more comes, and stay."""
+        """Send a FIN and keep the connection."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_WR)
 
 
 class WebLine(Line):
-    """One over WebSocket: what is said goes out in one frame, and what frames hold is received."""
+    """A connection over WebSocket: each write is one frame, and payloads of frames are received."""
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock)
-        #: The answer to the request is there.
+        #: Set when the answer to the upgrade request has come.
         self.upgraded = asyncio.Event()
         self.pongs = 0
         self._frames = bytearray()
@@ -162,28 +162,25 @@ class WebLine(Line):
         self.transport.write(frame(data))
 
     async def upgrade(self) -> None:
-        """Ask for the WebSocket, and wait for it."""
+        """Request the WebSocket upgrade and wait for the answer."""
         self.transport.write(UPGRADE)
         await asyncio.wait_for(self.upgraded.wait(), PATIENCE)
         if not self.open:
             raise ConnectionError("no WebSocket connection")
 
 
-#: What every other connection is made over where nothing else is said.
+#: By default connections alternate between these two.
 BOTH = (Over.TLS, Over.PLAIN)
 
 
-class Fight:
-    """One attack on one broker, for so many seconds.
-
-    Its connections are made over each of `ways` in turn.
-    """
+class Load:
+    """One attack on one broker for `seconds`; its connections alternate between `ways`."""
 
     def __init__(self, target: Target, ways: tuple[Over, ...], seconds: float) -> None:
         self.target = target
         self.ways = ways
         self.seconds = seconds
-        #: What was done how often, for the report.
+        #: How often each thing was done, for the report.
         self.counts: Counter[str] = Counter()
         self.lines: set[Line] = set()
         self._context = target.context()
@@ -197,11 +194,11 @@ class Fight:
         return self._loop.time() < self._end
 
     def within(self, part: float) -> bool:
-        """Whether that part of the time is not over yet."""
+        """Whether less than that part of the time has passed."""
         return self._loop.time() < self._end - (1 - part) * self.seconds
 
     async def rounds(self, pause: float = 0.0) -> AsyncIterator[int]:
-        """Count until the time is over, with so many seconds between the rounds."""
+        """Count rounds until the time is over, `pause` seconds apart."""
         number = 0
         while self.on:
             yield number
@@ -209,7 +206,7 @@ class Fight:
             await asyncio.sleep(pause)
 
     async def raw(self, over: Over | None = None, *, receive_buffer: int = 0) -> socket.socket:
-        """A TCP connection to one of the listeners, with nothing said on it."""
+        """A TCP connection to one of the listeners; nothing has been sent on it."""
         port = self.target.port_of(over or next(self._next_way))
         sock = socket.socket()
         try:
@@ -225,10 +222,10 @@ class Fight:
         return sock
 
     async def dial(self, over: Over | None = None, *, receive_buffer: int = 0) -> Line:
-        """A connection with its handshake, be it of TLS or WebSocket, done.
+        """A connection whose TLS or WebSocket handshake is done.
 
         Raises:
-            OSError: the broker does not take it.
+            OSError: the broker does not accept it.
         """
         over = over or next(self._next_way)
         sock = await self.raw(over, receive_buffer=receive_buffer)
@@ -255,14 +252,14 @@ class Fight:
         packet: bytes = b"",
         **fields: Any,
     ) -> Line:
-        """A client that has logged in, with this CONNECT if there is one.
+        """A client that has logged in, with `packet` as its CONNECT if there is one.
 
         Raises:
-            OSError: the broker does not take it.
+            OSError: the broker does not accept it.
         """
         line = await self.dial(receive_buffer=receive_buffer)
-        line.say(packet or self.connect_packet(client_id, version=version, **fields))
-        if not await line.hear(4) or line.first[3]:
+        line.send_nowait(packet or self.connect_packet(client_id, version=version, **fields))
+        if not await line.receive(4) or line.first[3]:
             raise ConnectionError(f"'{client_id}' is not let in: {line.first.hex()}")
         self.counts["logins"] += 1
         return line
@@ -276,7 +273,7 @@ class Fight:
     async def crowd(
         self, count: int, make: Callable[[int], Awaitable[Line]], part: float = 0.6
     ) -> list[Line]:
-        """So many connections made by `make(number)`, or those that part of the time allows."""
+        """`count` connections made by `make(number)`, or as many as `part` of the time allows."""
         numbers = iter(range(count))
         made: list[Line] = []
 
@@ -295,7 +292,7 @@ class Fight:
         return made
 
     async def together(self, *work: Coroutine[Any, Any, None]) -> None:
-        """Run all of it until the time is over."""
+        """Run all of these concurrently until the time is over."""
         tasks = [asyncio.ensure_future(one) for one in work]
         left = max(0.0, self._end - self._loop.time())
         done, _ = await asyncio.wait(tasks, timeout=left)
@@ -308,37 +305,37 @@ class Fight:
                 raise error
 
     async def flood(self, line: Line, data: bytes, count: int, what: str) -> None:
-        """Send `data`, which is `count` of `what`, again and again until the time is over."""
+        """Send `data`, which counts as `count` of `what`, repeatedly until the time is over."""
         while self.on and line.open:
             await line.send(data)
             self.counts[what] += count
             await asyncio.sleep(0)
 
     def leave(self) -> None:
-        """Drop all connections at once."""
+        """Reset all connections at once."""
         for line in self.lines:
-            line.hang_up()
+            line.abort()
 
 
 @dataclass(frozen=True, slots=True)
 class Attack:
-    """`run` is what is done, `says` what the log must say about who did it.
+    """`run` is the attack, `log_pattern` matches the log line that must name the client behind it.
 
-    `limits` are of `broker.limits`, beside those of `arena.LIMITS`; with less time than `at_least`
-    (seconds) nothing comes of it, and with less than `said_after` too little for the log to tell:
-    the buffers on the way take that long to fill. `short` is whether it is worth a second in CI,
-    beside the others. `p99` is what 99 of 100 round trips of the healthy client may take, and
-    `worst` what the longest may, in seconds. `over` is what it is for, when not for everything.
+    `limits` are keys of `broker.limits`, on top of `server.LIMITS`. An attack takes at least
+    `at_least` seconds to have an effect, and `logged_after` seconds until the log can mention it,
+    because buffers on the way have to fill first. `short`: it is worth a second in CI, where all
+    run. `p99` and `worst` bound the healthy client's round trips, in seconds. `over` is the one
+    transport that it is for; None for all.
     """
 
     name: str
     what: str
-    run: Callable[[Fight], Awaitable[None]]
-    says: str
+    run: Callable[[Load], Awaitable[None]]
+    log_pattern: str
     limits: dict[str, Any] = field(default_factory=dict)
     at_least: float = 0.0
     short: bool = True
-    said_after: float = 0.0
+    logged_after: float = 0.0
     p99: float = math.inf
     worst: float = ROUND_TRIP
     over: Over | None = None
@@ -358,7 +355,7 @@ def encode4(*packets: Packet) -> bytes:
 
 
 class Attacker:
-    """The process that attacks, one thing after the other."""
+    """The attacker's process; it runs one attack after the other."""
 
     def __init__(self) -> None:
         self._pipe, end = _spawn.Pipe()
@@ -369,14 +366,14 @@ class Attacker:
     def attack(
         self, name: str, target: Target, ways: tuple[Over, ...], seconds: float
     ) -> tuple[Counter[str], str]:
-        """What was done how often, and what went wrong, when the attack is over."""
+        """Run an attack to its end; returns its counts and, if it failed, why."""
         self._pipe.send((name, target, ways, seconds))
         assert self._pipe.poll(seconds + 3 * PATIENCE), "the attack does not come to its end"
         counts, failure = self._pipe.recv()
         return counts, failure
 
     def end(self) -> None:
-        """Leave nothing running."""
+        """End the process."""
         self._process.kill()
         self._process.join()
         self._pipe.close()
@@ -386,24 +383,24 @@ def _serve(pipe: Connection) -> None:
     from attacks import ATTACKS
 
     os.nice(10)
-    logging.disable(logging.CRITICAL)  # asyncio's, of connections that end in every way there is
+    logging.disable(logging.CRITICAL)  # asyncio logs each of these connections that end badly
     while True:
         name, target, ways, seconds = pipe.recv()
-        pipe.send(uvloop.run(_fight(ATTACKS[name], target, ways, seconds)))
+        pipe.send(uvloop.run(_run_attack(ATTACKS[name], target, ways, seconds)))
 
 
-async def _fight(
+async def _run_attack(
     attack: Attack, target: Target, ways: tuple[Over, ...], seconds: float
 ) -> tuple[Counter[str], str]:
-    fight = Fight(target, ways, seconds)
+    load = Load(target, ways, seconds)
     failure = ""
     try:
-        # What the broker does not answer, or does not take, is not waited for.
-        await asyncio.wait_for(attack.run(fight), seconds + LATEST)
+        # The broker may neither answer nor read; the attack ends anyway.
+        await asyncio.wait_for(attack.run(load), seconds + LATEST)
     except asyncio.TimeoutError:
-        fight.counts["broken off"] = 1
+        load.counts["broken off"] = 1
     except Exception:
         failure = traceback.format_exc()
-    fight.leave()
+    load.leave()
     await asyncio.sleep(0.05)  # for the transports to close
-    return fight.counts, failure
+    return load.counts, failure
