@@ -203,7 +203,7 @@ class RpcClient:
             raise ClientError(f"goal {id_} is being cancelled, and there is no result yet")
         if content_type(result) in ("application/cdr", "application/x-ros1"):
             from appliance.ros.calls.goals import status_of
-            from appliance.ros.payload.payloads import RAW, named_encoding
+            from appliance.ros.payload.encodings.registry import RAW, named_encoding
 
             wire = RAW[named_encoding(content_type(result)) or "cdr"]
             return GoalOutcome(status_of(bytes(result.payload), wire), shown(result))
@@ -257,7 +257,7 @@ def decode(message: paho.MQTTMessage) -> Any:
         except orjson.JSONDecodeError:
             pass
     if said in (None, "application/cbor"):
-        from appliance.ros.payload import cbor
+        from appliance.ros.payload.encodings import cbor
         from appliance.ros.payload.fallback import ConversionError
 
         with contextlib.suppress(ConversionError):

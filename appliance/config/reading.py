@@ -34,7 +34,7 @@ from appliance.config.settings import (
     Settings,
     TopicRoute,
 )
-from appliance.config.values import OF_NODE, InListError
+from appliance.config.values import OF_NODE, InListError, ValueEncoding
 from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument
 from appliance.host.environment import of_service
 
@@ -156,8 +156,8 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         if route.to == "ros":
             for key in route.mqtt_keys:
                 yield ("bridge", "topics", number, key), "is for routes to MQTT only"
-        elif route.fields and route.encoding not in ("json", "cbor"):
-            problem = f"is for json and cbor only, and the encoding is {route.encoding}"
+        elif route.fields and route.encoding not in (known := get_args(ValueEncoding)):
+            problem = f"is for {' and '.join(known)} only, and the encoding is {route.encoding}"
             yield ("bridge", "topics", number, "fields"), problem
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"

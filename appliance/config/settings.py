@@ -44,6 +44,7 @@ from appliance.config.values import (
     Retain,
     RosNames,
     TlsVersion,
+    ValueEncoding,
     check_action_type,
     check_allow,
     check_clamp,
@@ -367,7 +368,7 @@ class ParameterRoute(_CalledRoute):
 
     ros: ParameterNames
     mqtt: Annotated[str, AfterValidator(check_node_topic)] = "{robot}{node}/_param"
-    encoding: Literal["json", "cbor"] = "json"
+    encoding: ValueEncoding = "json"
 
     @property
     def is_pattern(self) -> bool:

@@ -302,10 +302,17 @@ ParameterNames = Annotated[str | tuple[str, ...], PlainValidator(_parse_paramete
 FieldPath = Annotated[str, AfterValidator(_check_field)]
 
 
+#: Nothing of ROS is imported here, and so the encodings that `appliance.ros.payload.encodings` has
+#: are listed once more; tests/ros/payload/test_encodings.py holds the lists equal.
 Encoding = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
 
 
+#: Those of services and actions.
 CallEncoding = Literal["json", "cbor", "cdr", "ros1"]
+
+
+#: Those of any value: of parameters, and of some of a message's fields.
+ValueEncoding = Literal["json", "cbor"]
 
 
 Direction = Literal["mqtt", "ros", "both"]

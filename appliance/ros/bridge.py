@@ -35,7 +35,7 @@ from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import UnknownTypeError
-from appliance.ros.payload.payloads import CONTENT_TYPE
+from appliance.ros.payload.encodings.registry import CONTENT_TYPE
 from appliance.ros.payload.schema import json_schema, topic_of
 from appliance.ros.retained_cleanup import TopicOwners, is_of_route
 from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from appliance.ros.metrics import FlowCounters, Latency
-from appliance.ros.payload.payloads import Encoding
+from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.topics.flow import BridgedTopic, BridgeRoute, Direction, Flow, TopicSettings
 
 
@@ -32,7 +32,7 @@ class TopicStatus:
     mqtt: str
     type: str
     direction: Direction
-    encoding: Encoding
+    encoding: EncodingName
     messages: int
     rate: float
     size: int

@@ -19,8 +19,7 @@ from appliance.ros.bridge import TopicSettings
 from appliance.ros.calls.routes import CallRoutes
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import UnknownTypeError, describe
-from appliance.ros.payload.payloads import RAW
-from appliance.ros.payload.payloads import check as check_encoding
+from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.ros1 import node as ros1
 from appliance.ros.ros2 import discovery, installation
 from appliance.ros.ros2 import node as ros2
@@ -99,14 +98,14 @@ def _looks(
     route: TopicSettings, type_name: str, converters: Converters
 ) -> Iterator[Callable[[], object]]:
     """What raises an error for a mistake in the route, each for one."""
-    if route.encoding not in RAW or route.rules is not None:
+    encoding = ENCODINGS[route.encoding]
+    if encoding.serialization is None or route.rules is not None:
         for field in route.fields:
             yield functools.partial(converters.get, type_name, (field,))
         for direction in ("mqtt", "ros"):
             if route.to in (direction, "both"):
                 converter = converters.get(type_name)
-                to_ros = direction == "ros"
-                yield functools.partial(check_encoding, converter, route.encoding, to_ros=to_ros)
+                yield functools.partial(encoding.check, converter, to_ros=direction == "ros")
     if route.rules is not None:
         converter, rules = converters.get(type_name), route.rules
         parts = [CommandRules(clamp=(one,)) for one in rules.clamp]

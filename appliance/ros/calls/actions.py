@@ -57,7 +57,8 @@ from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSub
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
-from appliance.ros.payload.payloads import CONTENT_TYPE, RAW, CallEncoding, dumps
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import CONTENT_TYPE, RAW, VALUE_ENCODINGS
 from appliance.ros.qos import BURST
 from appliance.ros.skipped import Skipped, SkipReason
 
@@ -112,7 +113,7 @@ class ActionSettings:
     mqtt: str
     type: str | None = None
     timeout: float = 5.0
-    encoding: CallEncoding = "json"
+    encoding: EncodingName = "json"
     keep_result: float = 60.0
     cancel: Literal["own", "any"] = "own"
     cancel_on_disconnect: bool = False
@@ -586,7 +587,9 @@ class BridgedAction:
         canceling, response = await self._cancel(id_, stamp)
         if call.encoding in RAW:
             return Answer(response, call.encoding, f"{CANCEL}_Response")
-        return Answer(dumps({"goals_canceling": canceling}, call.encoding), call.encoding)
+        return Answer(
+            VALUE_ENCODINGS[call.encoding].dumps({"goals_canceling": canceling}), call.encoding
+        )
 
     def _check_right(self, caller: Session, id_: bytes) -> None:
         """Raises CallError when the caller may cancel only its own goals, and this is another's."""

@@ -42,14 +42,14 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.replay_guard import ReplayGuard
 from appliance.ros.payload.converter import TooLargeError
-from appliance.ros.payload.payloads import (
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import (
     CONTENT_TYPE,
-    RAW,
-    CallEncoding,
-    InputLimits,
-    dumps,
+    ENCODINGS,
+    VALUE_ENCODINGS,
     named_encoding,
 )
+from appliance.ros.payload.payloads import InputLimits
 from appliance.ros.topics.conversions import ConversionQueue, user_of
 from appliance.ros.topics.staleness import SENT_AT, said_age
 
@@ -77,7 +77,7 @@ ErrorCode: TypeAlias = Literal[
 
 
 #: Encodings of a call that has other values than ROS messages in it; of such, ROS's own bytes too.
-WITHOUT_RAW: tuple[CallEncoding, ...] = ("json", "cbor")
+WITHOUT_RAW: tuple[EncodingName, ...] = tuple(VALUE_ENCODINGS)
 
 #: Seconds between two lines in the log about the same route's errors.
 REPORT_INTERVAL = 60.0
@@ -111,7 +111,7 @@ class Answer:
     """The answer to a call: its payload, how that is encoded, and the ROS type of it, if any."""
 
     payload: bytes
-    encoding: CallEncoding
+    encoding: EncodingName
     type: str | None = None
 
 
@@ -212,7 +212,7 @@ class Call:
     payload: bytes
     topic: str
     reply: Message
-    encoding: CallEncoding
+    encoding: EncodingName
     doubt: str = ""
     is_late: bool = False
     slot: Slot | None = None
@@ -238,8 +238,8 @@ class CallEndpoint:
     timeout: float
     counters: CallCounters
     handle: Handler
-    encoding: CallEncoding = "json"
-    encodings: tuple[CallEncoding, ...] = WITHOUT_RAW
+    encoding: EncodingName = "json"
+    encodings: tuple[EncodingName, ...] = WITHOUT_RAW
     largest: int | None = None
     is_cancel: bool = False
 
@@ -541,7 +541,7 @@ class CallDispatcher:
         self._check_age(endpoint, caller, message)
         size = len(call.payload)
         try:
-            self.limits.input.check_size(size, call.encoding)
+            self.limits.input.check_size(size, ENCODINGS[call.encoding])
         except TooLargeError as error:
             raise CallError("too_large", str(error)) from None
         if endpoint.largest is not None and size > endpoint.largest:
@@ -639,7 +639,7 @@ class CallDispatcher:
         endpoint: CallEndpoint,
         caller: Session,
         reply: Message | None,
-        encoding: CallEncoding,
+        encoding: EncodingName,
         error: CallError,
     ) -> None:
         counters = endpoint.counters
@@ -659,7 +659,7 @@ class CallDispatcher:
             )
 
     def _answer(
-        self, reply: Message, payload: bytes, encoding: CallEncoding, about: list[tuple[str, str]]
+        self, reply: Message, payload: bytes, encoding: EncodingName, about: list[tuple[str, str]]
     ) -> None:
         properties = dict(reply.properties or {})
         properties[Property.CONTENT_TYPE] = CONTENT_TYPE[encoding]
@@ -668,14 +668,15 @@ class CallDispatcher:
 
 
 def error_payload(
-    error: CallError, encoding: CallEncoding, **more: str
-) -> tuple[bytes, CallEncoding]:
+    error: CallError, encoding: EncodingName, **more: str
+) -> tuple[bytes, EncodingName]:
     """An error as every answer has it, `{"error": {"code": …, "message": …}}`, and its encoding.
 
     ROS's own bytes have no words for it: that is JSON then, which no CDR begins like.
     """
     about = {"code": error.code, "message": str(error)}
-    return dumps({**more, "error": about}, encoding), "json" if encoding in RAW else encoding
+    readable = encoding if encoding in VALUE_ENCODINGS else "json"
+    return VALUE_ENCODINGS[readable].dumps({**more, "error": about}), readable
 
 
 def _is_level(client_id: str) -> bool:

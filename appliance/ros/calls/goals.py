@@ -15,7 +15,8 @@ from typing import Any
 from appliance.ros.calls.dispatcher import Answer, CallError
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import Serialization
-from appliance.ros.payload.payloads import RAW, CallEncoding, dumps, loads
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import RAW, VALUE_ENCODINGS
 
 CANCEL = "action_msgs/srv/CancelGoal"
 GOAL_INFO = "action_msgs/msg/GoalInfo"
@@ -58,13 +59,14 @@ def id_of(uuid: dict[str, str]) -> bytes:
 
 
 def accepted(
-    converters: Converters, id_: bytes, stamp: dict[str, int], encoding: CallEncoding
+    converters: Converters, id_: bytes, stamp: dict[str, int], encoding: EncodingName
 ) -> Answer:
     """The answer to a goal that was accepted."""
     if encoding in RAW:
         info = {"goal_id": {"uuid": id_}, "stamp": stamp}
         return Answer(converters.get(GOAL_INFO).from_dict(info), encoding, GOAL_INFO)
-    return Answer(dumps({"goal_id": id_.hex(), "stamp": stamp}, encoding), encoding)
+    value = {"goal_id": id_.hex(), "stamp": stamp}
+    return Answer(VALUE_ENCODINGS[encoding].dumps(value), encoding)
 
 
 def status_of(result: bytes, wire: Serialization) -> str:
@@ -73,17 +75,18 @@ def status_of(result: bytes, wire: Serialization) -> str:
     return _state(result[start] if len(result) > start else 0)
 
 
-def result(converters: Converters, action: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+def result(converters: Converters, action: str, cdr: bytes, encoding: EncodingName) -> bytes:
     """The payload of a response of `get_result`. Raises ConversionError."""
     if encoding in RAW:
         return cdr
     converter = converters.get(f"{action}_GetResult_Response")
-    said = converter.to_cbor_value(cdr) if encoding == "cbor" else converter.to_dict(cdr)
+    values = VALUE_ENCODINGS[encoding]
+    response = values.values(converter, cdr)
     status = status_of(cdr, converter.description.wire)
-    return dumps({"status": status, "result": said["result"]}, encoding)
+    return values.dumps({"status": status, "result": response["result"]})
 
 
-def statuses(converters: Converters, cdr: bytes, encoding: CallEncoding) -> bytes:
+def statuses(converters: Converters, cdr: bytes, encoding: EncodingName) -> bytes:
     """The payload of what a server says of its goals. Raises ConversionError."""
     if encoding in RAW:
         return cdr
@@ -95,7 +98,7 @@ def statuses(converters: Converters, cdr: bytes, encoding: CallEncoding) -> byte
         }
         for one in converters.get(STATUS).to_dict(cdr)["status_list"]
     ]
-    return dumps(goals, encoding)
+    return VALUE_ENCODINGS[encoding].dumps(goals)
 
 
 def going_on(converters: Converters, cdr: bytes) -> list[bytes]:
@@ -108,7 +111,7 @@ def going_on(converters: Converters, cdr: bytes) -> list[bytes]:
 
 
 def which(
-    converters: Converters, payload: bytes, encoding: CallEncoding
+    converters: Converters, payload: bytes, encoding: EncodingName
 ) -> tuple[bytes, dict[str, int]]:
     """The goals that a call of `_cancel` means, in ROS's words: the id of one; or ALL, of those
     that were accepted up to a time, and for the time 0 of all there are. Raises CallError.
@@ -122,7 +125,7 @@ def which(
             said = info.to_dict(payload)
             id_: object = id_of(said["goal_id"])
         else:
-            value = loads(payload, encoding)
+            value = VALUE_ENCODINGS[encoding].loads(payload)
             if value == {"all": True}:
                 value = {"stamp": {}}
             if not isinstance(value, dict) or not value or value.keys() - {"goal_id", "stamp"}:

@@ -24,7 +24,7 @@ from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
 from appliance.ros.calls.parameter_topics import ParameterGroup, ParameterTopics, shorten, to_bytes
 from appliance.ros.node import BusError, ParameterServer, RosNode
 from appliance.ros.patterns import is_plain
-from appliance.ros.payload.payloads import dumps
+from appliance.ros.payload.encodings.registry import VALUE_ENCODINGS
 from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
@@ -113,12 +113,12 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
 
     def _show(self, namespace: ParameterGroup, name: str, value: Any) -> None:
         """Publish a parameter as it is now; None for one that is no more."""
-        encoding = namespace.route.encoding
+        encoding = VALUE_ENCODINGS[namespace.route.encoding]
         try:
             payload = (
                 b""
                 if value is None
-                else dumps(value if encoding == "cbor" else _to_plain(value), encoding)
+                else encoding.dumps(value if encoding.has_bytes else _to_plain(value))
             )
         except TypeError:  # an integer too large for JSON
             log.debug("%s/%s cannot be shown", namespace.name, name)

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import orjson
 import pybase64
@@ -28,7 +28,9 @@ from appliance.ros.calls.dispatcher import (
 )
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payload.converter import LARGEST_LENIENT, ConversionError, TooLargeError
-from appliance.ros.payload.payloads import CONTENT_TYPE, InputLimits, dumps, loads
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import CONTENT_TYPE, VALUE_ENCODINGS
+from appliance.ros.payload.payloads import InputLimits
 
 #: Parameters that one call sets.
 SET_AT_ONCE = 200
@@ -49,7 +51,7 @@ class ParameterSettings:
     names: tuple[str, ...]
     mqtt: str
     timeout: float = 5.0
-    encoding: Literal["json", "cbor"] = "json"
+    encoding: EncodingName = "json"
 
     def of(self, node: str) -> Names | None:
         """Those that are wanted of a node; None for none at all."""
@@ -185,7 +187,7 @@ class ParameterTopics(ABC, Generic[GroupT]):
                 raise CallError("not_authorized", text)
         reason = await self._set(group, values, call, at_once)
         said = {"successful": True, "reason": reason}
-        return Answer(dumps(said, call.encoding), call.encoding)
+        return Answer(VALUE_ENCODINGS[call.encoding].dumps(said), call.encoding)
 
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
         """Each route, what it has counted, and the nodes that it shows now."""
@@ -220,8 +222,9 @@ def _is_topic(name: str, topic: str) -> bool:
 def value_of(call: Call, limits: InputLimits) -> Any:
     """The value in a call. Raises CallError."""
     try:
-        limits.check(call.payload, call.encoding)
-        return loads(call.payload, call.encoding)
+        encoding = VALUE_ENCODINGS[call.encoding]
+        limits.check(call.payload, encoding)
+        return encoding.loads(call.payload)
     except TooLargeError as error:
         raise CallError("too_large", str(error)) from None
     except ConversionError as error:

@@ -32,7 +32,8 @@ from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
 from appliance.ros.patterns import is_plain
 from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
 from appliance.ros.payload.definitions import UnknownTypeError
-from appliance.ros.payload.payloads import CallEncoding, dumps
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import VALUE_ENCODINGS
 from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
@@ -356,15 +357,16 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         self._nodes.clear()
 
 
-def _to_payload(value: Mapping[str, Any], encoding: CallEncoding) -> bytes:
+def _to_payload(value: Mapping[str, Any], encoding: EncodingName) -> bytes:
     """The payload of a ParameterValue; empty when the parameter is not set."""
     kind = value["type"]
     if not 0 < kind < len(_FIELDS):
         return b""
     plain = value[_FIELDS[kind][0]]
-    if encoding == "cbor" and kind == _BYTES:
+    described = VALUE_ENCODINGS[encoding]
+    if described.has_bytes and kind == _BYTES:
         plain = pybase64.b64decode(plain)
-    return dumps(plain, encoding)
+    return described.dumps(plain)
 
 
 def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,14 +41,15 @@ from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
 from appliance.ros.payload.definitions import UnknownTypeError
-from appliance.ros.payload.payloads import (
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.encodings.registry import (
     CONTENT_TYPE,
+    ENCODINGS,
     RAW,
-    CallEncoding,
-    InputLimits,
-    loads,
+    VALUE_ENCODINGS,
     named_encoding,
 )
+from appliance.ros.payload.payloads import InputLimits
 from appliance.ros.skipped import Skipped, SkipReason
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class ServiceSettings:
     to: Literal["ros", "mqtt"] = "ros"
     type: str | None = None
     timeout: float = 5.0
-    encoding: CallEncoding = "json"
+    encoding: EncodingName = "json"
     on_error: str | None = None
 
     def base(self, ros: str) -> str:
@@ -88,7 +89,7 @@ def to_request(
     converters: Converters,
     type_name: str,
     payload: bytes,
-    encoding: CallEncoding,
+    encoding: EncodingName,
     limits: InputLimits,
 ) -> bytes:
     """The serialized message of a payload; an empty one has every field's default.
@@ -99,10 +100,9 @@ def to_request(
         converter = converters.get(type_name)
         if not payload:
             return converter.from_dict({})
-        limits.check(payload, encoding)
-        if encoding in RAW:
-            return converter.checked(payload, limits.items)
-        return converter.from_cbor(payload) if encoding == "cbor" else converter.from_json(payload)
+        described = ENCODINGS[encoding]
+        limits.check(payload, described)
+        return described.decoder(converter, limits.items)(payload)
     except TooLargeError as error:
         raise CallError("too_large", str(error)) from None
     except ConversionError as error:
@@ -111,12 +111,11 @@ def to_request(
         raise CallError("unknown_type", str(error)) from None
 
 
-def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: CallEncoding) -> bytes:
+def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: EncodingName) -> bytes:
     """The payload of a serialized message. Raises ConversionError, UnknownTypeError."""
     if encoding in RAW:
         return cdr
-    converter = converters.get(type_name)
-    return converter.to_cbor(cdr) if encoding == "cbor" else converter.to_json(cdr)
+    return ENCODINGS[encoding].encoder(converters.get(type_name))(cdr)
 
 
 class ServiceRoutes:
@@ -477,7 +476,7 @@ class ProvidedService:
         take = partial(self._take_response, asked.respond, message.payload, encoding)
         self._dispatcher.conversions.do(origin, len(message.payload), take)
 
-    def _take_response(self, respond: Respond, payload: bytes, encoding: CallEncoding) -> None:
+    def _take_response(self, respond: Respond, payload: bytes, encoding: EncodingName) -> None:
         limits = self._dispatcher.limits.input
         try:
             cdr = to_request(self._converters, self._response_type, payload, encoding, limits)
@@ -552,9 +551,9 @@ class ProvidedService:
         self._is_tried = False
 
 
-def _is_error(payload: bytes, encoding: CallEncoding) -> bool:
+def _is_error(payload: bytes, encoding: EncodingName) -> bool:
     try:
-        value = loads(payload, encoding)
+        value = VALUE_ENCODINGS[encoding].loads(payload)
     except ConversionError:
         return False
     return isinstance(value, dict) and isinstance(value.get("error"), dict)

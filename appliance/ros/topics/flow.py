@@ -22,7 +22,8 @@ from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode
 from appliance.ros.patterns import Names, compile_pattern
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import CDR, Serialization, UnknownTypeError
-from appliance.ros.payload.payloads import Compression, Encoding, InputLimits
+from appliance.ros.payload.encodings.base import EncodingName
+from appliance.ros.payload.payloads import Compression, InputLimits
 from appliance.ros.skipped import Skipped, SkipReason
 from appliance.ros.topics.rules import CommandRules
 
@@ -55,7 +56,7 @@ class TopicSettings:
     to: Literal["mqtt", "ros", "both"]
     mqtt: str
     type: str | None = None
-    encoding: Encoding = "json"
+    encoding: EncodingName = "json"
     rate: float | None = None
     qos: int | None = None
     retain: bool | None = None
@@ -121,7 +122,7 @@ class BridgedTopic:
     mqtt: str
     type: str
     direction: Direction
-    encoding: Encoding
+    encoding: EncodingName
 
 
 class LogFunction(Protocol):

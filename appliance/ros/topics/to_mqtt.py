@@ -11,7 +11,8 @@ from appliance.mqtt.codec import Properties, encode_property_list, encode_string
 from appliance.ros.mailbox import LARGE, Lane, Mailbox
 from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.payloads import RAW, check, packer
+from appliance.ros.payload.encodings.registry import ENCODINGS
+from appliance.ros.payload.payloads import packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
 from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
@@ -86,9 +87,10 @@ class ToMqtt(Flow):
         self._unsubscribe()
         settings = self.settings
         converter = None
-        if settings.encoding not in RAW:
+        encoding = ENCODINGS[settings.encoding]
+        if encoding.serialization is None:
             converter = self._converters.get(type_name, settings.fields)
-            check(converter, settings.encoding, to_ros=False)
+            encoding.check(converter, to_ros=False)
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))

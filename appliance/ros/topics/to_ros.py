@@ -15,7 +15,8 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.payloads import CONTENT_TYPE, check, claim, unpacker
+from appliance.ros.payload.encodings.registry import ENCODINGS
+from appliance.ros.payload.payloads import claim, unpacker
 from appliance.ros.qos import publisher_qos
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
@@ -86,7 +87,7 @@ class ToRos(Flow):
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
         settings = self.settings
         converter = self._converters.get(type_name)
-        check(converter, settings.encoding, to_ros=True)
+        ENCODINGS[settings.encoding].check(converter, to_ros=True)
         unpack = unpacker(converter, settings.encoding, settings.compression, settings.limits)
         publisher = node.create_publisher(self.ros, type_name, qos)
         name = node.resolve(self.ros)
@@ -264,7 +265,7 @@ class ToRos(Flow):
         except ConversionError as error:
             said = properties.get(Property.CONTENT_TYPE)
             encoding = self.settings.encoding
-            if not isinstance(said, str) or said == CONTENT_TYPE[encoding]:
+            if not isinstance(said, str) or said == ENCODINGS[encoding].content_type:
                 raise
             problem = (
                 f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"

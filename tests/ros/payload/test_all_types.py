@@ -20,6 +20,7 @@ from pathlib import Path
 
 import orjson
 import pytest
+from encoded import from_cbor, to_cbor
 
 pytest.importorskip("rclpy", reason="needs ROS 2: the extra `ros`")
 
@@ -313,12 +314,12 @@ def test_round_trip_in_cbor(name: str) -> None:
     converter = CONVERTERS.get(name)
     for message in messages(name):
         cdr = write(message)
-        payload = converter.to_cbor(cdr)
+        payload = to_cbor(converter, cdr)
         assert same(cbor2.loads(payload), in_cbor(message))
-        assert converter.from_cbor(payload) == cdr  # NaN and infinities included
-        assert converter.to_cbor(write(message, ">")) == payload
+        assert from_cbor(converter, payload) == cdr  # NaN and infinities included
+        assert to_cbor(converter, write(message, ">")) == payload
         # As a client writes it that knows nothing of typed arrays.
-        assert converter.from_cbor(cbor2.dumps(plain(message))) == cdr
+        assert from_cbor(converter, cbor2.dumps(plain(message))) == cdr
 
 
 @pytest.mark.parametrize("name", TYPES)
@@ -334,7 +335,7 @@ def test_some_fields(name: str) -> None:
         for order in "<>":
             cdr = write(message, order)
             assert same(converter.to_dict(cdr), picked(plain(message), fields))
-            assert same(cbor2.loads(converter.to_cbor(cdr)), picked(in_cbor(message), fields))
+            assert same(cbor2.loads(to_cbor(converter, cdr)), picked(in_cbor(message), fields))
 
 
 def field_paths(description, prefix=""):
@@ -387,11 +388,12 @@ def test_mutated_cdr(name: str) -> None:
             try:
                 expected = careful_decode(converter.description, mutant)
             except ConversionError:
-                for convert in (converter.to_json, converter.to_cbor):
-                    with pytest.raises(ConversionError):
-                        convert(mutant)
+                with pytest.raises(ConversionError):
+                    converter.to_json(mutant)
+                with pytest.raises(ConversionError):
+                    to_cbor(converter, mutant)
                 continue
-            cbor2.loads(converter.to_cbor(mutant))
+            cbor2.loads(to_cbor(converter, mutant))
             assert same(converter.to_dict(mutant), expected)
             orjson.loads(converter.to_json(mutant))
 
@@ -460,15 +462,15 @@ def test_mutated_json_and_cbor(name: str, monkeypatch: pytest.MonkeyPatch) -> No
                 expected = converter.from_dict(cbor2.loads(spoilt))
             except ConversionError as error:
                 with pytest.raises(ConversionError) as caught:
-                    converter.from_cbor(spoilt)
+                    from_cbor(converter, spoilt)
                 assert caught.value.path == error.path
             else:
-                assert converter.from_cbor(spoilt) == expected
+                assert from_cbor(converter, spoilt) == expected
                 deserialize_message(expected, type(message))
         for _ in range(3):
             mutant = mutated(converter.to_json(write(message)), rng)
             with contextlib.suppress(ConversionError):
                 deserialize_message(converter.from_json(mutant), type(message))
-            mutant = mutated(converter.to_cbor(write(message)), rng)
+            mutant = mutated(to_cbor(converter, write(message)), rng)
             with contextlib.suppress(ConversionError):
-                deserialize_message(converter.from_cbor(mutant), type(message))
+                deserialize_message(from_cbor(converter, mutant), type(message))

@@ -11,6 +11,7 @@ import sys
 
 import orjson
 import pytest
+from encoded import from_text, to_text
 
 from appliance.ros.payload.codegen import generate
 from appliance.ros.payload.converter import (
@@ -20,6 +21,7 @@ from appliance.ros.payload.converter import (
     Converters,
     compile_converter,
 )
+from appliance.ros.payload.cost import ITEMS
 from appliance.ros.payload.definitions import (
     PRIMITIVES,
     TIME,
@@ -35,6 +37,7 @@ from appliance.ros.payload.definitions import (
     import_message,
     load_description,
 )
+from appliance.ros.payload.encodings.registry import ENCODINGS
 
 FLOAT64 = PRIMITIVES["float64"]
 FLOAT32 = PRIMITIVES["float32"]
@@ -537,10 +540,9 @@ def test_python_values_that_are_none_of_json() -> None:
 )
 def test_text(type_, text: bytes, value) -> None:
     converter = of(type_)
-    assert converter.has_text
-    message = converter.from_text(text)
+    message = from_text(converter, text)
     assert converter.to_dict(message) == {"data": value}
-    assert converter.to_text(message) == text
+    assert to_text(converter, message) == text
 
 
 def test_text_as_people_type_it() -> None:
@@ -552,10 +554,10 @@ def test_text_as_people_type_it() -> None:
         (PRIMITIVES["int8"], b"+007\n", 7),
         (PRIMITIVES["bool"], b"true\n", True),
     ):
-        assert of(type_).to_dict(of(type_).from_text(text)) == {"data": value}
+        assert of(type_).to_dict(from_text(of(type_), text)) == {"data": value}
     nan = of(FLOAT32)
-    assert math.isnan(nan.to_dict(nan.from_text(b"NaN"))["data"])
-    assert nan.to_text(nan.from_text(b"nan")) == b"nan"
+    assert math.isnan(nan.to_dict(from_text(nan, b"NaN"))["data"])
+    assert to_text(nan, from_text(nan, b"nan")) == b"nan"
 
 
 @pytest.mark.parametrize(
@@ -579,7 +581,7 @@ def test_text_as_people_type_it() -> None:
 )
 def test_text_refused(type_, text: bytes, problem: str) -> None:
     with pytest.raises(ConversionError) as caught:
-        of(type_).from_text(text)
+        from_text(of(type_), text)
     assert str(caught.value) == problem
 
 
@@ -591,11 +593,11 @@ def test_only_a_lone_data_field_goes_as_text() -> None:
         of(FLOAT64, name="value"),
         compile_converter(EMPTY),
     ):
-        assert not converter.has_text
-        with pytest.raises(ConversionError, match="cannot go as text"):
-            converter.from_text(b"1")
-        with pytest.raises(ConversionError, match="cannot go as text"):
-            converter.to_text(HEADER_BYTES + bytes(100))
+        text = ENCODINGS["text"]
+        with pytest.raises(UnknownTypeError, match="cannot go as text"):
+            text.encoder(converter)
+        with pytest.raises(UnknownTypeError, match="cannot go as text"):
+            text.decoder(converter, ITEMS)
 
 
 # --- descriptions ---------------------------------------------------------------------------

@@ -10,11 +10,11 @@ import pytest
 
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros.payload import cbor
 from appliance.ros.payload.fallback import ConversionError
 
 pytest.importorskip("sensor_msgs.msg")
 import zstandard
+from encoded import decoded, encoded, from_cbor, to_cbor
 from test_bridge import STRING, TWIST, House, both, string, to_mqtt, to_ros
 
 from appliance.ros.payload.converter import Converters
@@ -24,6 +24,7 @@ from appliance.ros.payload.definitions import (
     load_description,
     select,
 )
+from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import InputLimits, packer, unpacker
 from appliance.ros.payload.schema import json_schema
 
@@ -54,12 +55,12 @@ def properties_of(message):
 
 def test_arrays_of_numbers_are_typed_arrays_and_bytes_are_bytes():
     joints = CONVERTERS.get(JOINTS)
-    payload = joints.to_cbor(joints.from_json(b'{"name": ["a"], "position": [1.5, -2]}'))
+    payload = to_cbor(joints, joints.from_json(b'{"name": ["a"], "position": [1.5, -2]}'))
     value = cbor2.loads(payload)
     assert value["name"] == ["a"]
     assert value["position"] == cbor2.CBORTag(86, struct.pack("<2d", 1.5, -2))
     picture = CONVERTERS.get(PICTURE)
-    assert cbor2.loads(picture.to_cbor(picture.from_binary(JPEG)))["data"] == JPEG
+    assert cbor2.loads(to_cbor(picture, decoded("binary", picture, JPEG)))["data"] == JPEG
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,7 @@ def test_arrays_of_numbers_are_typed_arrays_and_bytes_are_bytes():
 def test_typed_arrays_of_any_kind_are_taken(tag, code):
     joints = CONVERTERS.get(JOINTS)
     payload = cbor2.dumps({"position": cbor2.CBORTag(tag, struct.pack(code, 0, 1, 2, 100))})
-    assert joints.to_dict(joints.from_cbor(payload))["position"] == [0, 1, 2, 100]
+    assert joints.to_dict(from_cbor(joints, payload))["position"] == [0, 1, 2, 100]
 
 
 @pytest.mark.parametrize(
@@ -95,7 +96,7 @@ def test_typed_arrays_of_any_kind_are_taken(tag, code):
 )
 def test_what_is_no_cbor_of_a_message_is_refused(payload, problem):
     with pytest.raises(ConversionError, match=problem):
-        CONVERTERS.get(JOINTS).from_cbor(payload)
+        from_cbor(CONVERTERS.get(JOINTS), payload)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_what_is_no_cbor_of_a_message_is_refused(payload, problem):
 )
 def test_what_cbor_gets_wrong_is_named_by_its_path(value, path):
     with pytest.raises(ConversionError) as caught:
-        CONVERTERS.get(ODOMETRY).from_cbor(cbor2.dumps(value))
+        from_cbor(CONVERTERS.get(ODOMETRY), cbor2.dumps(value))
     assert caught.value.path == path
 
 
@@ -126,7 +127,7 @@ def test_cbor_decodes_no_more_than_it_is_given():
     for _ in range(9):
         level = b"\xd8\x1c\x8a" + level + b"\xd8\x1d\x00" * 9
     with pytest.raises(ConversionError):
-        cbor.loads(level)
+        ENCODINGS["cbor"].loads(level)
 
 
 # fields
@@ -178,7 +179,7 @@ async def test_a_picture_goes_as_it_is_with_its_content_type(house):
     (cdr,) = other.received
     value = CONVERTERS.get(PICTURE).to_dict(cdr)
     assert value["format"] == "jpeg"
-    assert CONVERTERS.get(PICTURE).to_binary(cdr) == JPEG
+    assert encoded("binary", CONVERTERS.get(PICTURE), cdr) == JPEG
 
 
 async def test_a_raw_image_cannot_be_made_of_its_bytes(house):

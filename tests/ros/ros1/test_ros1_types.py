@@ -6,6 +6,7 @@ import json
 import struct
 
 import pytest
+from encoded import from_text, to_text
 
 from appliance.ros.bridge import Bridge  # noqa: F401  (it knows all modules that it needs)
 from appliance.ros.calls.goals import STATES
@@ -83,9 +84,9 @@ def test_a_definition_with_all_that_there_is() -> None:
 
 def test_strings_may_have_any_character_and_end_with_none() -> None:
     it = converter("string data")
-    assert it.from_text(b"a\0b") == b"\x03\0\0\0a\0b"
+    assert from_text(it, b"a\0b") == b"\x03\0\0\0a\0b"
     assert it.to_json(b"\x03\0\0\0a\0b") == b'{"data":"a\\u0000b"}'
-    assert it.to_text(b"\x02\0\0\0a\0") == b"a\0"
+    assert to_text(it, b"\x02\0\0\0a\0") == b"a\0"
     assert it.to_json(b"\x01\0\0\0\xff") == '{"data":"\ufffd"}'.encode()
     with pytest.raises(ConversionError, match="truncated"):
         it.checked(b"\xff\xff\xff\xff")

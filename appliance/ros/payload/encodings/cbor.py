@@ -1,9 +1,8 @@
-"""CBOR (RFC 8949) as this bridge speaks it: JSON's shape, bytes as byte strings, and arrays of
-numbers as typed arrays (RFC 8746), which are CDR's bytes as they stand.
+"""`cbor`: CBOR (RFC 8949) in JSON's shape, with byte strings and typed arrays (RFC 8746).
 
-What comes in may have plain arrays as well, and typed arrays of any type and byte order that Python
-knows. Other tags are refused: none is needed, and with references to values that are there already,
-some bytes could stand for gigabytes.
+The bytes of a typed array are those of CDR, and are copied. Input may have plain arrays as well,
+and typed arrays of any type and byte order that Python knows. Other tags are refused: none is
+needed, and with references to values that came before, a few bytes could stand for gigabytes.
 """
 
 from __future__ import annotations
@@ -15,8 +14,10 @@ from typing import Any
 import cbor2
 
 from appliance.ros.payload.arrays import Numbers, unpack_numbers
-from appliance.ros.payload.cost import DEPTH
+from appliance.ros.payload.converter import Converter
+from appliance.ros.payload.cost import DEPTH, weigh_cbor
 from appliance.ros.payload.definitions import PRIMITIVES
+from appliance.ros.payload.encodings.base import Decode, Encode, ValueEncoding
 from appliance.ros.payload.fallback import ConversionError
 
 #: Tags of typed arrays in little endian.
@@ -57,11 +58,11 @@ _CODES = {
     86: "<d",
 }
 
-#: The tags that cbor2 would do something about.
+#: The tags that cbor2 would convert to objects of Python.
 _KNOWN = (0, 1, 2, 3, 4, 5, 25, 28, 29, 30, 35, 36, 37, 100, 256, 258, 260, 261, 1004, 43000)
 
-#: Those that are on the wire of ROS as they are here.
-_AS_THEY_ARE = {
+#: The typed arrays whose bytes are those of ROS.
+_AS_ON_ROS = {
     **{tag: PRIMITIVES[name] for name, tag in TAGS.items()},
     **dict.fromkeys((64, 68), PRIMITIVES["uint8"]),
 }
@@ -72,9 +73,40 @@ def _encode_numbers(encoder: cbor2.CBOREncoder, value: Any) -> None:
     encoder.encode(cbor2.CBORTag(TAGS[value.primitive.name], value.data))
 
 
-def dumps(value: object) -> bytes:
-    """The CBOR of a value, in which there may be what a reader of `generate_binary` gives."""
-    return cbor2.dumps(value, default=_encode_numbers)
+class Cbor(ValueEncoding):
+    """CBOR: the fields of a message as a map, with NaN and infinities."""
+
+    name = "cbor"
+    content_type = "application/cbor"
+    has_bytes = True
+
+    def encoder(self, converter: Converter) -> Encode:
+        to_values = converter.to_binary_values
+
+        def encode(cdr: bytes) -> bytes:
+            return cbor2.dumps(to_values(cdr), default=_encode_numbers)
+
+        return encode
+
+    def decoder(self, converter: Converter, items: int) -> Decode:
+        from_values = converter.from_values
+
+        def decode(payload: bytes) -> bytes:
+            return from_values(loads(payload, as_numbers=True), len(payload))
+
+        return decode
+
+    def cost(self, payload: bytes, most: int) -> int:
+        return weigh_cbor(payload, most)
+
+    def dumps(self, value: object) -> bytes:
+        return cbor2.dumps(value, default=_encode_numbers)
+
+    def loads(self, payload: bytes) -> Any:
+        return loads(payload)
+
+    def values(self, converter: Converter, cdr: bytes) -> dict[str, Any]:
+        return converter.to_binary_values(cdr)
 
 
 def _read_list(tag: cbor2.CBORTag, _: bool) -> list[Any]:
@@ -90,7 +122,7 @@ def _read_list(tag: cbor2.CBORTag, _: bool) -> list[Any]:
 
 
 def _read_numbers(tag: cbor2.CBORTag, is_immutable: bool) -> Numbers | list[Any]:
-    primitive = _AS_THEY_ARE.get(tag.tag)
+    primitive = _AS_ON_ROS.get(tag.tag)
     data = tag.value
     if primitive is None or not isinstance(data, bytes) or len(data) % primitive.size:
         return _read_list(tag, is_immutable)
@@ -108,10 +140,10 @@ _REFUSED = {tag: _refuse(tag) for tag in _KNOWN}
 
 
 def loads(payload: bytes, *, as_numbers: bool = False) -> Any:
-    """The value of CBOR; raises ConversionError when it is none, or more than one.
+    """The value of CBOR. Raises ConversionError when the payload is not exactly one value.
 
-    Typed arrays are lists; with `as_numbers` those that ROS has like this are `Numbers`, in which
-    nothing is looked at.
+    Typed arrays become lists; with `as_numbers` those whose bytes are ROS's become `Numbers`, which
+    are copied without being read.
     """
     file = BytesIO(payload)
     decoder = cbor2.CBORDecoder(
