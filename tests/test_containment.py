@@ -773,12 +773,12 @@ async def _looks(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("actions.look")
 async def _looks_at_actions(site: Site, patch: pytest.MonkeyPatch) -> None:
-    actions = site.bridge.calls._actions
-    action = Mock(ros="/act")
-    action.look.side_effect = SabotageError
-    actions._actions["/act"] = action
-    actions.look()
-    del actions._actions["/act"]
+    topics = site.bridge.calls._actions.topics
+    action, actions = Mock(ros="/act"), topics._actions
+    action.poll_graph.side_effect = SabotageError
+    topics.replace([action])
+    topics.poll_graph()
+    topics.replace(actions)
 
 
 @reach("actions.task", "actions.end")

@@ -1,9 +1,9 @@
-"""Actions: goals that MQTT clients send, and what becomes of them.
+"""Actions that MQTT clients use: goals, their cancelling and their results, on the loop's thread.
 
-An action is made of services and topics, and is bridged as these: `/act/_action/send_goal`,
-`cancel_goal` and `get_result`, `feedback` and `status`.
+A ROS action is made of services and topics and is bridged as these: `/act/_action/send_goal`,
+`cancel_goal` and `get_result` here, `feedback` and `status` in action_topics.py.
 
-| topic under `r2d2/act` | what |
+| topic under `r2d2/act` | content |
 |---|---|
 | `_goal` | a call with the goal's fields; its answer is `{"goal_id": …}` once it is accepted |
 | `_cancel` | a call with `{"goal_id": …}`, `{"stamp": …}` for all up to then, or `{"all": true}` |
@@ -11,9 +11,9 @@ An action is made of services and topics, and is bridged as these: `/act/_action
 | `_result/{goal id}` | `{"status": "succeeded", "result": {…}}`, retained for `keep_result` |
 | `_status` | all goals that the server knows of, retained |
 
-A result that never comes is `{"status": "unknown", "error": {…}}`.
+A goal whose result never comes gets `{"status": "unknown", "error": {…}}`.
 
-These are JSON, CBOR or ROS's own bytes, see goals.py.
+Payloads are JSON, CBOR or ROS's own bytes, see goals.py.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import asyncio
 import contextlib
 import logging
 import secrets
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -34,6 +33,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls import goals
+from appliance.ros.calls.action_topics import ActionSnapshot, ActionSubscriptions, ActionTopics
 from appliance.ros.calls.dispatcher import (
     WITHOUT_RAW,
     Answer,
@@ -48,18 +48,15 @@ from appliance.ros.calls.dispatcher import (
     error_payload,
 )
 from appliance.ros.calls.fair_cache import FairCache
-from appliance.ros.calls.goals import ALL, CANCEL, STATUS
+from appliance.ros.calls.goals import ALL, CANCEL
 from appliance.ros.calls.requests import Key, Requests
-from appliance.ros.calls.services import from_ros, to_request
-from appliance.ros.mailbox import Lane, Mailbox
-from appliance.ros.metrics import FlowCounters
-from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription
+from appliance.ros.calls.services import to_request
+from appliance.ros.mailbox import Mailbox
+from appliance.ros.node import BusError, RosNode
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE, RAW, VALUE_ENCODINGS
-from appliance.ros.qos import BURST
 from appliance.ros.skipped import Skipped, SkipReason
 
 log = logging.getLogger(__name__)
@@ -68,35 +65,33 @@ SEND_GOAL = "/_action/send_goal"
 GET_RESULT = "/_action/get_result"
 CANCEL_GOAL = "/_action/cancel_goal"
 
-#: By the numbers of action_msgs/srv/CancelGoal.
+#: By the return codes of action_msgs/srv/CancelGoal.
 _NOT_CANCELLED: dict[int, tuple[ErrorCode, str]] = {
     1: ("rejected", "the action's server does not cancel it"),
     2: ("unknown_goal", "the action's server knows of no such goal"),
     3: ("unknown_goal", "the goal has ended already"),
 }
 
-#: Goals whose feedback waits for a busy broker, each with its newest.
-LANES = 256
+#: Results of one action that are retained at a time, and their bytes; beyond these the oldest of
+#: the user with the most is cleared.
+MAX_RESULTS = 1000
+MAX_RESULT_BYTES = 16 * 1024 * 1024
 
-#: Results that one action keeps at a time, and bytes of them; the oldest of the user with most go
-#: first.
-RESULTS = 1000
-RESULT_BYTES = 16 * 1024 * 1024
+#: Goals of one action that were given up before they were accepted and are remembered, as their
+#: server may accept them yet.
+MAX_ABANDONED = 1000
 
-#: Goals of one action that were given up before they were accepted; so are these.
-UNWANTED = 1000
-
-#: Goals of all actions that have ended of which is known who sent them; and these.
-ENDED = 10_000
+#: Ended goals, of all actions, whose owner is remembered.
+MAX_ENDED = 10_000
 
 #: Bytes of a call that cancels.
-LARGEST_CANCEL = 1024
+MAX_CANCEL_BYTES = 1024
 
-#: Seconds that a server which has just come has to say that it does not know a goal.
-CHECK_TIME = 5.0
+#: Seconds in which a server that has just joined must say that it does not know a goal.
+CHECK_TIMEOUT = 5.0
 
-#: Seconds that servers have to take back goals when the appliance stops.
-LAST_WORD = 1.0
+#: Seconds that servers have to cancel goals when the appliance stops.
+STOP_TIMEOUT = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +100,8 @@ class ActionSettings:
 
     A `{ros}` in `mqtt` stands for the ROS name. `timeout` is for the acceptance of a goal and for
     its cancelling, `keep_result` is how long a result is retained, both in seconds. `encoding` is
-    for what is published, and for calls that do not name another. `cancel` says whose goals those
-    may cancel who may call `_cancel`.
+    for what is published, and for calls that do not name another. `cancel` says whose goals a
+    client may cancel that has the right to call `_cancel`.
     """
 
     names: tuple[str, ...]
@@ -120,8 +115,11 @@ class ActionSettings:
 
 
 @dataclass(eq=False, slots=True)
-class _Goal:
-    """A goal under way that an MQTT client has sent."""
+class Goal:
+    """A goal under way that an MQTT client has sent.
+
+    `result` is set when its outcome is known otherwise than by the answer of `get_result`.
+    """
 
     id: bytes
     owner: Session
@@ -131,9 +129,40 @@ class _Goal:
     is_orphan: bool = False
 
 
+class GoalRegistry:
+    """The goals of all actions: the limit on those under way, and who owns which."""
+
+    def __init__(self) -> None:
+        self.slots = ConcurrencyLimiter("goals")
+        #: The owners of goals that have ended, by the goal's id.
+        self.ended: FairCache[bytes, str] = FairCache(MAX_ENDED)
+        self._running: dict[bytes, Goal] = {}
+
+    def begin(self, owner: Session) -> Goal:
+        """Make a goal with a new id; a slot has been found to be free."""
+        id_ = secrets.token_bytes(16)
+        result = asyncio.get_running_loop().create_future()
+        goal = self._running[id_] = Goal(id_, owner, self.slots.acquire(owner), result)
+        return goal
+
+    def end(self, goal: Goal) -> None:
+        """Release the goal's slot, and remember the owner of one that was accepted."""
+        del self._running[goal.id]
+        self.slots.release(goal.slot)
+        if goal.is_accepted:
+            self.ended.put(goal.slot.user, goal.id, _owner(goal.owner))
+
+    def owns(self, caller: Session, id_: bytes) -> bool:
+        """Whether the goal is the caller's: as long as it is under way, and some time after."""
+        goal = self._running.get(id_)
+        if goal is not None:
+            return _owner(goal.owner) == _owner(caller)
+        return self.ended.get(id_) == _owner(caller)
+
+
 @dataclass(eq=False, slots=True)
 class _BackgroundTasks:
-    """Tasks that nobody waits for, kept until they end."""
+    """Tasks that nobody awaits, referenced until they end."""
 
     entries: Entries
     running: set[asyncio.Task[None]] = field(default_factory=set)
@@ -150,7 +179,7 @@ class _BackgroundTasks:
 
 
 class ActionRoutes:
-    """The routes of actions; for the loop's thread, where it does not say otherwise."""
+    """The routes of actions; for the loop's thread, and `topics` for the ROS thread."""
 
     def __init__(
         self,
@@ -168,32 +197,30 @@ class ActionRoutes:
         self._node = node
         self._post = post
         self._mailbox = mailbox
+        self.topics = ActionTopics(entries.faults, post)
+        self.goals = GoalRegistry()
         self._counters: dict[ActionSettings, CallCounters] = {}
         self._actions: dict[str, BridgedAction] = {}
-        #: Those whose route has gone before their goals.
-        self._past: list[BridgedAction] = []
-        #: Actions that patterns speak of and do not take.
+        #: Those whose route was removed before their goals have ended.
+        self._removed: list[BridgedAction] = []
+        #: Actions on the bus that a pattern names and does not take.
         self._refused: list[Skipped] = []
         self._tasks = _BackgroundTasks(entries)
-        #: Of the goals under way.
-        self.slots = ConcurrencyLimiter("goals")
-        #: Who has sent a goal that has ended since, by its id.
-        self.ended: FairCache[bytes, str] = FairCache(ENDED)
 
     def start(self) -> None:
-        """Nothing is known of the bus yet."""
+        """Clear what another run has left retained: nothing is known of the bus yet."""
         for route in self._counters:
-            self._dispatcher.clear(route.mqtt, "{ros}", "_status")
+            self._dispatcher.clear_retained(route.mqtt, "{ros}", "_status")
 
     def replace(self, routes: Sequence[ActionSettings]) -> None:
-        """Have these routes from now on; one that was there before does not notice."""
+        """Use these routes from now on; one that was there before goes on without a break."""
         self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         self.follow()
 
     def follow(self) -> None:
-        """Offer what is on the bus now."""
+        """Bridge the actions that are on the bus now."""
         services = self._requests.services
-        # Until all is found that it is made of, the result of a goal could not be asked for.
+        # Only whole actions: without `get_result` nobody could ask for the result of a goal.
         found = {
             name: [min(types)]
             for service in services
@@ -208,50 +235,58 @@ class ActionRoutes:
 
         wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
         self._refused = refusals(routes, found, wanted, "action", misfit)
-        self._past = [action for action in self._past if action.has_goals]
+        self._removed = [action for action in self._removed if action.has_goals]
         for name, action in list(self._actions.items()):
             if wanted.get(name) != action.route:
                 action.stop()
                 del self._actions[name]
-                self._past.append(action)
+                self._removed.append(action)
         for name, route in wanted.items():
             if name not in self._actions:
-                self._actions[name] = BridgedAction(name, route, self._counters[route], self)
+                self._actions[name] = self._new_action(name, route)
+            action = self._actions[name]
             fixed = route.type if route.type is not None and "*" not in route.type else None
-            seen = found[name][0] if name in found else self._actions[name].type
-            self._actions[name].type = fixed or seen
-            self._actions[name].see(name in found)
+            seen = found[name][0] if name in found else action.type
+            action.set_state(fixed or seen, name in found)
+        self.topics.replace(action.subscriptions for action in self._actions.values())
+
+    def _new_action(self, ros: str, route: ActionSettings) -> BridgedAction:
+        return BridgedAction(
+            ros,
+            route,
+            self._counters[route],
+            self._dispatcher,
+            self._requests,
+            self._converters,
+            self._node,
+            self._mailbox,
+            self._post,
+            self.goals,
+            self._tasks,
+            partial(self._server_joined, ros),
+        )
 
     def keys(self) -> Iterable[Key]:
-        """The services that a client should be ready for."""
+        """The services that need a client that is ready."""
         for action in self._actions.values():
             yield from action.keys()
 
-    def owns(self, caller: Session, id_: bytes) -> bool:
-        """Whether the goal is the caller's: as long as it is under way, and some time after."""
-        for action in self._all():
-            goal = action._goals.get(id_)
-            if goal is not None:
-                return _owner(goal.owner) == _owner(caller)
-        return self.ended.get(id_) == _owner(caller)
-
     def departed(self, session: Session) -> None:
         """A client's connection has ended."""
-        if session in self.slots:
+        if session in self.goals.slots:
             for action in self._all():
                 action.departed(session)
 
-    def server_came(self, ros: str) -> None:
-        """Another server of that action has come."""
+    def _server_joined(self, ros: str) -> None:
         for action in self._all():
             if action.ros == ros:
                 action.check_goals()
 
     def _all(self) -> list[BridgedAction]:
-        return [*self._actions.values(), *self._past]
+        return [*self._actions.values(), *self._removed]
 
     def status(self) -> list[tuple[ActionSettings, CallCounters, list[str]]]:
-        """Each route, what it has counted, and the actions that it offers now."""
+        """Each route, its counters, and the actions that it bridges now."""
         return [
             (route, counters, [a.ros for a in self._actions.values() if a.route is route])
             for route, counters in self._counters.items()
@@ -268,60 +303,40 @@ class ActionRoutes:
                 "encoding": action.route.encoding,
             }
             for action in self._actions.values()
-            if action.is_there
+            if action.is_available
         ]
 
     def skips(self) -> list[Skipped]:
-        """The actions that routes speak of and are not bridged."""
+        """The actions that a route names and that are not bridged."""
         skips = list(self._refused)
         for action in self._actions.values():
             type_name = action.type or ""
             problem = self._requests.problem(f"{action.ros}{SEND_GOAL}", f"{type_name}_SendGoal")
             if problem is not None:
                 skips.append(Skipped(action.ros, "action", type_name, "problem", problem))
-            elif not action.is_there:
+            elif not action.is_available:
                 skips.append(
                     Skipped(action.ros, "action", type_name, "absent", "no node offers it")
                 )
         return skips
 
     async def cancel_orphans(self) -> None:
-        """The appliance stops, and with it every client's way to its goals: cancel those that
-        are not to go on without them."""
-        cancels = [
-            action._cancel_quietly(goal.id, "the appliance stops")
-            for action in self._all()
-            if action.route.cancel_on_disconnect
-            for goal in action._goals.values()
-            if goal.is_accepted
-        ]
+        """Cancel the goals that are to end with their client: as the appliance stops, no client can
+        reach them any more."""
+        cancels = [cancel for action in self._all() for cancel in action.orphan_cancels()]
         if cancels:
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(asyncio.gather(*cancels), LAST_WORD)
+                await asyncio.wait_for(asyncio.gather(*cancels), STOP_TIMEOUT)
 
     async def stop(self) -> None:
-        """The bus has been left: nothing is offered any more."""
+        """Clear what is retained, once the bus has been left."""
         for action in self._actions.values():
-            action.forget()
+            action.clear_status()
         self._actions.clear()
-        self._past.clear()
+        self._removed.clear()
         self._refused.clear()
+        self.topics.replace(())
         await self._tasks.stop()
-
-    # The ROS thread
-
-    def look(self) -> None:
-        """Follow the actions' topics."""
-        for action in list(self._actions.values()):
-            try:
-                action.look(self._node)
-            except Exception as error:
-                self._post(self._tasks.entries.faults.caught, "actions.look", error, action.ros)
-
-    def lost(self) -> None:
-        """The bus is gone, and with it all subscriptions."""
-        for action in list(self._actions.values()):
-            action.lost()
 
 
 def _types(name: str, services: Mapping[str, Sequence[str]]) -> set[str]:
@@ -350,67 +365,91 @@ def _misfit(route: ActionSettings, type_name: str) -> tuple[SkipReason, str] | N
 
 
 class BridgedAction:
-    """One action that MQTT clients may use."""
+    """One action that MQTT clients may use; for the loop's thread."""
 
     def __init__(
-        self, ros: str, route: ActionSettings, counters: CallCounters, routes: ActionRoutes
+        self,
+        ros: str,
+        route: ActionSettings,
+        counters: CallCounters,
+        dispatcher: CallDispatcher,
+        requests: Requests,
+        converters: Converters,
+        node: RosNode,
+        mailbox: Mailbox,
+        post: Callable[..., None],
+        registry: GoalRegistry,
+        tasks: _BackgroundTasks,
+        server_joined: Callable[[], None],
     ) -> None:
         self.ros = ros
         self.route = route
         self.base = route.mqtt.replace("{ros}", ros)
         self.type: str | None = None
-        self.is_there = False
-        #: Whether the status has to be asked for anew: a publisher that stayed says it only once.
-        self._has_forgotten = False
+        self.is_available = False
+        #: Called when another server of the action has appeared on the bus.
+        self.server_joined = server_joined
         self._counters = counters
-        self._routes = routes
-        self._dispatcher = routes._dispatcher
-        self._requests = routes._requests
-        self._converters = routes._converters
-        self._wire = routes._node.wire
-        self._goals: dict[bytes, _Goal] = {}
-        #: Goals that nobody waits for any more, should their server accept them yet.
-        self._unwanted: FairCache[bytes, None] = FairCache(UNWANTED)
-        #: Topics of results that are retained, and until when; they all have the same time.
-        self._kept: FairCache[str, float] = FairCache(RESULTS, RESULT_BYTES)
-        # The ROS thread's.
-        self._subscriptions: list[RosSubscription] = []
-        self._subscribed: str | None = None
-        self._is_over = False
-        self._servers = 0
-        self._counted = FlowCounters()
-        self._lanes: OrderedDict[bytes, Lane] = OrderedDict()
-        self._status_lane = Lane(1, self._counted)
+        self._dispatcher = dispatcher
+        self._requests = requests
+        self._converters = converters
+        self._node = node
+        self._wire = node.wire
+        self._registry = registry
+        self._tasks = tasks
+        self._goals: dict[bytes, Goal] = {}
+        #: Goals whose sender waits no longer, to be cancelled should their server accept them yet.
+        self._abandoned: FairCache[bytes, None] = FairCache(MAX_ABANDONED)
+        #: Topics of retained results, and until when; they all have the same time.
+        self._results: FairCache[str, float] = FairCache(MAX_RESULTS, MAX_RESULT_BYTES)
+        self._status_clears = 0
+        self._is_logged = False
+        #: The ROS thread's side.
+        self.subscriptions = ActionSubscriptions(
+            ros, self.base, route.encoding, node, converters, mailbox, self, post
+        )
         self._endpoints = [
             CallEndpoint(
                 f"{self.base}/{verb}",
                 f"{ros} {verb[1:]}",
                 route.timeout,
                 counters,
-                handle,
+                handler,
                 route.encoding,
                 (*WITHOUT_RAW, self._wire.encoding),
-                LARGEST_CANCEL if verb == "_cancel" else None,
+                MAX_CANCEL_BYTES if verb == "_cancel" else None,
                 verb == "_cancel",
             )
-            for verb, handle in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
+            for verb, handler in (("_goal", self._on_goal), ("_cancel", self._on_cancel))
         ]
         for endpoint in self._endpoints:
             self._dispatcher.register(endpoint)
-        self._is_told = False
 
-    def see(self, is_there: bool) -> None:
-        """Whether the action is on the bus now."""
-        if self.is_there and not is_there:
-            self.forget()
-            self._has_forgotten = True
-        if not self._is_told or self.is_there != is_there:
-            self._is_told = True
-            if is_there:
+    def set_state(self, type_name: str | None, is_available: bool) -> None:
+        """Take over the action's type, and whether it is on the bus now."""
+        if self.is_available and not is_available:
+            self.clear_status()
+            self._status_clears += 1
+        if not self._is_logged or self.is_available != is_available:
+            self._is_logged = True
+            if is_available:
                 log.info("%s can be called at %s/_goal", self.ros, self.base)
             else:
                 log.info("%s: no node offers it; it is called at %s/_goal", self.ros, self.base)
-        self.is_there = is_there
+        self.type = type_name
+        self.is_available = is_available
+        self._update_subscriptions()
+
+    def _update_subscriptions(self) -> None:
+        self.subscriptions.update(
+            ActionSnapshot(
+                self.type, self.is_available, self._status_clears, frozenset(self._abandoned)
+            )
+        )
+
+    def topic_failed(self, problem: str) -> None:
+        """A topic cannot be subscribed to, or a message cannot be converted."""
+        self._counters.last_error = problem
 
     def keys(self) -> Iterable[Key]:
         """The services that it is made of."""
@@ -423,70 +462,62 @@ class BridgedAction:
 
     def _on_goal(self, call: Call) -> Callable[[], Awaitable[Answer]]:
         type_name = self.type
-        if type_name is None or not self.is_there:
+        if type_name is None or not self.is_available:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
         limits = self._dispatcher.limits
-        self._routes.slots.check(call.caller, limits)
+        self._registry.slots.check(call.caller, limits)
         goal_cdr = to_request(
             self._converters, f"{type_name}_Goal", call.payload, call.encoding, limits.input
         )
         return partial(self._send_goal, call, type_name, goal_cdr)
 
     async def _send_goal(self, call: Call, type_name: str, goal_cdr: bytes) -> Answer:
-        routes = self._routes
-        routes.slots.check(call.caller, self._dispatcher.limits)
+        self._registry.slots.check(call.caller, self._dispatcher.limits)
         if self.route.cancel_on_disconnect and call.caller.link is None:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
-        id_ = secrets.token_bytes(16)
-        request = goals.with_id(goal_cdr, id_, self._wire)
-        goal = _Goal(
-            id_,
-            call.caller,
-            routes.slots.acquire(call.caller),
-            asyncio.get_running_loop().create_future(),
-        )
-        self._goals[id_] = goal
+        goal = self._registry.begin(call.caller)
+        self._goals[goal.id] = goal
+        request = goals.with_id(goal_cdr, goal.id, self._wire)
         try:
-            response = await self._requests.ask(
+            cdr = await self._requests.ask(
                 f"{self.ros}{SEND_GOAL}", f"{type_name}_SendGoal", request
             )
-            said = self._converters.get(f"{type_name}_SendGoal_Response").to_dict(response)
-            if not said["accepted"]:
+            response = self._converters.get(f"{type_name}_SendGoal_Response").to_dict(cdr)
+            if not response["accepted"]:
                 raise CallError("rejected", f"{self.ros} does not accept the goal")
         except asyncio.CancelledError:
-            # It may be accepted yet, and nobody would know of it: it is cancelled now, and once
+            # Its server may accept it yet, and no client would know of it: cancel it now, and once
             # more should it begin after that.
-            self._give_up(goal)
-            self._routes._tasks.begin(self._cancel_quietly(id_, "nobody waits for it any more"))
+            self._abandon(goal)
+            self._tasks.begin(self._cancel_quietly(goal.id, "nobody waits for it any more"))
             raise
         except CallError as error:
             if error.code == "vanished":  # for a moment only, perhaps
-                self._give_up(goal)
+                self._abandon(goal)
             else:
-                self._forget(goal)
+                self._end(goal)
             raise
         except BaseException:
-            self._forget(goal)
+            self._end(goal)
             raise
         goal.is_accepted = True
-        self._routes._tasks.begin(self._follow_goal(goal, type_name))
+        self._tasks.begin(self._follow_goal(goal, type_name))
         if goal.is_orphan:
             self._cancel_orphan(goal)
-        return goals.accepted(self._converters, id_, said["stamp"], call.encoding)
+        return goals.accepted(self._converters, goal.id, response["stamp"], call.encoding)
 
-    def _forget(self, goal: _Goal) -> None:
+    def _end(self, goal: Goal) -> None:
         if self._goals.pop(goal.id, None) is not None:
-            self._routes.slots.release(goal.slot)
-            if goal.is_accepted:
-                self._routes.ended.put(goal.slot.user, goal.id, _owner(goal.owner))
+            self._registry.end(goal)
 
-    def _give_up(self, goal: _Goal) -> None:
-        """Nobody waits for its acceptance any more: should it come, it is cancelled."""
-        self._forget(goal)
-        self._unwanted.put(goal.slot.user, goal.id, None)
+    def _abandon(self, goal: Goal) -> None:
+        """End a goal that may be accepted yet: then it is cancelled."""
+        self._end(goal)
+        self._abandoned.put(goal.slot.user, goal.id, None)
+        self._update_subscriptions()
 
-    async def _follow_goal(self, goal: _Goal, type_name: str) -> None:
-        """Wait for the result, as long as it takes, and publish it."""
+    async def _follow_goal(self, goal: Goal, type_name: str) -> None:
+        """Await the result, as long as it takes, and publish it."""
         asking = asyncio.ensure_future(self._ask_result(goal, type_name))
         try:
             await asyncio.wait({asking, goal.result}, return_when=asyncio.FIRST_COMPLETED)
@@ -505,20 +536,20 @@ class BridgedAction:
             payload, encoding = error_payload(error, self.route.encoding, status=status)
         finally:
             asking.cancel()
-            self._forget(goal)
+            self._end(goal)
         kind = "GetResult_Response" if encoding in RAW else "Result"
-        about = [
+        user_properties = [
             ("status", "ok" if status == "succeeded" else "error"),
             ("ros-type", f"{type_name}_{kind}"),
         ]
         properties: Properties = {
             Property.CONTENT_TYPE: CONTENT_TYPE[encoding],
-            Property.USER_PROPERTY: about,
+            Property.USER_PROPERTY: user_properties,
         }
         self._publish_result(goal, payload, properties)
 
-    async def _ask_result(self, goal: _Goal, type_name: str) -> tuple[str, bytes]:
-        """What became of the goal, and the response of `get_result`. Raises CallError."""
+    async def _ask_result(self, goal: Goal, type_name: str) -> tuple[str, bytes]:
+        """The goal's final status, and the response of `get_result`. Raises CallError."""
         converter = self._converters.get(f"{type_name}_GetResult_Request")
         service = f"{self.ros}{GET_RESULT}"
         try:
@@ -530,44 +561,46 @@ class BridgedAction:
         except CallError as error:
             if error.code != "unavailable":
                 raise
-            # The server was there, and took the goal.
+            # The server was there, as it has accepted the goal.
             raise CallError("vanished", f"{service} went away before it answered") from None
         status = goals.status_of(response, self._wire)
         if status == "unknown":
-            text = f"the server of {self.ros} has come anew and does not know the goal"
+            text = f"the server of {self.ros} was restarted and does not know the goal"
             raise CallError("vanished", text)
         return status, response
 
-    def _publish_result(self, goal: _Goal, payload: bytes, properties: Properties) -> None:
+    def _publish_result(self, goal: Goal, payload: bytes, properties: Properties) -> None:
         keep = self.route.keep_result
         topic = f"{self.base}/_result/{goal.id.hex()}"
-        until = self._dispatcher.now() + keep if keep > 0 else None
-        self._dispatcher.publish(Message(topic, payload, 1, keep > 0, properties, until))
-        if until is None:
-            return
         now = self._dispatcher.now()
-        for old in list(takewhile(lambda item: item[1] <= now, self._kept.items())):
-            self._kept.remove(old[0])  # the broker has let go of it by itself
-        for dropped, _ in self._kept.put(goal.slot.user, topic, until, len(payload)):
-            self._dispatcher.publish(Message(dropped, b"", 0, True))
+        expires_at = now + keep if keep > 0 else None
+        self._dispatcher.publish(Message(topic, payload, 1, keep > 0, properties, expires_at))
+        if expires_at is None:
+            return
+        for expired in list(takewhile(lambda item: item[1] <= now, self._results.items())):
+            self._results.remove(expired[0])  # the broker has removed it by itself
+        for evicted, _ in self._results.put(goal.slot.user, topic, expires_at, len(payload)):
+            self._dispatcher.publish(Message(evicted, b"", 0, True))
 
     @property
     def has_goals(self) -> bool:
+        """Whether a goal is under way."""
         return bool(self._goals)
 
     def check_goals(self) -> None:
-        """Another server has come: it may have taken the place of one that was ended."""
+        """Ask whether the goals are still known: a server that has just joined may have replaced
+        one that was ended."""
         type_name = self.type
         if type_name is None:
             return
         for goal in self._goals.values():
             if goal.is_accepted:
-                self._routes._tasks.begin(self._check(goal, type_name))
+                self._tasks.begin(self._check(goal, type_name))
 
-    async def _check(self, goal: _Goal, type_name: str) -> None:
-        # A server that works on the goal says nothing until it is done.
+    async def _check(self, goal: Goal, type_name: str) -> None:
+        # A server that works on the goal does not answer until it is done.
         try:
-            await asyncio.wait_for(self._ask_result(goal, type_name), CHECK_TIME)
+            await asyncio.wait_for(self._ask_result(goal, type_name), CHECK_TIMEOUT)
         except asyncio.TimeoutError:
             return
         except CallError as error:
@@ -579,7 +612,7 @@ class BridgedAction:
     def _on_cancel(self, call: Call) -> Callable[[], Awaitable[Answer]]:
         id_, stamp = goals.which(self._converters, call.payload, call.encoding)
         self._check_right(call.caller, id_)
-        if not self.is_there:
+        if not self.is_available:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")
         return partial(self._cancel_for, call, id_, stamp)
 
@@ -587,14 +620,13 @@ class BridgedAction:
         canceling, response = await self._cancel(id_, stamp)
         if call.encoding in RAW:
             return Answer(response, call.encoding, f"{CANCEL}_Response")
-        return Answer(
-            VALUE_ENCODINGS[call.encoding].dumps({"goals_canceling": canceling}), call.encoding
-        )
+        payload = VALUE_ENCODINGS[call.encoding].dumps({"goals_canceling": canceling})
+        return Answer(payload, call.encoding)
 
     def _check_right(self, caller: Session, id_: bytes) -> None:
         """Raises CallError when the caller may cancel only its own goals, and this is another's."""
         right = f"{self.base}/_cancel_any"
-        if self.route.cancel == "any" or self._routes.owns(caller, id_):
+        if self.route.cancel == "any" or self._registry.owns(caller, id_):
             return
         if not self._dispatcher.may_publish(caller, right):
             what = f"goal {id_.hex()} is" if id_ != ALL else "these goals may be"
@@ -607,23 +639,26 @@ class BridgedAction:
     async def _cancel(
         self, id_: bytes, stamp: dict[str, int] | None = None
     ) -> tuple[list[str], bytes]:
-        """Cancel a goal, or ALL up to a time; returns the ids of those that are
-        cancelling, and the response."""
+        """Cancel a goal, or ALL up to a time.
+
+        Returns the ids of the goals that are being cancelled, and the response. Raises CallError.
+        """
         request = self._converters.get(f"{CANCEL}_Request").from_dict(
             {"goal_info": {"goal_id": {"uuid": id_}, "stamp": stamp or {}}}
         )
-        response = await self._requests.ask(f"{self.ros}{CANCEL_GOAL}", CANCEL, request)
-        said = self._converters.get(f"{CANCEL}_Response").to_dict(response)
-        canceling = [goals.id_of(info["goal_id"]).hex() for info in said["goals_canceling"]]
-        if said["return_code"] in _NOT_CANCELLED:
-            code, text = _NOT_CANCELLED[said["return_code"]]
+        cdr = await self._requests.ask(f"{self.ros}{CANCEL_GOAL}", CANCEL, request)
+        response = self._converters.get(f"{CANCEL}_Response").to_dict(cdr)
+        canceling = [goals.id_of(info["goal_id"]).hex() for info in response["goals_canceling"]]
+        if response["return_code"] in _NOT_CANCELLED:
+            code, text = _NOT_CANCELLED[response["return_code"]]
             raise CallError(code, text)
         if not canceling and id_ != ALL:
-            # rclpy's server says nothing worse of a goal that it refuses to cancel.
+            # rclpy's server has no other answer for a goal that it refuses to cancel.
             raise CallError("rejected", "the action's server does not cancel it")
-        return canceling, response
+        return canceling, cdr
 
     async def _cancel_quietly(self, id_: bytes, why: str) -> None:
+        """Cancel a goal for no caller: how that ends goes to the log."""
         try:
             await asyncio.wait_for(self._cancel(id_), self.route.timeout)
         except CallError as error:
@@ -634,15 +669,17 @@ class BridgedAction:
         else:
             log.info("goal %s of %s is cancelled: %s", id_.hex(), self.ros, why)
 
-    def _cancel_unwanted(self, ids: list[bytes]) -> None:
+    def goals_running(self, ids: list[bytes]) -> None:
+        """Cancel the abandoned goals among those that the status says are running."""
         for id_ in ids:
-            if id_ in self._unwanted:
-                self._unwanted.remove(id_)
+            if id_ in self._abandoned:
+                self._abandoned.remove(id_)
                 why = "it was accepted when nobody waited for it any more"
-                self._routes._tasks.begin(self._cancel_quietly(id_, why))
+                self._tasks.begin(self._cancel_quietly(id_, why))
+        self._update_subscriptions()
 
     def departed(self, session: Session) -> None:
-        """The client has gone."""
+        """Cancel the goals of a client whose connection has ended, where the route says so."""
         if not self.route.cancel_on_disconnect:
             return
         for goal in self._goals.values():
@@ -651,115 +688,34 @@ class BridgedAction:
                 if goal.is_accepted:
                     self._cancel_orphan(goal)
 
-    def _cancel_orphan(self, goal: _Goal) -> None:
-        why = f"{goal.owner} has gone"
-        self._routes._tasks.begin(self._cancel_quietly(goal.id, why))
+    def _cancel_orphan(self, goal: Goal) -> None:
+        self._tasks.begin(self._cancel_quietly(goal.id, f"{goal.owner} has gone"))
+
+    def orphan_cancels(self) -> list[Coroutine[Any, Any, None]]:
+        """What cancels the goals that may not outlive the appliance."""
+        if not self.route.cancel_on_disconnect:
+            return []
+        return [
+            self._cancel_quietly(goal.id, "the appliance stops")
+            for goal in self._goals.values()
+            if goal.is_accepted
+        ]
 
     def stop(self) -> None:
-        """The route was removed. Goals go on, and their results are published."""
+        """Remove what the route has set up. Goals go on, and their results are published."""
         for endpoint in self._endpoints:
             self._dispatcher.unregister(endpoint)
-        self.forget()
-        try:
-            self._routes._node.call_soon(self._close)
-        except BusError:
-            self._is_over = True
+        self.clear_status()
+        with contextlib.suppress(BusError):  # without a bus there are no subscriptions either
+            self._node.call_soon(self.subscriptions.close)
 
-    def forget(self) -> None:
-        """What is shown of the bus is not so any more."""
+    def clear_status(self) -> None:
+        """Clear the retained status, which is true no more."""
         self._dispatcher.publish(Message(f"{self.base}/_status", b"", 0, True))
-
-    # The ROS thread
-
-    def look(self, node: RosNode) -> None:
-        """Subscribe when the type is known; see whether servers have come."""
-        type_name = self.type
-        if self._is_over or type_name is None:
-            return
-        servers = node.count(f"{self.ros}/_action/status")[0]
-        if servers > self._servers and self._subscribed is not None:
-            self._routes._post(self._routes.server_came, self.ros)
-        self._servers = servers
-        is_old = self._has_forgotten and self.is_there
-        if type_name == self._subscribed and not is_old:
-            return
-        self._has_forgotten = False
-        self._close_subscriptions()
-        self._subscribed = type_name
-        latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
-        status, feedback = f"{self.ros}/_action/status", f"{self.ros}/_action/feedback"
-        try:
-            own = node.subscribe_raw(status, STATUS, latched, self._on_status)
-            self._subscriptions.append(own)
-            on_feedback = partial(self._on_feedback, f"{type_name}_Feedback")
-            own = node.subscribe_raw(
-                feedback, f"{type_name}_FeedbackMessage", QosProfile(depth=BURST), on_feedback
-            )
-            self._subscriptions.append(own)
-        except (BusError, UnknownTypeError) as error:
-            self._counters.last_error = str(error)
-            self._routes._post(log.error, "%s has no feedback: %s", self.ros, error)
-
-    def _close(self) -> None:
-        self._is_over = True
-        self._close_subscriptions()
-        self._take_back_status()
-
-    def _take_back_status(self) -> None:
-        """Behind what waits in the mailbox, which would be retained for good."""
-        nothing = Message(f"{self.base}/_status", b"", 0, True)
-        self._routes._mailbox.put(self._status_lane, nothing)
-
-    def _close_subscriptions(self) -> None:
-        for own in self._subscriptions:
-            own.destroy()
-        self._subscriptions.clear()
-
-    def lost(self) -> None:
-        """The bus is gone, and with it the subscriptions."""
-        self._subscriptions.clear()
-        self._subscribed = None
-        self._servers = 0
-        self._take_back_status()
-
-    def _on_status(self, cdr: bytes) -> None:
-        try:
-            payload = goals.statuses(self._converters, cdr, self.route.encoding)
-            late = goals.going_on(self._converters, cdr) if self._unwanted else []
-        except ConversionError as error:
-            self._counters.last_error = str(error)
-            return
-        if any(id_ in self._unwanted for id_ in late):
-            self._routes._post(self._cancel_unwanted, late)
-        self._put(self._status_lane, f"{self.base}/_status", payload, STATUS, retain=True)
-
-    def _on_feedback(self, type_name: str, cdr: bytes) -> None:
-        id_, feedback = goals.split_id(cdr, self._wire)
-        try:
-            payload = from_ros(self._converters, type_name, feedback, self.route.encoding)
-        except (ConversionError, UnknownTypeError) as error:
-            self._counters.last_error = str(error)
-            return
-        lane = self._lanes.pop(id_, None) or Lane(1, self._counted)
-        self._lanes[id_] = lane
-        if len(self._lanes) > LANES:
-            self._lanes.popitem(last=False)
-        topic = f"{self.base}/_feedback/{id_.hex()}"
-        self._put(lane, topic, payload, type_name)
-
-    def _put(
-        self, lane: Lane, topic: str, payload: bytes, type_name: str, *, retain: bool = False
-    ) -> None:
-        properties: Properties = {
-            Property.CONTENT_TYPE: CONTENT_TYPE[self.route.encoding],
-            Property.USER_PROPERTY: [("ros-type", type_name)],
-        }
-        message = Message(topic, payload, int(retain), retain, properties)
-        self._routes._mailbox.put(lane, message)
 
 
 def _owner(caller: Session) -> str:
-    """Whose goals a client's are: its user's, on whichever client; without one, its own."""
+    """The owner of a client's goals: its user, on whichever client; without one, the client."""
     identity = caller.identity
     if identity is None or identity.username is None:
         return f"client {caller.client_id}"

@@ -396,7 +396,7 @@ class CallDispatcher:
         self._broker.flush()
         return code
 
-    def clear(self, base: str, name: str, below: str) -> None:
+    def clear_retained(self, base: str, name: str, below: str) -> None:
         """Take back what was left retained by a run that was killed.
 
         That is what is below `base`, where `name` stands for any ROS name, and there matches the

@@ -36,6 +36,9 @@ class FairCache(Generic[K, V]):
     def __contains__(self, key: K) -> bool:
         return key in self._user_of
 
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._user_of)
+
     def get(self, key: K) -> V | None:
         """The value; None if there is none, or no more."""
         if key not in self._user_of:

@@ -29,7 +29,7 @@ ALL = bytes(16)
 STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
 #: Of these, those of a goal that goes on.
-_GOING_ON = (1, 2)
+_RUNNING = (1, 2)
 
 _WHICH = (
     'say which goal: {"goal_id": "…"}, the 32 hex digits of its id; {"stamp": {"sec": …, '
@@ -101,12 +101,12 @@ def statuses(converters: Converters, cdr: bytes, encoding: EncodingName) -> byte
     return VALUE_ENCODINGS[encoding].dumps(goals)
 
 
-def going_on(converters: Converters, cdr: bytes) -> list[bytes]:
+def running(converters: Converters, cdr: bytes) -> list[bytes]:
     """The ids of the goals that go on, of what a server says. Raises ConversionError."""
     return [
         id_of(one["goal_info"]["goal_id"])
         for one in converters.get(STATUS).to_dict(cdr)["status_list"]
-        if one["status"] in _GOING_ON
+        if one["status"] in _RUNNING
     ]
 
 

@@ -98,7 +98,7 @@ class ParameterTopics(ABC, Generic[GroupT]):
     def start(self) -> None:
         """Nothing is known of the bus yet."""
         for route in self._counters:
-            self._dispatcher.clear(route.mqtt, "{node}", ".+")
+            self._dispatcher.clear_retained(route.mqtt, "{node}", ".+")
 
     def replace(self, routes: Sequence[ParameterSettings]) -> None:
         """Have these routes from now on."""

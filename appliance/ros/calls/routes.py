@@ -167,7 +167,7 @@ class CallBridge:
     def look(self) -> None:
         """Follow what has come and gone on the graph."""
         routes = self._routes
-        looks = [self._services.look, self._actions.look, self._parameters.look]
+        looks = [self._services.look, self._actions.topics.poll_graph, self._parameters.look]
         if routes.services or routes.actions or routes.parameters or self._requests.has_clients:
             looks.insert(0, self._requests.look)
         for look in looks:
@@ -180,5 +180,5 @@ class CallBridge:
         """The bus is gone, and with it all that was set up."""
         self._requests.lost()
         self._services.lost()
-        self._actions.lost()
+        self._actions.topics.on_bus_lost()
         self._parameters.lost()

@@ -225,7 +225,7 @@ async def test_ros_ends_while_goals_are_under_way(harness):
 
 
 async def test_goals_are_bounded_and_so_are_kept_results(harness, monkeypatch):
-    monkeypatch.setattr(module, "RESULTS", 3)
+    monkeypatch.setattr(module, "MAX_RESULTS", 3)
     walks, client = await begin(harness)
     for _ in range(20):
         assert (await client.call(GOAL, {"order": 3}))[0] == "ok"

@@ -196,13 +196,13 @@ async def test_the_goals_of_one_user_leave_room_for_another(harness):
     assert "3 goals of this client" in (await operator.error(GOAL, {"order": 3}))[1]
     await until(lambda: len(slow.results) == 7, "the results are asked for")
     slow.finish()
-    await until(lambda: not harness.bridge.calls._actions.slots._total, "they end")
+    await until(lambda: not harness.bridge.calls._actions.goals.slots._total, "they end")
     assert (await crowd[2].call(GOAL, {"order": 3}))[0] == "ok"
 
 
 async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkeypatch):
     """10,118 short goals of another client made it so that its owner could not cancel it."""
-    monkeypatch.setattr(actions, "ENDED", 50)
+    monkeypatch.setattr(actions, "MAX_ENDED", 50)
     slow = await begin(harness)
     for user in ("operator", "mallory"):
         harness.rules.deny(user, "publish", "r2d2/walk/_cancel_any")
@@ -217,7 +217,7 @@ async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkey
         assert (await mallory.call(GOAL, {"order": 3}))[0] == "ok"
         await until(lambda: slow.results, "its result is asked for")
         slow.finish()
-    table = harness.bridge.calls._actions.ended
+    table = harness.bridge.calls._actions.goals.ended
     await until(lambda: len(table) == 50, "it is full")
     assert (await mallory.error(STOP, {"goal_id": goal}))[0] == "not_authorized"
     assert (await operator.call(STOP, {"goal_id": goal}))[0] == "ok"
@@ -228,7 +228,7 @@ async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkey
 
 
 async def test_the_results_of_one_user_leave_those_of_another(harness, monkeypatch):
-    monkeypatch.setattr(actions, "RESULTS", 4)
+    monkeypatch.setattr(actions, "MAX_RESULTS", 4)
     slow = await begin(harness)
     operator, mallory = harness.client("operator"), harness.client("mallory")
 
@@ -247,14 +247,14 @@ async def test_the_results_of_one_user_leave_those_of_another(harness, monkeypat
 
 
 async def test_kept_results_are_bounded_in_bytes(harness, monkeypatch):
-    monkeypatch.setattr(actions, "RESULT_BYTES", 100)  # of 43 bytes or so each
+    monkeypatch.setattr(actions, "MAX_RESULT_BYTES", 100)  # of 43 bytes or so each
     slow = await begin(harness)
     client = harness.client("alice")
     for _ in range(5):
         await client.call(GOAL, {"order": 3})
         await until(lambda: slow.results, "its result is asked for")
         slow.finish()
-        await until(lambda: not harness.bridge.calls._actions.slots._total, "it has ended")
+        await until(lambda: not harness.bridge.calls._actions.goals.slots._total, "it has ended")
     assert len(list(harness.broker.retained.find("r2d2/walk/_result/+"))) == 2
 
 
