@@ -354,14 +354,8 @@ class Broker:
         session.unchecked = True
         session.resend()
 
-    def attach(
-        self, client_id: str, link: Link, link_for: Callable[[Session], Link] | None = None
-    ) -> Session:
-        """A session inside the appliance, with all rights and kept until `detach`.
-
-        `link_for` gives the link for what a session publishes; retained messages of a new
-        subscription go to `link`.
-        """
+    def attach(self, client_id: str, link: Link) -> Session:
+        """A session inside the appliance, with all rights and kept until `detach`."""
         before = self.sessions.get(client_id)
         if before is not None:
             if before.identity is None:
@@ -371,7 +365,6 @@ class Broker:
             self._end(before)
         session = Session(client_id, None, self.accounting)
         session.link = link
-        session.link_for = link_for
         self.sessions[client_id] = session
         return session
 
@@ -601,6 +594,7 @@ class Broker:
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
         taken = full = False
+        message.publisher = origin
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
@@ -628,6 +622,7 @@ class Broker:
                 else:
                     self._log_receiver_full(asked, message)
                 full = True
+        message.publisher = None
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
         # Who has no room misses it, which is logged: a publisher that was told would send it to

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
@@ -17,6 +17,9 @@ from appliance.mqtt.codec import (
     encode_varint,
     text_size,
 )
+
+if TYPE_CHECKING:
+    from appliance.broker.session import Session
 
 #: What a queued message takes beside its bytes, roughly: the objects around it, in bytes.
 OVERHEAD = 512
@@ -42,12 +45,16 @@ class Message:
     is in seconds of the broker's clock (`Broker.now`), None when the message does not expire.
     `properties_wire` are the properties that all receivers get, as they stand in an MQTT 5 packet
     between packet id and payload: a message keeps no other form of them.
+
+    `publisher` is the session that publishes it, while it is delivered: links inside the appliance
+    read it. It is None before and after, as a message may outlive the session by days.
     """
 
     __slots__ = (
         "expires_at",
         "payload",
         "properties_wire",
+        "publisher",
         "qos",
         "retain",
         "size",
@@ -73,6 +80,7 @@ class Message:
         self.qos = qos
         self.retain = retain
         self.expires_at = expires_at
+        self.publisher: Session | None = None
         self.topic_wire = topic_wire or encode_string(topic)
         self.properties_wire = _passed_on(properties) if properties else properties_wire
         #: One encoded header (QoS 0: the whole packet), and the version and first byte that it is

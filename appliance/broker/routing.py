@@ -240,7 +240,7 @@ class Router:
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
                 continue
             known = merged.get(session.client_id)
-            receiver, qos, as_published, ids = known or (session.hearing(origin), 0, False, None)
+            receiver, qos, as_published, ids = known or (session, 0, False, None)
             if subscription.identifier:  # [MQTT-3.3.4-4]
                 ids = [*(ids or []), subscription.identifier]
             merged[session.client_id] = (

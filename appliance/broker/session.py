@@ -120,7 +120,6 @@ class Session:
         "large",
         "latest",
         "link",
-        "link_for",
         "queue",
         "readable",
         "readable_epoch",
@@ -143,8 +142,6 @@ class Session:
         #: Of its user, whose memory it takes.
         self.account = accounting.accounts.of(identity)
         self.link: Link | None = None
-        #: For a session inside the appliance that wants to know who published what it receives.
-        self.link_for: Callable[[Session], Link] | None = None
         self.expiry = 0
         #: When its connection began, in seconds of the broker's clock.
         self.connected_at = accounting.now
@@ -205,14 +202,6 @@ class Session:
         return self.expiry > 0
 
     # --- towards the client -------------------------------------------------------------------
-
-    def hearing(self, origin: Session) -> Session:
-        """Itself, as it receives what `origin` publishes."""
-        if self.link_for is None:
-            return self
-        session = Session(self.client_id, None, self.accounting)
-        session.link = self.link_for(origin)
-        return session
 
     @property
     def ready(self) -> bool:

@@ -51,7 +51,7 @@ from appliance.ros.topics.flow import (
     Flow,
     TopicSettings,
 )
-from appliance.ros.topics.lease import Leases
+from appliance.ros.topics.lease import BRIDGE_CLIENT_ID, Leases
 from appliance.ros.topics.staleness import StalenessDetector
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
@@ -60,7 +60,6 @@ __all__ = ["Bridge", "BridgedTopic", "BusState", "RouteStatus", "TopicSettings",
 
 log = logging.getLogger(__name__)
 
-CLIENT_ID = "_bridge"
 
 #: Messages that the loop's thread publishes before it lets others have their turn.
 BATCH = 64
@@ -295,11 +294,7 @@ class Bridge:
 
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
-        self._session = self._broker.attach(
-            CLIENT_ID,
-            _Link(self._receive, None),
-            lambda origin: _Link(self._receive, origin),
-        )
+        self._session = self._broker.attach(BRIDGE_CLIENT_ID, _Link(self._receive))
         self._subscribe()
         self._broker.departures.append(self._around.arrivals.departed)
         self.calls.start()
@@ -741,13 +736,10 @@ class Bridge:
 
 
 class _Link(InsideLink):
-    """The bridge as the link of its session, for what one client publishes."""
+    """The link of the bridge's session."""
 
-    def __init__(
-        self, receive: Callable[[Message, bool, Session | None], None], origin: Session | None
-    ) -> None:
+    def __init__(self, receive: Callable[[Message, bool, Session | None], None]) -> None:
         self._receive = receive
-        self._origin = origin
 
     def publish(
         self,
@@ -759,4 +751,4 @@ class _Link(InsideLink):
         subscription_ids: list[int] | None,
     ) -> None:
         """A message for ROS."""
-        self._receive(message, retain, self._origin)
+        self._receive(message, retain, message.publisher)

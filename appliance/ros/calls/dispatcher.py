@@ -247,12 +247,11 @@ class CallEndpoint:
 MessageHandler: TypeAlias = Callable[[Session, Message], None]
 
 
-class Ear(InsideLink):
-    """The link for what one session publishes."""
+class _Link(InsideLink):
+    """The link of the dispatcher's session: calls, and what `listen` subscribed to."""
 
-    def __init__(self, switchboard: CallDispatcher, origin: Session | None) -> None:
-        self._switchboard = switchboard
-        self._origin = origin
+    def __init__(self, receive: Callable[[Session, Message, int], None]) -> None:
+        self._receive = receive
 
     def publish(
         self,
@@ -264,8 +263,8 @@ class Ear(InsideLink):
         subscription_ids: list[int] | None,
     ) -> None:
         """A message to one of the topics that were asked for."""
-        if self._origin is not None and subscription_ids:
-            self._switchboard.receive(self._origin, message, subscription_ids[0])
+        if message.publisher is not None and subscription_ids:
+            self._receive(message.publisher, message, subscription_ids[0])
 
 
 class CallDispatcher:
@@ -293,9 +292,7 @@ class CallDispatcher:
 
     def start(self) -> None:
         """Let calls come in."""
-        self._session = self._broker.attach(
-            CLIENT_ID, Ear(self, None), lambda origin: Ear(self, origin)
-        )
+        self._session = self._broker.attach(CLIENT_ID, _Link(self.receive))
         self._broker.departures.append(self._replay_guard.departed)
         for topic_filter in self._identifiers:
             self._subscribe(topic_filter)

@@ -12,6 +12,9 @@ from weakref import WeakValueDictionary
 from appliance.broker.ports import Decision
 from appliance.broker.session import Session
 
+#: The client id of the bridge's own session, which has no identity.
+BRIDGE_CLIENT_ID = "_bridge"
+
 _FREE = Decision(True, "nobody commands it")
 
 #: Why a command is not carried out that waited for something when a stop came.
@@ -133,8 +136,9 @@ class Lease:
     def decide(self, session: Session) -> Decision:
         """Whether the session may command now."""
         holder = self.holder
-        # What the bridge itself publishes there is what it heard on ROS.
-        if holder is None or session is holder or session.link_for is not None:
+        # What the bridge itself publishes there has come from ROS.
+        is_bridge = session.identity is None and session.client_id == BRIDGE_CLIENT_ID
+        if holder is None or session is holder or is_bridge:
             return _FREE
         return Decision(False, f"{holder} commands {self.topic}, and the route is exclusive")
 
