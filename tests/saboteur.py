@@ -41,7 +41,7 @@ NAMED = {
     "later",
     "reader",
     "run",
-    "shield",
+    "contained_proxy",
     "signal",
     "soon",
     "task",
@@ -75,14 +75,14 @@ INLINE = {
     "connection.chunk": ("broker.client", "Client", "receive", "data_received"),
     "connection.last_chunk": ("broker.client", "Client", "receive", "connection_lost"),
     "connection.last_turn": ("broker.client", "Client", "send_on", "_leave"),
-    "connection.login": ("wire", "ClientProtocol", "_read_on", "_log_in"),
+    "connection.login": ("wire", "ClientProtocol", "_resume_input", "_log_in"),
     "connection.turn": ("wire", "ClientProtocol", "take_turn", "_run_turns"),
     "control.command": ("app", "App", "_answer_status", ""),
     "control.connection": ("control", "Control", "_answer", "_serve"),
     "flush": ("broker.output", "Output", "flush", "broker/broker.py:flush"),
     "flush.wait": ("broker.output", "Output", "wait", "_hold_back"),
     "listener.admit": ("listeners", "Listeners", "admit", "_accept"),
-    "listener.open": ("listeners", "_Door", "open", "_open_doors"),
+    "listener.open": ("listeners", "_ListeningSocket", "open", "_open_sockets"),
     "session.replay": ("broker.retained", "Retained", "find_in_steps", "_find_retained"),
     "session.send": ("broker.output", "Output", "publish", "_send"),
     "tls.chunk": ("tls", "TlsTransport", "_take", "data_received"),
@@ -182,8 +182,12 @@ class Saboteur:
             caught(own, entry, error, served)
 
         monkeypatch.setattr(Faults, "caught", noted)
-        run, task, repeat = entries.Entries.run, entries.Entries.task, entries.Repeated.__init__
-        once, shield = Faults.run, entries._Shield.__init__
+        run, task, repeat = (
+            entries.Entries.run,
+            entries.Entries.task,
+            entries.PeriodicCallback.__init__,
+        )
+        once, shield = Faults.run, entries._ContainedProxy.__init__
         struck = self._struck
 
         def entered(own, entry, served, failed, callback, args):
@@ -216,8 +220,8 @@ class Saboteur:
         monkeypatch.setattr(FaultContainment, "_contained", of_the_node)
         monkeypatch.setattr(entries.Entries, "run", entered)
         monkeypatch.setattr(entries.Entries, "task", begun)
-        monkeypatch.setattr(entries.Repeated, "__init__", repeated)
-        monkeypatch.setattr(entries._Shield, "__init__", shielded)
+        monkeypatch.setattr(entries.PeriodicCallback, "__init__", repeated)
+        monkeypatch.setattr(entries._ContainedProxy, "__init__", shielded)
         monkeypatch.setattr(Faults, "run", ran)
         for name in ("wire", "tls", "websocket"):
             module = importlib.import_module(f"appliance.{name}")

@@ -26,7 +26,7 @@ import pytest
 import uvloop
 import yaml
 from amqtt.plugins.base import BasePlugin
-from house import Caller, House, check_network, make_contexts
+from harness import Harness, Peer, check_scheduler, make_contexts
 from saboteur import INLINE, SabotageError, Saboteur, all_entries
 from waiting import PATIENCE, until
 
@@ -51,7 +51,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.net import connection as wire
-from appliance.net import lingering as farewell
+from appliance.net import lingering as lingering
 from appliance.net import listeners, tls
 from appliance.ops.control import ControlError, ask
 from appliance.ops.crash import CrashReports
@@ -101,27 +101,27 @@ class Actor:
         # comes with the result or the error of what it waits for.
         while not self.site.is_over:
             try:
-                caller = await self.site.join(self.name, self.kind, keep_alive=self.keep_alive)
+                peer = await self.site.log_in(self.name, self.kind, keep_alive=self.keep_alive)
                 try:
-                    await asyncio.wait_for(self.begin(caller), STEP)
+                    await asyncio.wait_for(self.begin(peer), STEP)
                     while not self.site.is_over:
-                        await asyncio.wait_for(self.step(caller), STEP)
+                        await asyncio.wait_for(self.step(peer), STEP)
                         self.done += 1
                 finally:
-                    caller.hang_up()
+                    peer.hang_up()
             except (OSError, EOFError, AssertionError, asyncio.TimeoutError):
                 self.losses += 1
                 await asyncio.sleep(0.02)
 
-    async def begin(self, caller: Caller) -> None:
+    async def begin(self, peer: Peer) -> None:
         """Once a connection."""
 
-    async def step(self, caller: Caller) -> None:
+    async def step(self, peer: Peer) -> None:
         """What it does."""
 
-    async def wait_for(self, caller: Caller, kind: type[Packet]) -> Any:
+    async def wait_for(self, peer: Peer, kind: type[Packet]) -> Any:
         while True:
-            packet = await caller.hear()
+            packet = await peer.receive()
             assert not isinstance(packet, Disconnect), packet
             if isinstance(packet, kind):
                 return packet
@@ -133,14 +133,14 @@ class Pinger(Actor):
     payload = b"x"
     pause = 0.01
 
-    async def begin(self, caller: Caller) -> None:
-        await caller.say(Subscribe(1, [Subscription(f"load/{self.name}", 1)]))
-        await self.wait_for(caller, Suback)
+    async def begin(self, peer: Peer) -> None:
+        await peer.send(Subscribe(1, [Subscription(f"load/{self.name}", 1)]))
+        await self.wait_for(peer, Suback)
 
-    async def step(self, caller: Caller) -> None:
-        await caller.say(Publish(f"load/{self.name}", self.payload, 1, packet_id=7))
-        back = await self.wait_for(caller, Publish)
-        await caller.say(Puback(back.packet_id, 0))
+    async def step(self, peer: Peer) -> None:
+        await peer.send(Publish(f"load/{self.name}", self.payload, 1, packet_id=7))
+        back = await self.wait_for(peer, Publish)
+        await peer.send(Puback(back.packet_id, 0))
         await asyncio.sleep(self.pause)
 
 
@@ -154,37 +154,37 @@ class Large(Pinger):
 class Subscriber(Actor):
     """Hundreds of filters in one packet, with a session that is stored."""
 
-    async def step(self, caller: Caller) -> None:
+    async def step(self, peer: Peer) -> None:
         names = [f"load/{self.name}/{n}" for n in range(300)]
-        await caller.say(Subscribe(1, [Subscription(name, 1) for name in names]))
-        assert len((await self.wait_for(caller, Suback)).reason_codes) == 300
-        await caller.say(Unsubscribe(2, names))
-        await self.wait_for(caller, Unsuback)
+        await peer.send(Subscribe(1, [Subscription(name, 1) for name in names]))
+        assert len((await self.wait_for(peer, Suback)).reason_codes) == 300
+        await peer.send(Unsubscribe(2, names))
+        await self.wait_for(peer, Unsuback)
         await asyncio.sleep(0.1)
 
 
 class Willing(Actor):
     """A client whose connection is cut, and its will."""
 
-    async def begin(self, caller: Caller) -> None:
-        await caller.say(Subscribe(1, [Subscription(f"will/{self.name}", 1)]))
-        await self.wait_for(caller, Suback)
+    async def begin(self, peer: Peer) -> None:
+        await peer.send(Subscribe(1, [Subscription(f"will/{self.name}", 1)]))
+        await self.wait_for(peer, Suback)
 
-    async def step(self, caller: Caller) -> None:
+    async def step(self, peer: Peer) -> None:
         will = Will(f"will/{self.name}", b"w", 1)
-        leaving = await self.site.join(f"{self.name}-leaving", self.kind, will=will)
+        leaving = await self.site.log_in(f"{self.name}-leaving", self.kind, will=will)
         leaving.hang_up()
-        back = await self.wait_for(caller, Publish)
-        await caller.say(Puback(back.packet_id, 0))
+        back = await self.wait_for(peer, Publish)
+        await peer.send(Puback(back.packet_id, 0))
         await asyncio.sleep(0.05)
 
 
 class Silent(Actor):
     """It says nothing, and is disconnected for that."""
 
-    async def step(self, caller: Caller) -> None:
-        silent = await self.site.join(f"{self.name}-silent", self.kind, keep_alive=1)
-        while not isinstance(packet := await silent.hear(), Disconnect):
+    async def step(self, peer: Peer) -> None:
+        silent = await self.site.log_in(f"{self.name}-silent", self.kind, keep_alive=1)
+        while not isinstance(packet := await silent.receive(), Disconnect):
             pass
         assert packet.reason_code == ReasonCode.KEEP_ALIVE_TIMEOUT
         await asyncio.sleep(0.4)  # longer than the farewell
@@ -194,26 +194,26 @@ class Silent(Actor):
 class Sys(Actor):
     """`$SYS` goes on."""
 
-    async def begin(self, caller: Caller) -> None:
-        await caller.say(Subscribe(1, [Subscription("$SYS/broker/bytes/received", 0)]))
+    async def begin(self, peer: Peer) -> None:
+        await peer.send(Subscribe(1, [Subscription("$SYS/broker/bytes/received", 0)]))
 
-    async def step(self, caller: Caller) -> None:
-        await self.wait_for(caller, Publish)
+    async def step(self, peer: Peer) -> None:
+        await self.wait_for(peer, Publish)
 
 
 class Keeper(Actor):
     """A session that expires, and a retained message that does; both are stored."""
 
-    async def step(self, caller: Caller) -> None:
+    async def step(self, peer: Peer) -> None:
         lasting = {Property.SESSION_EXPIRY_INTERVAL: 1}
-        other = await self.site.join(f"{self.name}-{self.done % 3}", properties=lasting)
-        await other.say(Subscribe(1, [Subscription(f"kept/{self.name}", 1)]))
+        other = await self.site.log_in(f"{self.name}-{self.done % 3}", properties=lasting)
+        await other.send(Subscribe(1, [Subscription(f"kept/{self.name}", 1)]))
         await self.wait_for(other, Suback)
         soon = {Property.MESSAGE_EXPIRY_INTERVAL: 1}
-        await caller.say(
+        await peer.send(
             Publish(f"kept/{self.name}/{self.done}", b"k", 1, True, False, 9, properties=soon)
         )
-        await self.wait_for(caller, Puback)
+        await self.wait_for(peer, Puback)
         other.hang_up()
         await asyncio.sleep(0.3)
 
@@ -225,7 +225,7 @@ class Site:
         self.directory = directory
         self.server, self.client = make_contexts(directory / "certs")
         self.actors: list[Actor] = []
-        self.hands: list[Caller] = []
+        self.hands: list[Peer] = []
         self.victims = 0
         self.readers: list[asyncio.Task[None]] = []
         self.is_over = False
@@ -246,7 +246,7 @@ class Site:
         self.stack.push_async_callback(self.app.stop)
         self.broker = self.app.broker
         self.faults = self.broker.faults
-        self.network = self.app._listeners.network
+        self.scheduler = self.app._listeners.scheduler
         self.app._entries.signal("signal.reload", signal.SIGHUP, self.app._on_hangup)
         self.stack.callback(loop.remove_signal_handler, signal.SIGHUP)
         notify = self.stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -310,19 +310,19 @@ class Site:
         self.node.add_service("/srv/slow", TRIGGER, lambda request, respond: None)
         self.node.add_service("/srv/quick", TRIGGER, lambda request, respond: respond(DONE))
 
-    async def join(self, name: str, kind: str = "plain", **options: Any) -> Caller:
+    async def log_in(self, name: str, kind: str = "plain", **options: Any) -> Peer:
         """A client that has logged in."""
-        caller = await self.dial(kind)
+        peer = await self.dial(kind)
         try:
-            await caller.say(Connect(name, **options))
-            connack = await asyncio.wait_for(caller.hear(), STEP)
+            await peer.send(Connect(name, **options))
+            connack = await asyncio.wait_for(peer.receive(), STEP)
             assert isinstance(connack, Connack) and not connack.reason_code, connack
         except BaseException:
-            caller.hang_up()
+            peer.hang_up()
             raise
-        return caller
+        return peer
 
-    async def dial(self, kind: str = "plain", receive_buffer: int = 0) -> Caller:
+    async def dial(self, kind: str = "plain", receive_buffer: int = 0) -> Peer:
         host, port = self.app.addresses[("plain", "tls", "websocket").index(kind)]
         secure = {"ssl": self.client, "server_hostname": "localhost"} if kind == "tls" else {}
         if receive_buffer:
@@ -343,51 +343,51 @@ class Site:
                 sock.detach()  # it is uvloop's alone, for the same reason
         if kind == "websocket":
             return await Framed.upgrade(reader, writer)
-        return Caller(reader, writer)
+        return Peer(reader, writer)
 
     def protocol(self, name: str) -> Any:
         """The server's end of the client's connection: not of one that it took over, and that is
         still closing."""
-        for protocol in self.network.open:
+        for protocol in self.scheduler.connections:
             client = protocol._client
             session = client.session
             if session is not None and session.client_id == name and session.link is client.output:
                 return protocol
         raise AssertionError(f"{name} is not connected")
 
-    async def victim(self, kind: str = "plain", receive_buffer: int = 0) -> tuple[Caller, Any]:
+    async def victim(self, kind: str = "plain", receive_buffer: int = 0) -> tuple[Peer, Any]:
         """A client that nothing but the test wants anything of; each time another one."""
         self.victims += 1
         name = f"victim-{self.victims}"
-        caller = await self.dial(kind, receive_buffer)
-        self.hands.append(caller)
-        await caller.say(Connect(name))
-        answer = await asyncio.wait_for(caller.hear(), STEP)
+        peer = await self.dial(kind, receive_buffer)
+        self.hands.append(peer)
+        await peer.send(Connect(name))
+        answer = await asyncio.wait_for(peer.receive(), STEP)
         assert isinstance(answer, Connack) and not answer.reason_code, answer
-        return caller, self.protocol(name)
+        return peer, self.protocol(name)
 
-    def drain(self, caller: Caller) -> None:
+    def drain(self, peer: Peer) -> None:
         """Let the client read on."""
 
         async def read() -> None:
             with contextlib.suppress(OSError, EOFError, asyncio.TimeoutError):
-                await caller.hear_the_end()
+                await peer.receive_rest()
 
         self.readers.append(asyncio.get_running_loop().create_task(read()))
 
-    async def slow(self, kind: str = "plain") -> tuple[Caller, Any]:
+    async def slow(self, kind: str = "plain") -> tuple[Peer, Any]:
         """One that has much to read, and does not."""
-        caller, protocol = await self.victim(kind, receive_buffer=4096)
-        caller.writer.transport.pause_reading()
-        await caller.say(Subscribe(1, [Subscription("flood", 0)]))
+        peer, protocol = await self.victim(kind, receive_buffer=4096)
+        peer.writer.transport.pause_reading()
+        await peer.send(Subscribe(1, [Subscription("flood", 0)]))
         await until(lambda: protocol._client.session.subscriptions, "the victim's subscription")
         for _ in range(200):  # of no more than 32 KiB: larger ones would wait in the session
             self.app._publish("flood", bytes(30_000))
             await asyncio.sleep(0)
-        return caller, protocol
+        return peer, protocol
 
 
-class Framed(Caller):
+class Framed(Peer):
     """A client whose packets go in WebSocket frames."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -434,7 +434,7 @@ class Framed(Caller):
             head = b"\x82\xff" + struct.pack(">Q", size)
         return head + bytes(4) + data
 
-    async def say(self, *packets: Packet | bytes) -> None:
+    async def send(self, *packets: Packet | bytes) -> None:
         for packet in packets:
             data = packet if isinstance(packet, bytes) else packet.encode(5)
             self.writer.write(self.frame(data))
@@ -474,7 +474,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         (app_module, "BESIDE_AGAIN", 0.05),
         (wire, "SLOW_AFTER", 0.05),
         (wire, "REVOKED_TIMEOUT", 0.05),
-        (farewell, "TIMEOUT", 0.2),
+        (lingering, "TIMEOUT", 0.2),
         (listeners, "ACCEPT_PAUSE", 0.05),
         (listeners, "HANDSHAKE_STALL", 0.05),
         (sqlite, "LINGER", 0.05),
@@ -515,39 +515,39 @@ def reach(*names: str) -> Callable[[Reach], Reach]:
 
 
 @reach("connection.slow", "connection.pause", "connection.resume")
-async def _slow(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, protocol = await site.slow()
-    await until(lambda: protocol._slow is not None or protocol._closing, "a slow client")
+async def _slow_timer(site: Site, patch: pytest.MonkeyPatch) -> None:
+    peer, protocol = await site.slow()
+    await until(lambda: protocol._slow_timer is not None or protocol._closing, "a slow client")
     await asyncio.sleep(0.1)
-    caller.writer.transport.resume_reading()
-    site.drain(caller)
+    peer.writer.transport.resume_reading()
+    site.drain(peer)
 
 
 @reach("tls.pause", "tls.resume")
 async def _slow_tls(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, _ = await site.slow("tls")
-    caller.writer.transport.resume_reading()
-    site.drain(caller)
+    peer, _ = await site.slow("tls")
+    peer.writer.transport.resume_reading()
+    site.drain(peer)
 
 
 @reach("websocket.pause", "websocket.resume")
 async def _slow_websocket(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, protocol = await site.victim("websocket", receive_buffer=4096)
-    await caller.say(Subscribe(1, [Subscription("flood", 0)]))
+    peer, protocol = await site.victim("websocket", receive_buffer=4096)
+    await peer.send(Subscribe(1, [Subscription("flood", 0)]))
     await until(lambda: protocol._client.session.subscriptions, "the victim's subscription")
-    caller._task.cancel()
+    peer._task.cancel()
     for _ in range(200):
         site.app._publish("flood", bytes(30_000))
         await asyncio.sleep(0)
     await asyncio.sleep(0.1)
-    caller._task = asyncio.ensure_future(caller._unpack())
+    peer._task = asyncio.ensure_future(peer._unpack())
 
 
 @reach("websocket.eof", "websocket.lost", "tls.eof", "connection.eof")
 async def _leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
     for kind in ("plain", "tls", "websocket"):
-        caller = await site.join(f"leaves-{kind}", kind)
-        caller.writer.close()
+        peer = await site.log_in(f"leaves-{kind}", kind)
+        peer.writer.close()
 
 
 @reach("tls.react")
@@ -561,9 +561,9 @@ async def _says_much_and_leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("connection.last_turn")
 async def _asks_much_and_leaves(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, protocol = await site.victim()
-    protocol._sends_on = True  # as when it has more to do than there was time for
-    caller.hang_up()
+    peer, protocol = await site.victim()
+    protocol._has_more = True  # as when it has more to do than there was time for
+    peer.hang_up()
 
 
 @reach("connection.cut")
@@ -586,7 +586,7 @@ async def _revoked(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim("tls")
     certificates = SimpleNamespace(refusal=lambda tls: "revoked", username=lambda tls: None)
     with pytest.MonkeyPatch.context() as checked:
-        checked.setattr(site.network, "certificates", certificates)
+        checked.setattr(site.scheduler, "certificates", certificates)
         protocol.check_certificate()
 
 
@@ -598,7 +598,7 @@ async def _checked(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("connection.login_timeout")
 async def _no_connect(site: Site, patch: pytest.MonkeyPatch) -> None:
     with pytest.MonkeyPatch.context() as hurried:
-        hurried.setattr(site.network, "connect_timeout", 0.05)
+        hurried.setattr(site.scheduler, "connect_timeout", 0.05)
         site.hands.append(await site.dial())
         await asyncio.sleep(0.1)
 
@@ -628,7 +628,7 @@ async def _cannot_be_aborted(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("commit.abandon", "commit.go_on", "commit.resume")
 async def _store_fails(site: Site, patch: pytest.MonkeyPatch) -> None:
     store: Any = site.broker.store
-    caller, _ = await site.victim()
+    peer, _ = await site.victim()
     with pytest.MonkeyPatch.context() as broken:
 
         def write(batch: object) -> None:
@@ -638,10 +638,10 @@ async def _store_fails(site: Site, patch: pytest.MonkeyPatch) -> None:
         lasting = {Property.SESSION_EXPIRY_INTERVAL: 60}
         other = await site.dial()
         site.hands.append(other)
-        await other.say(Connect("stored", properties=lasting))
+        await other.send(Connect("stored", properties=lasting))
         await until(lambda: store.failing, "the store to fail")
     await until(lambda: not store.failing, "the store to go on")
-    del caller
+    del peer
 
 
 @reach("flush.overflow")
@@ -657,17 +657,17 @@ async def _guarded(site: Site, patch: pytest.MonkeyPatch) -> None:
     with pytest.MonkeyPatch.context() as guarded:
         guarded.setitem(site.broker.guards, "guarded", [guard])
         site.broker.guards_changed()
-        caller, _ = await site.victim()
-        await caller.say(Publish("guarded", b"x", 1, packet_id=3))
-        assert (await caller.hear()).reason_code == ReasonCode.NOT_AUTHORIZED
+        peer, _ = await site.victim()
+        await peer.send(Publish("guarded", b"x", 1, packet_id=3))
+        assert (await peer.receive()).reason_code == ReasonCode.NOT_AUTHORIZED
     site.broker.guards_changed()
 
 
 @reach("session.replay")
 async def _retained(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.app._publish("r/x", b"x", True)
-    caller, _ = await site.victim()
-    await caller.say(Subscribe(1, [Subscription("r/#", 1)]))
+    peer, _ = await site.victim()
+    await peer.send(Subscribe(1, [Subscription("r/#", 1)]))
 
 
 @reach("listener.stall", "listener.open")
@@ -676,7 +676,7 @@ async def _stalls(site: Site, patch: pytest.MonkeyPatch) -> None:
     host, port = site.app.addresses[1]
     for _ in range(2):  # they never shake hands
         reader, writer = await asyncio.open_connection(host, port)
-        site.hands.append(Caller(reader, writer))
+        site.hands.append(Peer(reader, writer))
 
 
 @reach("app.beside", "app.task")
@@ -798,8 +798,8 @@ async def _drives(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("commands.wait")
 async def _first_command(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, _ = await site.victim()
-    await caller.say(Publish("r2d2/cmd_vel", b'{"linear": {"x": 1.0}}', 1, packet_id=3))
+    peer, _ = await site.victim()
+    await peer.send(Publish("r2d2/cmd_vel", b'{"linear": {"x": 1.0}}', 1, packet_id=3))
 
 
 @reach("turns.work", "turns.pause", "turns.next")
@@ -820,9 +820,9 @@ async def _asks_plugins(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("calls.take", "calls.call", "calls.end", "calls.timeout", "calls.answer", "calls.handle")
 async def _call(site: Site, patch: pytest.MonkeyPatch) -> None:
-    caller, _ = await site.victim()
+    peer, _ = await site.victim()
     for packet_id, name in enumerate(("slow", "quick"), 3):
-        await caller.say(Publish(f"r2d2/srv/{name}/_call/1", b"{}", 1, packet_id=packet_id))
+        await peer.send(Publish(f"r2d2/srv/{name}/_call/1", b"{}", 1, packet_id=packet_id))
 
 
 @reach("calls.follow", "parameters.read", "parameters.end")
@@ -840,9 +840,9 @@ async def _ros_asks(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.node.ask("/given", b"\0\1\0\0\0", lambda response: None)
 
 
-@reach("network.round")
+@reach("scheduler.round")
 async def _busy(site: Site, patch: pytest.MonkeyPatch) -> None:
-    site.network.is_busy()
+    site.scheduler.is_busy()
 
 
 #: Those that no load of MQTT reaches, and the tests that let them fail.
@@ -904,8 +904,8 @@ async def _one(site: Site, saboteur: Saboteur, name: str) -> None:
         await _strike(site, saboteur, name, behind=behind, where=where)
         others, saboteur.others = saboteur.others, []
         assert not others, f"faults that nobody injected, {where}:\n" + "\n".join(others)
-    for caller in site.hands:
-        caller.hang_up()
+    for peer in site.hands:
+        peer.hang_up()
     site.hands.clear()
     await _all_go_on(site, f"after the faults in {name}")
     await _all_right(site, f"after the faults in {name}")
@@ -953,12 +953,12 @@ async def _all_right(site: Site, when: str) -> None:
 
 def _wrong(site: Site) -> str:
     """What is left of who is gone, or is counted for nobody; empty when all is right."""
-    broker, network = site.broker, site.network
+    broker, scheduler = site.broker, site.scheduler
     try:
-        check_network(network)
+        check_scheduler(scheduler)
     except AssertionError as error:
         return f"accounts: {error}"
-    there = {protocol._client for protocol in network.open}
+    there = {protocol._client for protocol in scheduler.connections}
     if not broker.clients <= there:
         return f"no connections any more: {[*map(str, broker.clients - there)]}"
     outputs = {client.output for client in there}
@@ -967,11 +967,11 @@ def _wrong(site: Site) -> str:
         return f"not connected any more: {left}"
     neighbours = site.app._listeners._addresses._known.values()
     guests = {guest for each in neighbours for guest in each.guests}
-    if not guests <= network.open:
-        return f"guests that are gone: {[*map(str, guests - network.open)]}"
+    if not guests <= scheduler.connections:
+        return f"guests that are gone: {[*map(str, guests - scheduler.connections)]}"
     strangers = broker.accounting.accounts.strangers
     admitted = sum(sum(each.clients.values()) for each in neighbours)
-    logged_in = sum(protocol.account is not strangers for protocol in network.open)
+    logged_in = sum(protocol.account is not strangers for protocol in scheduler.connections)
     if admitted != logged_in:
         return f"{admitted} connections are counted that have logged in, and there are {logged_in}"
     return ""
@@ -1019,12 +1019,12 @@ def test_who_could_not_be_let_in_is_cut_off(
     """What follows a fault at the beginning of a connection comes to nothing, not to a fault."""
 
     async def dial() -> None:
-        house = House(*make_contexts(tmp_path))
-        await house.start()
-        faults = house.broker.faults
+        harness = Harness(*make_contexts(tmp_path))
+        await harness.start()
+        faults = harness.broker.faults
         saboteur.arm(entry)
-        host, port = house.ports[("plain", "tls", "websocket").index(kind)]
-        secure = {"ssl": house.client_context, "server_hostname": "localhost"}
+        host, port = harness.ports[("plain", "tls", "websocket").index(kind)]
+        secure = {"ssl": harness.client_context, "server_hostname": "localhost"}
         with contextlib.suppress(OSError, EOFError):
             opened = asyncio.open_connection(host, port, **(secure if kind == "tls" else {}))
             reader, writer = await asyncio.wait_for(opened, PATIENCE)
@@ -1033,8 +1033,8 @@ def test_who_could_not_be_let_in_is_cut_off(
                 await asyncio.wait_for(writer.drain(), PATIENCE)
             assert not await asyncio.wait_for(reader.read(1), PATIENCE)
         await until(lambda: faults.count, f"a fault in {entry}")
-        await until(lambda: not house.network.open, "the end of the connection")
-        await house.close()
+        await until(lambda: not harness.scheduler.connections, "the end of the connection")
+        await harness.close()
         assert faults.by_entry == {entry: 1}
         assert not saboteur.others, saboteur.others
 
@@ -1047,19 +1047,19 @@ async def test_who_a_fault_arose_with_is_told_at_once(
     tmp_path: Path, escaped: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When nobody else says anything either, and so nothing else is written out."""
-    house = House(*make_contexts(tmp_path))
-    await house.start()
+    harness = Harness(*make_contexts(tmp_path))
+    await harness.start()
     saboteur = Saboteur(monkeypatch)
     for behind in ("", "connection.chunk"):
-        caller = await house.join("a")
+        peer = await harness.log_in("a")
         saboteur.arm(*([] if behind else ["connection.chunk"]), behind=behind)
-        await caller.say(Publish("x", b"x", 1, packet_id=1))
-        while not isinstance(told := await caller.hear(), Disconnect):
+        await peer.send(Publish("x", b"x", 1, packet_id=1))
+        while not isinstance(told := await peer.receive(), Disconnect):
             pass
         assert told.reason_code == ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
-        assert not await caller.hear_the_end()
+        assert not await peer.receive_rest()
     monkeypatch.undo()
-    await house.close()
+    await harness.close()
     escaped.clear()
 
 
@@ -1070,7 +1070,7 @@ def test_a_round_of_turns_that_fails_is_followed_by_one(tmp_path: Path, escaped:
         faulty = False
 
         def take_turn(self) -> None:
-            network.queue_turn(self)
+            scheduler.queue_turn(self)
             if self.faulty:
                 self.faulty = False
                 raise SabotageError
@@ -1079,21 +1079,21 @@ def test_a_round_of_turns_that_fails_is_followed_by_one(tmp_path: Path, escaped:
             raise error  # that is not to be, and no more than this is to come of it
 
     async def run() -> None:
-        nonlocal network
-        house = House(*make_contexts(tmp_path))
-        network = house.network
-        scheduled = network.entries.soon
+        nonlocal scheduler
+        harness = Harness(*make_contexts(tmp_path))
+        scheduler = harness.scheduler
+        scheduled = scheduler.entries.soon
         rounds = []
 
         def soon(entry: str, *args: Any, **more: Any) -> asyncio.Handle:
             handle = scheduled(entry, *args, **more)
-            rounds.extend([handle] if entry == "network.turns" else [])
+            rounds.extend([handle] if entry == "scheduler.turns" else [])
             return handle
 
-        network.entries.soon = soon  # type: ignore[method-assign]
+        scheduler.entries.soon = soon  # type: ignore[method-assign]
         members = [Busy() for _ in range(3)]
         for member in members:
-            network.queue_turn(member)
+            scheduler.queue_turn(member)
         for _ in range(5):
             members[1].faulty = True
             await until(lambda: not members[1].faulty, "a fault")
@@ -1102,9 +1102,9 @@ def test_a_round_of_turns_that_fails_is_followed_by_one(tmp_path: Path, escaped:
             for _ in range(10):
                 await asyncio.sleep(0)
             assert len(rounds) - begun == 10
-        await house.close()
+        await harness.close()
 
-    network: Any = None
+    scheduler: Any = None
     asyncio.run(run())
     assert len(escaped) > 0
     escaped.clear()

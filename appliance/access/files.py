@@ -19,7 +19,7 @@ from appliance.access.problems import AccessFileError, Problem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
 from appliance.access.throttle import LoginThrottle, Recent
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
-from appliance.host.addresses import network
+from appliance.host.addresses import network_prefix
 from appliance.mqtt.codec import quote
 from appliance.mqtt.reason import ReasonCode
 
@@ -260,7 +260,7 @@ class FileAccess:
                 await self._repent(address, username)
                 right: str | Refusal | None = None
             else:
-                where = network(address)
+                where = network_prefix(address)
                 check = self._checking.get((where, login))
                 if check is None:
                     turn = self._turn(address, login)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from appliance.host.addresses import network
+from appliance.host.addresses import network_prefix
 
 #: The first delay when failures are more than allowed; each one more doubles it, up to this.
 FIRST_DELAY: Final = 0.125
@@ -60,7 +60,7 @@ class LoginThrottle:
         It is None, and nothing is taken, when that is longer than `patience`. Guesses in another
         `line` are not in each other's way.
         """
-        failures = self._networks.get(network(address))
+        failures = self._networks.get(network_prefix(address))
         if failures is None:
             return 0.0
         now = self._clock()
@@ -74,7 +74,7 @@ class LoginThrottle:
 
     def delay(self, address: str) -> float:
         """Seconds between two guesses from this address, as things are."""
-        failures = self._networks.get(network(address))
+        failures = self._networks.get(network_prefix(address))
         return self._delay(failures, self._clock()) if failures else 0.0
 
     def hold_up(self, username: str) -> float:
@@ -86,7 +86,7 @@ class LoginThrottle:
         """A guess was wrong."""
         now = self._clock()
         for known, key in (
-            (self._networks, network(address)),
+            (self._networks, network_prefix(address)),
             (self._users, self._key_of(username)),
         ):
             failures = known.get(key)

@@ -38,7 +38,7 @@ from appliance.config import (
 )
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
-from appliance.net.callbacks import Entries, shield
+from appliance.net.callbacks import Entries, contained_proxy
 from appliance.net.listeners import Listeners
 from appliance.ops.audit import Audit, AuditError
 from appliance.ops.control import Control, ControlError
@@ -166,7 +166,7 @@ class App:
         audit = broker_settings.audit
         if audit.path is not None:
             self.audit = Audit(audit.path, audit.size, audit.keep)
-            broker.audit_log = shield("audit", broker.faults, self.audit)
+            broker.audit_log = contained_proxy("audit", broker.faults, self.audit)
             self._stack.callback(self.audit.close)
             self.audit.began()
             self._stack.callback(self.audit.ended)
@@ -364,7 +364,7 @@ class App:
         if self.audit is not None:
             self.audit.changed(text)
         self._certificates_due.set()
-        self._listeners.network.in_background(self._listeners.check_certificates())
+        self._listeners.scheduler.in_background(self._listeners.check_certificates())
 
     def _publish(self, topic: str, payload: bytes, retain: bool = False) -> None:
         self.broker.publish(Message(topic, payload, 0, retain), self._inside)
@@ -387,7 +387,7 @@ class App:
             self._on_hangup()
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
         assert self._status is not None
-        pulse = Pulse(self.broker, self._listeners.network, self._inside, loop.time)
+        pulse = Pulse(self.broker, self._listeners.scheduler, self._inside, loop.time)
         self._notifier.start(self._entries, self._status.line, pulse.is_there)
         try:
             await self._stopping.wait()
@@ -411,7 +411,7 @@ class App:
                 self.broker.faults.caught("app.reload", error)
 
     def _on_hangup(self) -> None:
-        self._listeners.network.in_background(self._try_reload())
+        self._listeners.scheduler.in_background(self._try_reload())
 
     async def _answer_reload(self) -> list[str]:
         try:

@@ -191,7 +191,7 @@ class Reload:
         if not tls.take(loaded):
             return []
         listeners = self._parts.listeners
-        listeners.network.in_background(listeners.check_certificates())
+        listeners.scheduler.in_background(listeners.check_certificates())
         return ["certificates"]
 
     def _take_access(self, changes: Changes) -> list[str]:

@@ -130,7 +130,7 @@ class Status:
                 "tls": settings.context is not None,
                 "protocol": settings.protocol,
             }
-            for address, settings in self._parts.listeners.doors()
+            for address, settings in self._parts.listeners.sockets()
         ]
 
     def _clients(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 
 
-def network(address: str) -> bytes:
+def network_prefix(address: str) -> bytes:
     """One address of IPv4; of IPv6 a network of 64 bits, as one site has; or one Unix socket.
 
     `address` is a host, with its port or without: "127.0.0.1", "127.0.0.1:54321", "[::1]:54321";

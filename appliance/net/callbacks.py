@@ -88,12 +88,12 @@ class Entries:
 
     def every(
         self, entry: str, interval: float, callback: Callable[[], float | None], delay: float = -1
-    ) -> Repeated:
+    ) -> PeriodicCallback:
         """Call it again and again, also when it fails; for the first time after `delay`.
 
         It returns when it is to be called next, by the loop's clock, or None: after `interval`.
         """
-        return Repeated(self, entry, interval, callback, interval if delay < 0 else delay)
+        return PeriodicCallback(self, entry, interval, callback, interval if delay < 0 else delay)
 
     def from_thread(
         self,
@@ -161,7 +161,7 @@ class Entries:
         self.loop.add_signal_handler(number, self.run, entry, "", None, callback, ())
 
 
-class Repeated:
+class PeriodicCallback:
     """A callback that is called again and again, see `Entries.every`."""
 
     def __init__(
@@ -198,26 +198,28 @@ class Repeated:
             timer.cancel()
 
 
-class Faulty(Protocol):
+class FaultHandler(Protocol):
     """A connection, which a fault ends."""
 
     def fault(self, entry: str, error: Exception) -> None:
         """Count the fault and end the connection; never raises."""
 
 
-FaultyT = TypeVar("FaultyT", bound=Faulty)
+HandlerT = TypeVar("HandlerT", bound=FaultHandler)
 
 
 def contained(
     entry: str,
-) -> Callable[[Callable[Concatenate[FaultyT, P], T]], Callable[Concatenate[FaultyT, P], T | None]]:
+) -> Callable[
+    [Callable[Concatenate[HandlerT, P], T]], Callable[Concatenate[HandlerT, P], T | None]
+]:
     """For what the loop calls of a connection: what escapes ends that connection."""
 
     def decorate(
-        method: Callable[Concatenate[FaultyT, P], T],
-    ) -> Callable[Concatenate[FaultyT, P], T | None]:
+        method: Callable[Concatenate[HandlerT, P], T],
+    ) -> Callable[Concatenate[HandlerT, P], T | None]:
         @functools.wraps(method)
-        def run(self: FaultyT, /, *args: P.args, **kwargs: P.kwargs) -> T | None:
+        def run(self: HandlerT, /, *args: P.args, **kwargs: P.kwargs) -> T | None:
             try:
                 return method(self, *args, **kwargs)
             except Exception as error:
@@ -232,8 +234,8 @@ def contained(
 def contained_made(
     entry: str,
 ) -> Callable[
-    [Callable[[FaultyT, asyncio.BaseTransport], None]],
-    Callable[[FaultyT, asyncio.BaseTransport], None],
+    [Callable[[HandlerT, asyncio.BaseTransport], None]],
+    Callable[[HandlerT, asyncio.BaseTransport], None],
 ]:
     """`contained`, for `connection_made`: it also cuts the transport, of which nobody else knows.
 
@@ -241,10 +243,10 @@ def contained_made(
     """
 
     def decorate(
-        method: Callable[[FaultyT, asyncio.BaseTransport], None],
-    ) -> Callable[[FaultyT, asyncio.BaseTransport], None]:
+        method: Callable[[HandlerT, asyncio.BaseTransport], None],
+    ) -> Callable[[HandlerT, asyncio.BaseTransport], None]:
         @functools.wraps(method)
-        def run(self: FaultyT, transport: asyncio.BaseTransport) -> None:
+        def run(self: HandlerT, transport: asyncio.BaseTransport) -> None:
             try:
                 method(self, transport)
             except Exception as error:
@@ -256,12 +258,12 @@ def contained_made(
     return decorate
 
 
-def shield(entry: str, faults: Faults, told: T) -> T:
+def contained_proxy(entry: str, faults: Faults, told: T) -> T:
     """A part that is told of what happens, so that its faults are not those of who tells it."""
-    return cast(T, _Shield(entry, faults, told))
+    return cast(T, _ContainedProxy(entry, faults, told))
 
 
-class _Shield:
+class _ContainedProxy:
     def __init__(self, entry: str, faults: Faults, told: object) -> None:
         self._entry = entry
         self._faults = faults

@@ -19,11 +19,11 @@ from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, R
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.net import lingering as farewell
+from appliance.net import lingering as lingering
 from appliance.net import tls
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.scheduler import PUBLISH_BURST, Scheduler
-from appliance.net.sockets import Probe, inbox, peer_status
+from appliance.net.sockets import Probe, peer_status, receive_buffer
 from appliance.net.websocket import WebSocket
 
 #: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
@@ -48,7 +48,7 @@ LARGE_CHUNK = 128 * 1024
 
 #: Bytes of a chunk that are little: after more than these it is checked whether who sends them has
 #: to wait.
-LITTLE = 16 * 1024
+SMALL_CHUNK = 16 * 1024
 
 #: Turns that a client takes, without a second's rest, until the log is told.
 MANY_TURNS = 200
@@ -63,7 +63,7 @@ SLOW_AFTER = 1.0
 CLOSE_TIMEOUT = 10.0
 
 #: Seconds that a client's computer is asked for a sign of life.
-PROBED = 3.0
+PROBE_DURATION = 3.0
 
 #: Seconds that one gets whose certificate was revoked.
 REVOKED_TIMEOUT = 1.0
@@ -79,50 +79,50 @@ class ClientConnection:
     """
 
     def __init__(
-        self, network: Scheduler, address: str, host: str, anonymous: bool | None = None
+        self, scheduler: Scheduler, address: str, host: str, anonymous: bool | None = None
     ) -> None:
         self.address = address
         self._anonymous = anonymous  # what its listener says of clients without a user name
         #: The part of it that all connections of one computer share; empty for a Unix socket.
         self.host = host
         #: Who is charged for what waits here: nobody in particular until the login.
-        self.account = network.broker.accounting.accounts.strangers
+        self.account = scheduler.broker.accounting.accounts.strangers
         #: What was accepted, until there is a transport for it.
         self._accepted: socket.socket | None = None
-        self._network = network
-        self._broker = network.broker
-        self._accounting = network.broker.accounting
-        self._counters = network.broker.counters
+        self._scheduler = scheduler
+        self._broker = scheduler.broker
+        self._accounting = scheduler.broker.accounting
+        self._counters = scheduler.broker.counters
         self._transport: asyncio.Transport | None = None
-        self._entries = network.entries
-        self._loop = network.entries.loop
+        self._entries = scheduler.entries
+        self._loop = scheduler.entries.loop
         self._client = Client(self._broker, self)
         self._closing = False
         self._is_lost = False
         # Input: what was received and waits, and what it waits for.
-        self._held = _NOTHING
-        self._held_size = 0  # bytes of the chunk that it is the rest of, in the accounting
-        self._frame = 0  # bytes of a WebSocket frame that is not complete
+        self._backlog = _NOTHING
+        self._backlog_size = 0  # bytes of the chunk that it is the rest of, in the accounting
+        self._frame_size = 0  # bytes of a WebSocket frame that is not complete
         self._is_record_cut = False  # the same of TLS
-        self._below = 0  # bytes that TLS and WebSocket have not taken apart
-        self._sends_on = False  # the client has more to do, and wants its turn
-        self._turn_over = False
+        self._below_size = 0  # bytes that TLS and WebSocket have not taken apart
+        self._has_more = False  # the client has more to do, and wants its turn
+        self._turn_queued = False
         self._in_turn = False
         self._turns_taken = 0  # without a second's rest
         self._turned_at = 0.0
-        self._resting: asyncio.TimerHandle | None = None
-        self._looks: asyncio.TimerHandle | None = None  # whether it has caught up
-        self._looks_at = 0.0
-        self._choked = False
+        self._rest_timer: asyncio.TimerHandle | None = None
+        self._look_timer: asyncio.TimerHandle | None = None  # whether it has caught up
+        self._look_at = 0.0
+        self._input_blocked = False
         self._logging_in = False
-        self._who: Identity | Refusal | None = None  # what came of it, not told yet
+        self._login_result: Identity | Refusal | None = None  # what came of it, not told yet
         self._stopped = False  # the client takes in nothing until its next turn
-        self._waits: asyncio.TimerHandle | None = None  # for that, unless it comes before
+        self._wait_timer: asyncio.TimerHandle | None = None  # for that, unless it comes before
         # How fast it publishes.
-        self._little = min(LITTLE, network.portion)
-        self._countdown = network.check_every  # of messages, to the next check
+        self._small_chunk = min(SMALL_CHUNK, scheduler.portion)
+        self._countdown = scheduler.check_every  # of messages, to the next check
         self._checked_at = self._loop.time()
-        self._allowed = PUBLISH_BURST * network.publish_rate  # messages, at the last check
+        self._allowed = PUBLISH_BURST * scheduler.publish_rate  # messages, at the last check
         # Output: what the transport was not given yet, and what of it is counted.
         self._waiting: deque[bytes] = deque()
         self._waiting_size = 0  # bytes that are left of them
@@ -131,10 +131,10 @@ class ClientConnection:
         self._paused = False
         self._withheld: asyncio.TimerHandle | None = None  # paused until then, on purpose
         self._counted = 0  # bytes in the accounting
-        self._slow: asyncio.TimerHandle | None = None
+        self._slow_timer: asyncio.TimerHandle | None = None
         self._is_system_limited = False
         self._probe: Probe | None = None
-        self._has_told_behind = False  # and the client wants to know when it has caught up
+        self._reported_behind = False  # and the client wants to know when it has caught up
         #: Bytes in the output from which on the client is not listened to.
         self._output_limit = 0
         #: The connection under the transport, to be closed after it.
@@ -142,7 +142,7 @@ class ClientConnection:
         # Slow strangers: the whole way to the end of CONNECT has one time limit.
         self._timeout = self._entries.later(
             "connection.login_timeout",
-            network.connect_timeout,
+            scheduler.connect_timeout,
             self._too_late,
             served=self,
             failed=self.abort,
@@ -159,8 +159,8 @@ class ClientConnection:
         """Take over an accepted connection, with TLS through its handshake."""
         # Not left to asyncio's own server for one reason: when a handshake fails, that would
         # say nothing, and who it was and why is what the log is asked for.
-        network = self._network
-        protocol = cast(asyncio.Protocol, WebSocket(self, network) if websocket else self)
+        scheduler = self._scheduler
+        protocol = cast(asyncio.Protocol, WebSocket(self, scheduler) if websocket else self)
         self._accepted = connection
         try:
             if connection.family != socket.AF_UNIX:
@@ -170,11 +170,13 @@ class ClientConnection:
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
             else:
-                timeout = network.connect_timeout
-                await tls.accept(connection, context, protocol, timeout, network, network.part)
+                timeout = scheduler.connect_timeout
+                await tls.accept(
+                    connection, context, protocol, timeout, scheduler, scheduler.linger
+                )
         except (OSError, asyncio.TimeoutError) as error:
-            if self in self._network.open:  # else it had to make room
-                self.complain(f"no {'TLS ' if context else ''}connection", tls.reason(error))
+            if self in self._scheduler.connections:  # else it had to make room
+                self.log_refusal(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
             self._forget()
         except Exception as error:
@@ -202,7 +204,7 @@ class ClientConnection:
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=OUTPUT_LOW_WATER)
-        if self not in self._network.open:  # the handshake ended just after its time
+        if self not in self._scheduler.connections:  # the handshake ended just after its time
             self._transport.abort()
         else:
             self.check_certificate()
@@ -219,14 +221,14 @@ class ClientConnection:
 
         One that has logged in is told why, and has a second to read it.
         """
-        certificates, tls_object = self._network.certificates, self._tls
+        certificates, tls_object = self._scheduler.certificates, self._tls
         if certificates is None or tls_object is None or self._closing:
             return
         reason = certificates.refusal(tls_object)
         if not reason:
             return
         if self._client.session is None:
-            self.complain("no TLS connection", reason)
+            self.log_refusal("no TLS connection", reason)
             self._client.output.abandon()
         else:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
@@ -234,11 +236,11 @@ class ClientConnection:
         self._entries.later("connection.revoked", REVOKED_TIMEOUT, self.abort, served=self)
 
     def _too_late(self) -> None:
-        timeout = f"{self._network.connect_timeout:g} s"
-        self.complain(f"no complete CONNECT within {timeout}", "broker.limits.connect_timeout")
+        timeout = f"{self._scheduler.connect_timeout:g} s"
+        self.log_refusal(f"no complete CONNECT within {timeout}", "broker.limits.connect_timeout")
         self.abort()
 
-    def complain(self, what: str, why: str) -> None:
+    def log_refusal(self, what: str, why: str) -> None:
         """Tell the log, unless it is a flood of the same from the same host."""
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
@@ -262,43 +264,43 @@ class ClientConnection:
             self._withheld.cancel()
             self._withheld = None
         self._count_output()
-        if self._slow is not None:
-            self._slow.cancel()
+        if self._slow_timer is not None:
+            self._slow_timer.cancel()
         self._accounting.now = self._loop.time()
-        if self._waits is not None:
-            self._waits.cancel()
-        if self._looks is not None:
-            self._looks.cancel()
+        if self._wait_timer is not None:
+            self._wait_timer.cancel()
+        if self._look_timer is not None:
+            self._look_timer.cancel()
         if not self._closing:
             self._closing = True
-            held, self._held = bytes(self._held), _NOTHING
+            held, self._backlog = bytes(self._backlog), _NOTHING
             try:
                 self._client.hurry()
                 self._client.receive(held)
             except Exception as error:
                 self._broker.fault("connection.last_chunk", error, self._client)
         self._transport = None
-        self.keep(0)
-        self._let_go_of_held()
-        self._accounting.take(self.account, -self._below)
-        self._below = 0
+        self.count_partial_frame(0)
+        self._release_backlog()
+        self._accounting.take(self.account, -self._below_size)
+        self._below_size = 0
         if self._connection is not None:
-            self._network.part(self._connection)
-        if self._network.is_busy():
+            self._scheduler.linger(self._connection)
+        if self._scheduler.is_busy():
             self._leave_later()
         else:
             self._leave()
 
     def _leave_later(self) -> None:
         """Let the others have their turn, then end the client."""
-        if not self._turn_over:
-            self._turn_over = True
-            self._network.queue_turn(self)
+        if not self._turn_queued:
+            self._turn_queued = True
+            self._scheduler.queue_turn(self)
 
     def _leave(self) -> None:
         """End the client when what it said before it left is done, in as many turns as it takes."""
-        if self._sends_on:
-            self._sends_on = False
+        if self._has_more:
+            self._has_more = False
             try:
                 self._client.send_on()
             except Exception as error:
@@ -310,10 +312,10 @@ class ClientConnection:
             self._broker.flush()
             # The client and its wire know each other: this lets both, and the TLS connection with
             # them, go now, and not when all that lives here is searched for garbage.
-            self._client.let_go(_Gone(self.address))
+            self._client.let_go(_ClosedTransport(self.address))
 
     def _forget(self) -> None:
-        self._network.closed(self)
+        self._scheduler.closed(self)
         self._timeout.cancel()
 
     def abort(self) -> None:
@@ -335,7 +337,7 @@ class ClientConnection:
     def make_room(self) -> None:
         """Close at once, for somebody else: it has not logged in, or is closing anyway."""
         if not self._closing:
-            self.complain("makes room for others", "it has not logged in (broker.limits)")
+            self.log_refusal("makes room for others", "it has not logged in (broker.limits)")
         if self._transport is None and self._accepted is not None:
             with contextlib.suppress(OSError):  # so the handshake fails
                 self._accepted.shutdown(socket.SHUT_RDWR)
@@ -348,7 +350,7 @@ class ClientConnection:
         try:
             counters = self._counters
             if (
-                len(data) > self._little or counters.cost > self._network.checkpoint
+                len(data) > self._small_chunk or counters.cost > self._scheduler.checkpoint
             ) and not self._in_turn:
                 data = self._receive_in_turn(data)
                 if not data:
@@ -363,45 +365,45 @@ class ClientConnection:
                 self._countdown += published
                 if self._countdown <= 0:
                     self._check_publisher()
-            if self._slow is not None and self._output_size() > self._output_limit:
+            if self._slow_timer is not None and self._output_size() > self._output_limit:
                 # It asks on, and does not read the answers.
-                self._choked = True
+                self._input_blocked = True
                 self._pause_reading()
         except Exception as error:
             self.fault("connection.chunk", error)
 
     def _receive_in_turn(self, data: bytes) -> bytes:
         """Let who sends much wait where that is due; returns what is to be taken in now."""
-        network, account = self._network, self.account
-        if len(data) <= self._little:
-            if not network.is_round_over():
+        scheduler, account = self._scheduler, self.account
+        if len(data) <= self._small_chunk:
+            if not scheduler.is_round_over():
                 return data
-            if network.may_go_beyond(account):
+            if scheduler.may_exceed_round(account):
                 begun = self._counters.cost
                 self._take_portion(data)
-                network.went_beyond(account, self._counters.cost - begun)
+                scheduler.count_excess(account, self._counters.cost - begun)
             else:
-                self._hold(data, 0)
-                self._read_later()
+                self._keep_backlog(data, 0)
+                self._resume_input_later()
             return b""
         self._check_memory()
-        portion = 0 if network.is_busy() else network.portion
+        portion = 0 if scheduler.is_busy() else scheduler.portion
         if len(data) >= LARGE_CHUNK or len(data) > portion:
-            self._read_later()
+            self._resume_input_later()
         if len(data) > portion:
-            self._hold(data, portion)
+            self._keep_backlog(data, portion)
         return data[:portion]
 
     def _check_publisher(self) -> None:
         """Let a publisher wait that is too fast, by its own limit or by everyone's."""
-        network = self._network
-        rate = network.publish_rate
+        scheduler = self._scheduler
+        rate = scheduler.publish_rate
         now = self._accounting.now
         # What it may publish grows with time, and shrinks by what it has published since the last
         # check.
         allowed = min(self._allowed + (now - self._checked_at) * rate, PUBLISH_BURST * rate)
-        self._allowed = allowed - (network.check_every - self._countdown)
-        self._countdown = network.check_every
+        self._allowed = allowed - (scheduler.check_every - self._countdown)
+        self._countdown = scheduler.check_every
         self._checked_at = now
         if self._allowed < 0:
             self._rest(-self._allowed / rate)
@@ -409,7 +411,7 @@ class ClientConnection:
             self._check_memory()
 
     def _check_memory(self) -> None:
-        if self._accounting.queued_bytes > self._network.short_of_memory and self._resting is None:
+        if self._accounting.queued_bytes > self._scheduler.high_memory and self._rest_timer is None:
             # Not for longer: it may be this client that has to acknowledge what takes the memory.
             self._rest(SHORT_OF_MEMORY_PAUSE)
             self._broker.rate_limited_log.warning(
@@ -423,116 +425,124 @@ class ClientConnection:
 
     def _rest(self, seconds: float) -> None:
         """Read nothing for so long."""
-        if self._resting is not None:
-            self._resting.cancel()
-        self._resting = self._entries.later(
+        if self._rest_timer is not None:
+            self._rest_timer.cancel()
+        self._rest_timer = self._entries.later(
             "connection.rested", seconds, self._rested, served=self, failed=self.abort
         )
         self._pause_reading()
 
     def _rested(self) -> None:
-        self._resting = None
-        if self._network.is_busy():
-            self._read_later()
+        self._rest_timer = None
+        if self._scheduler.is_busy():
+            self._resume_input_later()
         else:
-            self._read_on()
+            self._resume_input()
 
-    def _read_later(self) -> None:
+    def _resume_input_later(self) -> None:
         """Let the others have their turn, then read on."""
         self._pause_reading()
-        if not self._turn_over:
-            self._turn_over = True
-            self._network.queue_turn(self)
+        if not self._turn_queued:
+            self._turn_queued = True
+            self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
         """The others have had their turn."""
-        self._turn_over = False
+        self._turn_queued = False
         if self._is_lost:
             self._leave()
         else:
-            self._read_on()
+            self._resume_input()
 
     def _pause_reading(self) -> None:
         if self._transport is not None and not self._transport.is_closing():
-            self.is_not_read()
+            self.input_paused()
             self._transport.pause_reading()
 
-    def _read_on(self) -> None:
+    def _resume_input(self) -> None:
         """Go on with what waits, in its order, unless there is a reason to wait."""
-        if self._turn_over or self._resting or self._choked or self._logging_in or self._closing:
+        if (
+            self._turn_queued
+            or self._rest_timer
+            or self._input_blocked
+            or self._logging_in
+            or self._closing
+        ):
             return
         if self._transport is None or self._transport.is_closing():
             return
-        if self._who is not None:
-            who, self._who = self._who, None
+        if self._login_result is not None:
+            who, self._login_result = self._login_result, None
             # What the client sends because of the answer is not older than the answer. Once that
             # is written, nobody can tell it from what has come during the login.
-            self.is_read()
-            self.is_not_read()
+            self.input_resumed()
+            self.input_paused()
             self._answer_connect(who)
-            self._read_on()
-        elif self._sends_on:
-            self._send_on()
+            self._resume_input()
+        elif self._has_more:
+            self._continue_client()
         elif self._stopped:
             return
-        elif self._held:
-            portion = bytes(self._held[: self._network.portion])
-            self._held = self._held[self._network.portion :]
-            if not self._held:  # an empty part would keep the whole
-                self._let_go_of_held()
+        elif self._backlog:
+            portion = bytes(self._backlog[: self._scheduler.portion])
+            self._backlog = self._backlog[self._scheduler.portion :]
+            if not self._backlog:  # an empty part would keep the whole
+                self._release_backlog()
             self._take_portion(portion)
-            self._read_later()
+            self._resume_input_later()
         else:
-            self.is_read()
+            self.input_resumed()
             self._transport.resume_reading()
 
-    def is_not_read(self) -> None:
+    def input_paused(self) -> None:
         """What has come waits: here, or in a layer below that has told so."""
         self._client.inflow.not_read(self._loop.time())
 
-    def is_read(self) -> None:
+    def input_resumed(self) -> None:
         """It waits no longer."""
         inflow = self._client.inflow
         inflow.read(self._loop.time())
         if inflow.is_behind:
-            self._see_whether_caught_up()
+            self._check_caught_up()
 
-    def _see_whether_caught_up(self) -> None:
+    def _check_caught_up(self) -> None:
         """Look whether all is read of what the client has said while it was not, now and later."""
         if self._transport is None:
             return
-        known = inbox(self._transport.get_extra_info("socket"))
+        known = receive_buffer(self._transport.get_extra_info("socket"))
         if self._transport.get_extra_info("has_unread"):
             known = known._replace(unread=True)
         inflow = self._client.inflow
         seconds = inflow.look(self._loop.time(), **known._asdict())
         if seconds:
-            self._look_after(seconds)
+            self._schedule_look(seconds)
 
-    def _look_after(self, seconds: float) -> None:
+    def _schedule_look(self, seconds: float) -> None:
         """Look again, then or before."""
         looks_at = self._loop.time() + seconds
-        if self._looks is not None:
-            if self._looks_at <= looks_at:
+        if self._look_timer is not None:
+            if self._look_at <= looks_at:
                 return
-            self._looks.cancel()
-        self._looks_at = looks_at
-        self._looks = self._entries.later("connection.look", seconds, self._look_again, served=self)
+            self._look_timer.cancel()
+        self._look_at = looks_at
+        self._look_timer = self._entries.later(
+            "connection.look", seconds, self._look_again, served=self
+        )
 
     def _look_again(self) -> None:
-        self._looks = None
-        self._see_whether_caught_up()
+        self._look_timer = None
+        self._check_caught_up()
 
-    def _hold(self, data: bytes, begin: int) -> None:
+    def _keep_backlog(self, data: bytes, begin: int) -> None:
         """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
-        self._held = memoryview(data)[begin:]
-        self._accounting.take(self.account, len(data) - self._held_size)
-        self._held_size = len(data)
+        self._backlog = memoryview(data)[begin:]
+        self._accounting.take(self.account, len(data) - self._backlog_size)
+        self._backlog_size = len(data)
 
-    def _let_go_of_held(self) -> None:
-        self._held = _NOTHING
-        self._accounting.take(self.account, -self._held_size)
-        self._held_size = 0
+    def _release_backlog(self) -> None:
+        self._backlog = _NOTHING
+        self._accounting.take(self.account, -self._backlog_size)
+        self._backlog_size = 0
 
     def _take_portion(self, data: bytes) -> None:
         """Take in what is not to wait for a turn, or has had it."""
@@ -540,8 +550,8 @@ class ClientConnection:
         self.data_received(data)  # which never raises
         self._in_turn = False
 
-    def _send_on(self) -> None:
-        self._sends_on = self._stopped = False
+    def _continue_client(self) -> None:
+        self._has_more = self._stopped = False
         self._accounting.now = self._loop.time()
         published = self._counters.publish_received
         self._client.send_on()
@@ -549,7 +559,7 @@ class ClientConnection:
         self._broker.flush()
         if self._countdown <= 0:
             self._check_publisher()
-        self._read_on()
+        self._resume_input()
 
     def frame_limit(self) -> int:
         """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
@@ -557,19 +567,19 @@ class ClientConnection:
             return MAXIMUM_CONTROL
         return self._client.connection.maximum_packet_size + MAXIMUM_CONTROL
 
-    def set_apart(self, size: int) -> None:
+    def count_buffered(self, size: int) -> None:
         """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
         if not self._is_lost:
-            self._accounting.take(self.account, size - self._below)
-            self._below = size
+            self._accounting.take(self.account, size - self._below_size)
+            self._below_size = size
 
-    def keep(self, size: int) -> None:
+    def count_partial_frame(self, size: int) -> None:
         """Count the bytes of a WebSocket frame that is not complete; without room, close."""
         accounting = self._accounting
-        grown = size - self._frame
-        if size or self._frame:
-            self._note_part(size > 0 or self._is_record_cut)
-        self._frame = size
+        grown = size - self._frame_size
+        if size or self._frame_size:
+            self._note_partial_input(size > 0 or self._is_record_cut)
+        self._frame_size = size
         accounting.take(self.account, grown)
         if grown > 0 and size > accounting.reserve and not accounting.fits(self.account, 0):
             reason = (
@@ -579,17 +589,17 @@ class ClientConnection:
             self._client.fail(ProtocolError(ReasonCode.QUOTA_EXCEEDED, reason))
             self._broker.flush()
 
-    def has_part(self, part: bool) -> None:
+    def partial_record(self, part: bool) -> None:
         """Whether TLS keeps the beginning of a record."""
         self._is_record_cut = part
-        self._note_part(part or self._frame > 0)
+        self._note_partial_input(part or self._frame_size > 0)
 
-    def _note_part(self, is_kept: bool) -> None:
+    def _note_partial_input(self, is_kept: bool) -> None:
         """Know since when the beginning of something is kept below: what it holds is as old."""
         inflow, connection = self._client.inflow, self._client.connection
         if is_kept:
             inflow.unfinished = inflow.unfinished or self._loop.time()
-        elif not (connection.unfinished or connection.paused or self._held):
+        elif not (connection.unfinished or connection.paused or self._backlog):
             inflow.unfinished = 0.0  # what it held is done, or it was a ping
 
     # --- bytes out -----------------------------------------------------------------------------
@@ -620,7 +630,7 @@ class ClientConnection:
         self._waiting_size -= left
         self._begun = 0
         if len(chunk) > WRITE_PORTION:
-            self._network.unshare(self.account, chunk)
+            self._scheduler.unshare(self.account, chunk)
         else:
             self._unshared -= len(chunk)
         return memoryview(chunk)[begun:] if begun else chunk
@@ -631,21 +641,21 @@ class ClientConnection:
 
     def _count_output(self) -> None:
         """Enter in the accounting what waits for this client, and tell it when that is too much."""
-        network = self._network
+        scheduler = self._scheduler
         counted = self._unshared
         if self._paused and self._transport is not None:
             counted += self._transport.get_write_buffer_size()
-        network.count_output(self.account, counted - self._counted)
+        scheduler.count_output(self.account, counted - self._counted)
         self._counted = counted
-        limit = OUTPUT_LOW_WATER if network.is_much(self.account) else OUTPUT_HIGH_WATER
+        limit = OUTPUT_LOW_WATER if scheduler.is_output_high(self.account) else OUTPUT_HIGH_WATER
         size = self._output_size()
-        if size > limit and self._slow is None:
+        if size > limit and self._slow_timer is None:
             self._client.output.writable = False
             # From here on its output grows by what it is answered only, and by no more than this.
             self._output_limit = size + limit
-            self._slow = self._entries.later("connection.slow", SLOW_AFTER, self._tell_slow)
+            self._slow_timer = self._entries.later("connection.slow", SLOW_AFTER, self._log_slow)
 
-    def _tell_slow(self) -> None:
+    def _log_slow(self) -> None:
         self._broker.rate_limited_log.warning(
             self._loop.time(),
             "slow",
@@ -671,19 +681,19 @@ class ClientConnection:
         self._write_on()
         if self._paused or self._closing:
             return
-        if self._slow is None:
-            if self._has_told_behind:
-                self._has_told_behind = False
+        if self._slow_timer is None:
+            if self._reported_behind:
+                self._reported_behind = False
                 self._client.output.caught_up()
                 self._broker.flush()
             return
-        self._slow.cancel()
-        self._slow = None
-        self._has_told_behind = False
-        self._choked = False
+        self._slow_timer.cancel()
+        self._slow_timer = None
+        self._reported_behind = False
+        self._input_blocked = False
         self._client.output.resume_writing()
         self._broker.flush()
-        self._read_on()
+        self._resume_input()
 
     # --- the client's Wire ---------------------------------------------------------------------
 
@@ -691,18 +701,18 @@ class ClientConnection:
         """Find out in the background who sent the CONNECT; read nothing more until then."""
         self._logging_in = True
         self._pause_reading()
-        self._network.in_background(self._log_in(connect))
+        self._scheduler.in_background(self._log_in(connect))
 
     async def _log_in(self, connect: Connect) -> None:
         try:
-            self._who = await self._network.authenticate(
+            self._login_result = await self._scheduler.authenticate(
                 connect, self.address, self._tls, self._anonymous
             )
             self._logging_in = False
-            if self._network.is_busy():  # crowds come at once, when the robot's network is back
-                self._read_later()
+            if self._scheduler.is_busy():  # crowds come at once, when the robot's network is back
+                self._resume_input_later()
             else:
-                self._read_on()
+                self._resume_input()
         except Exception as error:
             self.fault("connection.login", error)
 
@@ -718,7 +728,7 @@ class ClientConnection:
 
         None is to a client whose certificate says who it is: it could only say something else.
         """
-        certificates, tls_object = self._network.certificates, self._tls
+        certificates, tls_object = self._scheduler.certificates, self._tls
         if certificates is not None and tls_object is not None:
             try:
                 if certificates.username(tls_object) is not None:
@@ -726,7 +736,7 @@ class ClientConnection:
             except ValueError:
                 return None
         stranger = self._client.session is None
-        return self._network.exchange(method, self.address if stranger else None)
+        return self._scheduler.exchange(method, self.address if stranger else None)
 
     def now(self) -> float:
         """Seconds of the event loop's clock."""
@@ -734,13 +744,13 @@ class ClientConnection:
 
     def admit(self, account: Account) -> str:
         """The client has logged in as this user, and may be silent now; or why it may not."""
-        refusal = self._network.doorkeeper.admit(self, account)
+        refusal = self._scheduler.admission_policy.admit(self, account)
         if refusal:
             return refusal
         self._timeout.cancel()
-        self._network.count_output(self.account, -self._counted)
-        self._network.count_output(account, self._counted)
-        waits = self._frame + self._below + self._held_size
+        self._scheduler.count_output(self.account, -self._counted)
+        self._scheduler.count_output(account, self._counted)
+        waits = self._frame_size + self._below_size + self._backlog_size
         self._accounting.take(self.account, -waits)
         self._accounting.take(account, waits)
         self.account = account
@@ -748,7 +758,7 @@ class ClientConnection:
 
     def holds(self, size: int) -> None:
         """A chunk is not little that may be the last byte of a large packet."""
-        self._little = 0 if size > LITTLE else min(LITTLE, self._network.portion)
+        self._small_chunk = 0 if size > SMALL_CHUNK else min(SMALL_CHUNK, self._scheduler.portion)
 
     def tls_info(self) -> TlsInfo:
         """The version of TLS, and the name in the client's certificate."""
@@ -759,8 +769,8 @@ class ClientConnection:
 
     def later(self) -> None:
         """Let the others have their turn, then let the client go on; it is not read before that."""
-        self._sends_on = True
-        self._read_later()
+        self._has_more = True
+        self._resume_input_later()
         now = self._accounting.now
         if now - self._turned_at > 1.0:  # it was idle
             self._turns_taken = 0
@@ -782,19 +792,19 @@ class ClientConnection:
 
     def wait(self, seconds: float) -> None:
         """Let the client have a turn after so many seconds."""
-        if self._waits is not None:
-            self._waits.cancel()
-        self._waits = self._entries.later(
+        if self._wait_timer is not None:
+            self._wait_timer.cancel()
+        self._wait_timer = self._entries.later(
             "connection.wait", seconds, self.proceed, served=self, failed=self.abort
         )
 
     def proceed(self) -> None:
         """Let the others have their turn, then the client."""
-        if self._waits is not None:
-            self._waits.cancel()
-            self._waits = None
-        self._sends_on = True
-        self._read_later()
+        if self._wait_timer is not None:
+            self._wait_timer.cancel()
+            self._wait_timer = None
+        self._has_more = True
+        self._resume_input_later()
 
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined when they are small; to who is slow, in portions."""
@@ -818,7 +828,7 @@ class ClientConnection:
             self._waiting.append(chunk)
             self._waiting_size += len(chunk)
             if len(chunk) > WRITE_PORTION:
-                self._network.share(self.account, chunk)
+                self._scheduler.share(self.account, chunk)
             else:
                 self._unshared += len(chunk)
         self._write_on()
@@ -827,7 +837,7 @@ class ClientConnection:
         """Whether the transport has asked for a pause."""
         if not self._is_system_limited:
             self._limit_system_output()
-        self._has_told_behind |= self._paused
+        self._reported_behind |= self._paused
         return self._paused
 
     def _limit_system_output(self) -> None:
@@ -845,21 +855,21 @@ class ClientConnection:
         if self._transport is None:
             return LOCAL_PEER
         known = peer_status(self._transport.get_extra_info("socket"))
-        has_unread = known.has_unread or bool(self._held) or self._sends_on
+        has_unread = known.has_unread or bool(self._backlog) or self._has_more
         has_unread = has_unread or bool(self._transport.get_extra_info("has_unread"))
         now = self._accounting.now  # of the chunk that is being taken in, if one is
         inflow = self._client.inflow
         held = inflow.held(now, has_unread=has_unread)
         flowing = inflow.flowing(now)
         if held:
-            self._look_after(PAUSE_BEHIND)
+            self._schedule_look(PAUSE_BEHIND)
         return replace(known, has_unread=has_unread, flowing=flowing, held=held)
 
     def probe(self) -> None:
         """Have it answer within two seconds, if it can."""
         if self._transport is not None and self._probe is None:
             self._probe = Probe(self._transport.get_extra_info("socket"))
-            self._entries.later("connection.probe", PROBED, self._end_probe, served=self)
+            self._entries.later("connection.probe", PROBE_DURATION, self._end_probe, served=self)
 
     def _end_probe(self) -> None:
         probe, self._probe = self._probe, None
@@ -887,7 +897,7 @@ class ClientConnection:
             return
         self._closing = True
         self._cut_after(CLOSE_TIMEOUT)
-        self._network.leaves(self)
+        self._scheduler.closing(self)
         if self._waiting:
             self._pause_reading()
         else:
@@ -896,7 +906,7 @@ class ClientConnection:
     def _close_transport(self) -> None:
         assert self._transport is not None
         if not self._transport.get_write_buffer_size():
-            self._cut_after(farewell.TIMEOUT)
+            self._cut_after(lingering.TIMEOUT)
         if self._connection is None and not self._transport.is_closing():
             # A transport closes its socket as soon as it has written: of that only a copy is left.
             with contextlib.suppress(OSError):
@@ -906,7 +916,7 @@ class ClientConnection:
         self._transport.close()
 
 
-class _Gone:
+class _ClosedTransport:
     """The wire of a client whose connection has ended: nothing comes of what it is told."""
 
     def __init__(self, address: str) -> None:

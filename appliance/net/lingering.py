@@ -29,13 +29,13 @@ class LingeringClose:
         self._ended = ended
         self._left = BYTES
         self._entries = entries
-        self._timeout = entries.later("farewell.timeout", TIMEOUT, self.end, failed=self.end)
+        self._timeout = entries.later("lingering.timeout", TIMEOUT, self.end, failed=self.end)
 
     def listen(self) -> None:
         """Begin; it ends by itself."""
         try:
             self._socket.shutdown(socket.SHUT_WR)
-            self._entries.reader("farewell.chunk", self._socket, self._discard, failed=self.end)
+            self._entries.reader("lingering.chunk", self._socket, self._discard, failed=self.end)
         except OSError:  # the other side was quicker
             self.end()
 

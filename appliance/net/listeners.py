@@ -16,10 +16,16 @@ from typing import Literal, cast
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Exchange
-from appliance.host.addresses import network
+from appliance.host.addresses import network_prefix
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.connection import ClientConnection
-from appliance.net.scheduler import FAREWELLS, Authenticate, Certificates, Member, Scheduler
+from appliance.net.scheduler import (
+    LINGERING_CLOSES,
+    Authenticate,
+    CertificatePolicy,
+    ScheduledConnection,
+    Scheduler,
+)
 from appliance.net.sockets import allow_files, listen, listen_on_path
 
 log = logging.getLogger(__name__)
@@ -58,7 +64,7 @@ STOP_TIMEOUT = 1.0
 GUESTS = 256
 
 #: Files that the process opens beside its connections.
-OTHER_FILES = GUESTS + FAREWELLS + 256
+OTHER_FILES = GUESTS + LINGERING_CLOSES + 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +102,7 @@ class ListenerSettings:
 
 
 class Listeners:
-    """All listening sockets; `network` has the connections made to them."""
+    """All listening sockets; `network_prefix` has the connections made to them."""
 
     def __init__(
         self,
@@ -104,12 +110,12 @@ class Listeners:
         authenticate: Authenticate,
         exchange: Callable[[str, str | None], Exchange | None],
         admission: Admission,
-        certificates: Certificates | None = None,
+        certificates: CertificatePolicy | None = None,
     ) -> None:
         self.broker = broker
         self.admission = admission
-        self._addresses = _Addresses(admission)
-        self.network = Scheduler(
+        self._addresses = _AddressLimits(admission)
+        self.scheduler = Scheduler(
             broker,
             authenticate,
             exchange,
@@ -118,67 +124,70 @@ class Listeners:
             publish_rate=admission.publish_rate,
             certificates=certificates,
         )
-        self._doors: list[_Door] = []
+        self._sockets: list[_ListeningSocket] = []
         self._handshakes: set[ClientConnection] = set()
         self._stall: asyncio.TimerHandle | None = None
 
     @property
     def addresses(self) -> list[tuple[str, int]]:
         """Where is listened, with the port that the system chose where it was 0."""
-        return [door.address for door in self._doors]
+        return [sock.address for sock in self._sockets]
 
-    def doors(self) -> list[tuple[str, ListenerSettings]]:
+    def sockets(self) -> list[tuple[str, ListenerSettings]]:
         """Each listener's address, as the log has it, and its settings."""
-        return [(str(door), door.settings) for door in self._doors]
+        return [(str(sock), sock.settings) for sock in self._sockets]
 
-    def prepare(self, settings: list[ListenerSettings]) -> list[_Door]:
+    def prepare(self, settings: list[ListenerSettings]) -> list[_ListeningSocket]:
         """Get ready to listen there, for `take`; where is listened already nothing changes yet.
 
         Raises:
             OSError: an address cannot be listened on; nothing has changed then.
         """
-        leaving = list(self._doors)
-        kept: list[_Door | None] = []
+        leaving = list(self._sockets)
+        kept: list[_ListeningSocket | None] = []
         for listener in settings:
             # The first of several: those whose ports the system chose are told apart by order.
-            same = (door for door in leaving if door.settings.place == listener.place)
+            same = (sock for sock in leaving if sock.settings.place == listener.place)
             kept.append(next(same, None))
             if kept[-1] is not None:
                 leaving.remove(kept[-1])
-        doors: list[_Door] = []
+        sockets: list[_ListeningSocket] = []
         try:
-            for listener, door in zip(settings, kept, strict=True):
-                doors.append(door or _Door(self, listener, leaving))
+            for listener, sock in zip(settings, kept, strict=True):
+                sockets.append(sock or _ListeningSocket(self, listener, leaving))
         except BaseException:
-            self.drop(doors)
+            self.drop(sockets)
             raise
-        return doors
+        return sockets
 
-    def drop(self, doors: list[_Door]) -> None:
+    def drop(self, sockets: list[_ListeningSocket]) -> None:
         """Not to be taken after all."""
-        for door in doors:
-            if door not in self._doors:
-                door.close()
+        for sock in sockets:
+            if sock not in self._sockets:
+                sock.close()
 
     def take(
-        self, doors: list[_Door], settings: list[ListenerSettings], admission: Admission
+        self,
+        sockets: list[_ListeningSocket],
+        settings: list[ListenerSettings],
+        admission: Admission,
     ) -> None:
         """Listen there from now on, like this; connections that were made elsewhere stay."""
         self.admission = admission
         self._addresses.use(admission)
-        self.network.use(admission.connect_timeout, admission.publish_rate)
+        self.scheduler.use(admission.connect_timeout, admission.publish_rate)
         allow_files(admission.connections + OTHER_FILES)
-        before, self._doors = self._doors, doors
-        for door in before:
-            if door not in doors:
-                door.close()
-                log.info("closed the listener on %s", door)
-        for door, listener in zip(doors, settings, strict=True):
-            door.use(listener)
-            door.open()
-            if door not in before:
+        before, self._sockets = self._sockets, sockets
+        for sock in before:
+            if sock not in sockets:
+                sock.close()
+                log.info("closed the listener on %s", sock)
+        for sock, listener in zip(sockets, settings, strict=True):
+            sock.use(listener)
+            sock.open()
+            if sock not in before:
                 kind = " for WebSocket" if listener.protocol == "websocket" else ""
-                log.info("listening%s on %s", kind, door)
+                log.info("listening%s on %s", kind, sock)
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Listen; returns the addresses, with the port that the system chose where it was 0.
@@ -202,7 +211,7 @@ class Listeners:
             host, port = cast("tuple[str, int]", peer)[:2]
             address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         if listener.path is None:
-            refusal = self._addresses.come(host, now)
+            refusal = self._addresses.reserve(host, now)
         if not refusal:
             refusal = self._make_room()
         if refusal:
@@ -212,15 +221,15 @@ class Listeners:
             if self.broker.audit_log is not None:
                 self.broker.audit_log.refused(address, refusal)
             return
-        protocol = ClientConnection(self.network, address, host, listener.anonymous)
-        self.network.open.add(protocol)
-        self._addresses.came(protocol)
+        protocol = ClientConnection(self.scheduler, address, host, listener.anonymous)
+        self.scheduler.connections.add(protocol)
+        self._addresses.add_guest(protocol)
         context = None
         if listener.context is not None:
             context = listener.context()
             self._handshakes.add(protocol)
         is_websocket = listener.protocol == "websocket"
-        self.network.in_background(self._begin(protocol, connection, context, is_websocket))
+        self.scheduler.in_background(self._begin(protocol, connection, context, is_websocket))
 
     async def _begin(
         self,
@@ -234,7 +243,7 @@ class Listeners:
         finally:
             self._handshakes.discard(protocol)
             if self._stall is not None:
-                self._open_doors()
+                self._open_sockets()
 
     def _make_room(self) -> str:
         """Let there be room for a connection more; or why there cannot be.
@@ -244,7 +253,7 @@ class Listeners:
         with most of them: as many strangers as may come from everywhere keep nobody out.
         """
         limit = self.admission.connections
-        if len(self.network.open) < max(
+        if len(self.scheduler.connections) < max(
             limit, self.broker.accounting.accounts.connections + GUESTS
         ):
             return ""
@@ -262,28 +271,28 @@ class Listeners:
     def wait_for_handshakes(self) -> None:
         """Open the doors again when a handshake has ended, or when none does for a while."""
         if self._stall is None:
-            self._stall = self.network.entries.later(
-                "listener.stall", HANDSHAKE_STALL, self._pass_stalled, failed=self._open_doors
+            self._stall = self.scheduler.entries.later(
+                "listener.stall", HANDSHAKE_STALL, self._pass_stalled, failed=self._open_sockets
             )
 
     def _pass_stalled(self) -> None:
         self._handshakes.clear()  # they go on, and are not counted any more
-        self._open_doors()
+        self._open_sockets()
 
-    def _open_doors(self) -> None:
+    def _open_sockets(self) -> None:
         if self._stall is not None:
             self._stall.cancel()
             self._stall = None
-        for door in self._doors:
+        for sock in self._sockets:
             try:
-                door.open()
+                sock.open()
             except Exception as error:
-                self.broker.faults.caught("listener.open", error, door)
-                door.pause()
+                self.broker.faults.caught("listener.open", error, sock)
+                sock.pause()
 
     async def check_certificates(self) -> None:
         """End the connections whose client's certificate is not, or no longer, accepted."""
-        for number, member in enumerate(list(self.network.open)):
+        for number, member in enumerate(list(self.scheduler.connections)):
             try:
                 member.check_certificate()
             except Exception as error:
@@ -293,33 +302,33 @@ class Listeners:
 
     async def stop(self) -> None:
         """Listen no more and close what is open; may be called twice."""
-        doors, self._doors = self._doors, []
-        for door in doors:
-            door.close()
+        sockets, self._sockets = self._sockets, []
+        for sock in sockets:
+            sock.close()
         if self._stall is not None:
             self._stall.cancel()
         self.broker.close(
             lambda session: session.close_link(ReasonCode.SERVER_SHUTTING_DOWN, "shutting down")
         )
-        await self.network.close(STOP_TIMEOUT)
+        await self.scheduler.close(STOP_TIMEOUT)
 
 
-class _Door:
+class _ListeningSocket:
     """One listening socket; it may take over the port of one that is `leaving`."""
 
     def __init__(
-        self, listeners: Listeners, settings: ListenerSettings, leaving: list[_Door]
+        self, listeners: Listeners, settings: ListenerSettings, leaving: list[_ListeningSocket]
     ) -> None:
         self._listeners = listeners
         self.settings = settings
-        self._entries = listeners.network.entries
+        self._entries = listeners.scheduler.entries
         self._is_open = False
         if settings.path is not None:
             self._socket = listen_on_path(settings.path, settings.mode)
             self._inode = settings.path.stat().st_ino
             self.address = (f"unix:{settings.path}", 0)
         else:
-            same = [door._socket for door in leaving if door.address[1] == settings.port > 0]
+            same = [sock._socket for sock in leaving if sock.address[1] == settings.port > 0]
             self._socket = listen(settings.host, settings.port, same)
             self.address = (settings.host, self._socket.getsockname()[1])
 
@@ -387,19 +396,19 @@ class _Door:
 
 
 @dataclass(slots=True)
-class _Neighbour:
+class _AddressState:
     """What is known of one address."""
 
     #: Connections that have not logged in yet, or are closing, in the order of their coming.
-    guests: dict[Member, None] = field(default_factory=dict)
+    guests: dict[ScheduledConnection, None] = field(default_factory=dict)
     #: And those that have, by their users.
     clients: dict[Account, int] = field(default_factory=dict)
     #: When the connections that it opened are paid for at the rate allowed.
     paid_at: float = 0.0
 
 
-class _Addresses:
-    """How many connections each address has, and how fast it opens new ones: the `Doorkeeper`.
+class _AddressLimits:
+    """How many connections each address has, and how fast it opens new ones: the `AdmissionPolicy`.
 
     Those of one user, and those before their login, are counted for themselves: who knows a
     password keeps nobody out who shares its address. All Unix sockets are one address, without a
@@ -408,7 +417,7 @@ class _Addresses:
 
     def __init__(self, admission: Admission) -> None:
         self.use(admission)
-        self._known: dict[bytes, _Neighbour] = {}
+        self._known: dict[bytes, _AddressState] = {}
         self._many = ADDRESSES
 
     def use(self, admission: Admission) -> None:
@@ -416,73 +425,73 @@ class _Addresses:
         self._limit = admission.connections_per_address
         self._rate = admission.connection_rate
 
-    def come(self, host: str, now: float) -> str:
+    def reserve(self, host: str, now: float) -> str:
         """Count a new connection's coming; or, uncounted, why it is not allowed."""
-        where = network(host)
-        neighbour = self._known.get(where)
-        if neighbour is None:
+        where = network_prefix(host)
+        state = self._known.get(where)
+        if state is None:
             if len(self._known) >= self._many:
                 self._forget_idle(now)
-            neighbour = self._known[where] = _Neighbour()
-        if len(neighbour.guests) >= self._limit:
+            state = self._known[where] = _AddressState()
+        if len(state.guests) >= self._limit:
             return (
-                f"its address has {len(neighbour.guests)} connections that have not logged in "
+                f"its address has {len(state.guests)} connections that have not logged in "
                 "(broker.limits.connections_per_address)"
             )
-        paid_at = max(neighbour.paid_at, now) + 1 / self._rate
+        paid_at = max(state.paid_at, now) + 1 / self._rate
         if paid_at > now + CONNECTION_BURST:
             return (
                 f"its address opens more than {self._rate:g} connections a second "
                 "(broker.limits.connection_rate)"
             )
-        neighbour.paid_at = paid_at
+        state.paid_at = paid_at
         return ""
 
-    def _of(self, member: Member) -> _Neighbour:
-        where = network(member.host) if member.host else UNIX
-        return self._known.setdefault(where, _Neighbour())
+    def _of(self, member: ScheduledConnection) -> _AddressState:
+        where = network_prefix(member.host) if member.host else UNIX
+        return self._known.setdefault(where, _AddressState())
 
-    def came(self, member: Member) -> None:
+    def add_guest(self, member: ScheduledConnection) -> None:
         """A new connection is there."""
         self._of(member).guests[member] = None
 
-    def admit(self, member: Member, account: Account) -> str:
-        """See `Doorkeeper.admit`."""
-        neighbour = self._of(member)
-        count = neighbour.clients.get(account, 0)
+    def admit(self, member: ScheduledConnection, account: Account) -> str:
+        """See `AdmissionPolicy.admit`."""
+        state = self._of(member)
+        count = state.clients.get(account, 0)
         if member.host and count >= self._limit:
             return (
                 f"its address has {count} connections of its user "
                 "(broker.limits.connections_per_address)"
             )
-        neighbour.guests.pop(member, None)
-        neighbour.clients[account] = count + 1
+        state.guests.pop(member, None)
+        state.clients[account] = count + 1
         return ""
 
-    def leaves(self, member: Member) -> None:
-        """See `Doorkeeper`."""
+    def closing(self, member: ScheduledConnection) -> None:
+        """See `AdmissionPolicy`."""
         self._of(member).guests[member] = None
 
-    def ended(self, member: Member) -> None:
-        """See `Doorkeeper`."""
-        neighbour = self._of(member)
-        neighbour.guests.pop(member, None)
-        count = neighbour.clients.get(member.account, 0)
+    def ended(self, member: ScheduledConnection) -> None:
+        """See `AdmissionPolicy`."""
+        state = self._of(member)
+        state.guests.pop(member, None)
+        count = state.clients.get(member.account, 0)
         if count > 1:
-            neighbour.clients[member.account] = count - 1
+            state.clients[member.account] = count - 1
         else:
-            neighbour.clients.pop(member.account, None)
+            state.clients.pop(member.account, None)
 
-    def oldest_guest(self) -> Member | None:
+    def oldest_guest(self) -> ScheduledConnection | None:
         """Of the address that has most of them, the guest that came first."""
         most = max(self._known.values(), key=lambda each: len(each.guests), default=None)
         return next(iter(most.guests), None) if most is not None else None
 
     def _forget_idle(self, now: float) -> None:
         self._known = {
-            where: neighbour
-            for where, neighbour in self._known.items()
-            if neighbour.guests or neighbour.clients or neighbour.paid_at > now
+            where: state
+            for where, state in self._known.items()
+            if state.guests or state.clients or state.paid_at > now
         }
         # Each is looked at once for every two that come: the work stays in proportion.
         self._many = max(ADDRESSES, 2 * len(self._known))

@@ -17,8 +17,8 @@ from appliance.broker.ports import Exchange, Identity, Refusal
 from appliance.host.clock import SpareClock
 from appliance.mqtt.packets import Connect
 from appliance.net.callbacks import Entries
+from appliance.net.layers import Schedulable, UpperLayer
 from appliance.net.lingering import LingeringClose
-from appliance.net.turns import Charged, Turn
 
 #: Messages that are few: after more than these it is checked whether who sends them has to wait.
 FEW_MESSAGES = 64
@@ -33,13 +33,13 @@ COST_PER_ROUND = 1500
 COST_BEYOND_ROUND = 100
 
 #: Cost after which the start of the round is taken anew.
-UNLOOKED = 300
+COST_BETWEEN_CHECKS = 300
 
 #: Seconds that a client may publish ahead of `limits.publish_rate`.
 PUBLISH_BURST = 1.0
 
 #: Closed connections that are listened to at a time, see `LingeringClose`.
-FAREWELLS = 256
+LINGERING_CLOSES = 256
 
 #: Who sent this CONNECT, from this address, over this TLS connection, if it is one; and does its
 #: listener let in who gives no user name (None: as everywhere)?
@@ -48,7 +48,7 @@ Authenticate: TypeAlias = Callable[
 ]
 
 
-class Certificates(Protocol):
+class CertificatePolicy(Protocol):
     """What is to be known of a client's certificate, of a connection with TLS."""
 
     def refusal(self, tls: ssl.SSLObject) -> str:
@@ -58,7 +58,7 @@ class Certificates(Protocol):
         """The user that it names; None when that is not asked for. ValueError: it names none."""
 
 
-class Member(Turn, Protocol):
+class ScheduledConnection(Schedulable, Protocol):
     """One of the connections."""
 
     #: What all connections of one computer share; empty for a Unix socket.
@@ -79,16 +79,16 @@ class Member(Turn, Protocol):
         """Close at once, for somebody else: it has not logged in, or is closing anyway."""
 
 
-class Doorkeeper(Protocol):
+class AdmissionPolicy(Protocol):
     """Who lets connections in, and knows how many may be there."""
 
-    def admit(self, member: Member, account: Account) -> str:
+    def admit(self, member: ScheduledConnection, account: Account) -> str:
         """A connection logs in as that user: why it may not, or nothing."""
 
-    def leaves(self, member: Member) -> None:
+    def closing(self, member: ScheduledConnection) -> None:
         """It is told its last bytes."""
 
-    def ended(self, member: Member) -> None:
+    def ended(self, member: ScheduledConnection) -> None:
         """It has ended, once."""
 
 
@@ -103,11 +103,11 @@ class Scheduler:
         broker: Broker,
         authenticate: Authenticate,
         exchange: Callable[[str, str | None], Exchange | None],
-        doorkeeper: Doorkeeper,
+        admission_policy: AdmissionPolicy,
         *,
         connect_timeout: float,
         publish_rate: float,
-        certificates: Certificates | None = None,
+        certificates: CertificatePolicy | None = None,
     ) -> None:
         self.broker = broker
         self._spare = broker.accounting.spare = SpareClock()
@@ -116,23 +116,23 @@ class Scheduler:
         self.exchange = exchange
         self.entries = Entries(asyncio.get_running_loop(), broker.faults)
         self.use(connect_timeout, publish_rate)
-        self.open: set[Member] = set()
+        self.connections: set[ScheduledConnection] = set()
         #: What runs in the background for a connection: TLS handshakes and logins.
         self.tasks: set[asyncio.Task[None]] = set()
         #: Bytes in the output of all clients, as far as they are counted.
         self.output = 0
-        self.doorkeeper = doorkeeper
+        self.admission_policy = admission_policy
         #: For how many clients a large chunk waits, by its id: in all, and of each account.
         self._shared: dict[tuple[int, int], int] = {}
         #: Who has more to do than there was time for; in turn, with all others in between.
-        self._turns: deque[Turn] = deque()
+        self._turn_queue: deque[Schedulable] = deque()
         #: `Counters.cost` from which on it is to be asked whether the round is over.
         self.checkpoint = 0
         self._next_turns: asyncio.Handle | None = None
-        self._counting = False
+        self._round_begun = False
         #: What each account has caused beyond the end of the round.
-        self._beyond: dict[Account, int] = {}
-        self._farewells: set[LingeringClose] = set()
+        self._excess: dict[Account, int] = {}
+        self._lingering: set[LingeringClose] = set()
         self._all_closed: asyncio.Event | None = None
 
     def use(self, connect_timeout: float, publish_rate: float) -> None:
@@ -144,9 +144,9 @@ class Scheduler:
         #: Bytes that hold no more messages than may come at once: the smallest one takes five.
         self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
         #: `Accounting.queued_bytes` from which on publishers are slowed.
-        self.short_of_memory = self.broker.limits.memory * 3 // 4
+        self.high_memory = self.broker.limits.memory * 3 // 4
         #: Bytes in the output of all clients from which on less is allowed to each of them.
-        self.much_output = self.broker.limits.memory // 4
+        self.high_output = self.broker.limits.memory // 4
 
     def is_busy(self) -> bool:
         """Whether as much was done in this round of the event loop as one round is for, or others
@@ -154,7 +154,7 @@ class Scheduler:
 
         Who sends much then waits, too.
         """
-        return self.is_round_over() or bool(self._turns)
+        return self.is_round_over() or bool(self._turn_queue)
 
     def is_round_over(self) -> bool:
         """Whether as much was done in this round of the event loop as one round is for.
@@ -162,44 +162,44 @@ class Scheduler:
         To be asked when `Counters.cost` is beyond the `checkpoint`, by who sends little.
         """
         cost = self.broker.counters.cost
-        if not self._counting:
-            self._counting = True
+        if not self._round_begun:
+            self._round_begun = True
             self.checkpoint = cost + COST_PER_ROUND
-            self.entries.soon("network.round", self._new_round, failed=self._new_round)
+            self.entries.soon("scheduler.round", self._new_round, failed=self._new_round)
         return cost > self.checkpoint
 
     def _new_round(self) -> None:
-        self._counting = False
-        self.checkpoint = self.broker.counters.cost + UNLOOKED
-        self._beyond.clear()
+        self._round_begun = False
+        self.checkpoint = self.broker.counters.cost + COST_BETWEEN_CHECKS
+        self._excess.clear()
 
-    def may_go_beyond(self, account: Account) -> bool:
+    def may_exceed_round(self, account: Account) -> bool:
         """Whether its clients have sent little since the round is over."""
-        return self._beyond.get(account, 0) < COST_BEYOND_ROUND
+        return self._excess.get(account, 0) < COST_BEYOND_ROUND
 
-    def went_beyond(self, account: Account, cost: int) -> None:
+    def count_excess(self, account: Account, cost: int) -> None:
         """So much was done for one of them nevertheless."""
-        self._beyond[account] = self._beyond.get(account, 0) + cost
+        self._excess[account] = self._excess.get(account, 0) + cost
 
-    def count(self, cost: int, charged: Charged) -> None:
+    def count_cost(self, cost: int, charged: UpperLayer) -> None:
         """So much was done for it, see `Counters.cost`."""
         counters = self.broker.counters
         counters.cost += cost
-        if self._counting and counters.cost > self.checkpoint:
-            self.went_beyond(charged.account, cost)
+        if self._round_begun and counters.cost > self.checkpoint:
+            self.count_excess(charged.account, cost)
 
-    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
-        """Whether a chunk is to be taken apart in a turn, see `Turns`."""
-        if not is_little:
+    def must_wait(self, charged: UpperLayer, *, is_small: bool) -> bool:
+        """Whether a chunk is to be taken apart in a turn, see `LayerScheduler`."""
+        if not is_small:
             return self.is_busy()
         if self.broker.counters.cost <= self.checkpoint or not self.is_round_over():
             return False
-        return not self.may_go_beyond(charged.account)
+        return not self.may_exceed_round(charged.account)
 
-    def queue_turn(self, member: Turn) -> None:
+    def queue_turn(self, member: Schedulable) -> None:
         """Call `take_turn` when it is the member's."""
-        self._turns.append(member)
-        if len(self._turns) == 1:
+        self._turn_queue.append(member)
+        if len(self._turn_queue) == 1:
             self._schedule_turns()
 
     def _schedule_turns(self) -> None:
@@ -207,34 +207,34 @@ class Scheduler:
         if self._next_turns is not None:
             self._next_turns.cancel()
         self._next_turns = self.entries.soon(
-            "network.turns", self._run_turns, failed=self._schedule_turns
+            "scheduler.turns", self._run_turns, failed=self._schedule_turns
         )
 
     def _run_turns(self) -> None:
         end = self.broker.counters.cost + COST_PER_ROUND
-        left = len(self._turns)
+        left = len(self._turn_queue)
         try:
             while left:
                 left -= 1
-                member = self._turns[0]
+                member = self._turn_queue[0]
                 try:
                     member.take_turn()
                 except Exception as error:
                     member.fault("connection.turn", error)
                 finally:
                     # After its turn, so that no entry meanwhile is the first, to be scheduled.
-                    self._turns.popleft()
+                    self._turn_queue.popleft()
                 if self.broker.counters.cost > end:
                     break
         finally:
-            if self._turns:
+            if self._turn_queue:
                 self._schedule_turns()
 
     def in_background(self, work: Coroutine[object, object, None]) -> None:
         """Run a connection's handshake or login beside everything else."""
-        task = self.entries.task("network.background", work)
+        task = self.entries.task("scheduler.background", work)
         self.tasks.add(task)
-        self.entries.when_done("network.background_end", task, self.tasks.discard, task)
+        self.entries.when_done("scheduler.background_end", task, self.tasks.discard, task)
 
     def count_output(self, account: Account, size: int) -> None:
         """So many bytes more, or less, wait to be read by a client of the account."""
@@ -249,14 +249,14 @@ class Scheduler:
         account.output += size
         account.bytes += size
 
-    def is_much(self, account: Account) -> bool:
+    def is_output_high(self, account: Account) -> bool:
         """Whether so much output waits that less is allowed to the account's clients.
 
         Those of a user with less than most have of it are not the reason.
         """
         return (
-            self.output > self.much_output
-            and account.output * len(self.broker.accounting.accounts) > self.much_output
+            self.output > self.high_output
+            and account.output * len(self.broker.accounting.accounts) > self.high_output
         )
 
     def share(self, account: Account, chunk: bytes) -> None:
@@ -287,47 +287,47 @@ class Scheduler:
             ((id(chunk), id(account)), partial(self._count_for, account)),
         )
 
-    def leaves(self, member: Member) -> None:
+    def closing(self, member: ScheduledConnection) -> None:
         """A connection is told its last bytes; one that has ended is nobody's guest any more."""
-        if member in self.open:
-            self.doorkeeper.leaves(member)
+        if member in self.connections:
+            self.admission_policy.closing(member)
 
-    def closed(self, member: Member) -> None:
+    def closed(self, member: ScheduledConnection) -> None:
         """A connection ended."""
-        if member in self.open:
-            self.open.discard(member)
-            self.doorkeeper.ended(member)
+        if member in self.connections:
+            self.connections.discard(member)
+            self.admission_policy.ended(member)
         self._tell_when_all_closed()
 
-    def part(self, connection: socket.socket) -> None:
+    def linger(self, connection: socket.socket) -> None:
         """Close a connection whose last bytes are on their way, see `LingeringClose`."""
-        if len(self._farewells) < FAREWELLS:
-            farewell = LingeringClose(connection, self._parted, self.entries)
-            self._farewells.add(farewell)
-            farewell.listen()
+        if len(self._lingering) < LINGERING_CLOSES:
+            lingering = LingeringClose(connection, self._lingering_ended, self.entries)
+            self._lingering.add(lingering)
+            lingering.listen()
         else:
             connection.close()
 
-    def _parted(self, farewell: LingeringClose) -> None:
-        self._farewells.discard(farewell)
+    def _lingering_ended(self, lingering: LingeringClose) -> None:
+        self._lingering.discard(lingering)
         self._tell_when_all_closed()
 
     def _tell_when_all_closed(self) -> None:
-        if self._all_closed is not None and not self.open and not self._farewells:
+        if self._all_closed is not None and not self.connections and not self._lingering:
             self._all_closed.set()
 
     async def close(self, timeout: float) -> None:
         """Close everything; who does not read the last bytes in so many seconds is cut off."""
-        for member in list(self.open):
+        for member in list(self.connections):
             member.close()
         for task in list(self.tasks):
             task.cancel()
-        if self.open or self._farewells:
+        if self.connections or self._lingering:
             self._all_closed = asyncio.Event()
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._all_closed.wait(), timeout)
-        for member in list(self.open):
+        for member in list(self.connections):
             member.abort()
-        for farewell in list(self._farewells):
-            farewell.end()
+        for lingering in list(self._lingering):
+            lingering.end()
         self._spare.close()

@@ -164,7 +164,7 @@ def peer_status(connection: socket.socket) -> PeerStatus:
     return PeerStatus(round_trip / 1e6, min(data, ack) / 1e3, unread > 0)
 
 
-class Inbox(NamedTuple):
+class ReceiveBuffer(NamedTuple):
     """What the system has received of a connection, as `Inflow.look` takes it."""
 
     unread: bool
@@ -173,25 +173,25 @@ class Inbox(NamedTuple):
     round_trip: float
 
 
-def inbox(connection: socket.socket) -> Inbox:
+def receive_buffer(connection: socket.socket) -> ReceiveBuffer:
     """How much of what has come is not read, and whether the other end may keep more back for that:
     its window is much smaller than it may be."""
     try:
         waits = _unread(connection)
         if connection.family == socket.AF_UNIX:
-            return Inbox(waits > 0, waits > _MUCH, 0, 0.0)
+            return ReceiveBuffer(waits > 0, waits > _MUCH, 0, 0.0)
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_SIZE)
         (round_trip,) = struct.unpack_from("=I", info, _ROUND_TRIP)
         (received,) = struct.unpack_from("=Q", info.ljust(_TCP_INFO_SIZE, b"\0"), _RECEIVED)
     except (OSError, ValueError, AttributeError, struct.error):  # closed, or this is no Linux
-        return Inbox(unread=False, full=False, received=0, round_trip=0.0)
+        return ReceiveBuffer(unread=False, full=False, received=0, round_trip=0.0)
     try:
         memory = connection.getsockopt(socket.SOL_SOCKET, _MEMORY, _MEMORY_SIZE)
         taken, most = struct.unpack_from("=II", memory)
         full = 4 * taken > most
     except (OSError, struct.error):  # before 4.12
         full = waits > _MUCH
-    return Inbox(waits > 0, full, received, round_trip / 1e6)
+    return ReceiveBuffer(waits > 0, full, received, round_trip / 1e6)
 
 
 def _unread(connection: socket.socket) -> int:

@@ -15,8 +15,8 @@ import ssl
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
-from appliance.net.callbacks import Faulty, contained, contained_made
-from appliance.net.turns import Charged, Turns
+from appliance.net.callbacks import FaultHandler, contained, contained_made
+from appliance.net.layers import LayerScheduler, UpperLayer
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -34,7 +34,7 @@ RECORDS_A_TURN = 256
 RECORD_COST = 1
 
 #: Bytes of a chunk that are little: it may be read although others have to be served.
-LITTLE = 4096
+SMALL_CHUNK = 4096
 
 #: Seconds that a client gets to read the last bytes before its connection is cut.
 CLOSE_TIMEOUT = 10.0
@@ -59,14 +59,14 @@ async def accept(
     context: ssl.SSLContext,
     protocol: asyncio.Protocol,
     timeout: float,
-    turns: Turns,
-    part: Callable[[socket.socket], None] = socket.socket.close,
+    scheduler: LayerScheduler,
+    linger: Callable[[socket.socket], None] = socket.socket.close,
 ) -> None:
     """Shake hands as the server on an accepted connection; from then on it is the protocol's.
 
-    Of many records in one chunk only some are read at a time, in `turns` with other connections.
+    Of many records in one chunk only some are read at a time, in `layers` with other connections.
 
-    When this fails the connection is closed, and the protocol has not heard of it. `part` closes
+    When this fails the connection is closed, and the protocol has not heard of it. `linger` closes
     one on which an alert was written, which says why: in TLS 1.3 the client may be sending already.
 
     Raises:
@@ -74,7 +74,9 @@ async def accept(
         ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
         OSError: the client is gone.
     """
-    error = await TlsTransport(protocol, context, turns, part).shake_hands(connection, timeout)
+    error = await TlsTransport(protocol, context, scheduler, linger).shake_hands(
+        connection, timeout
+    )
     if error is not None:
         try:
             raise error
@@ -99,21 +101,21 @@ class TlsTransport:
         self,
         protocol: asyncio.Protocol,
         context: ssl.SSLContext,
-        turns: Turns,
-        part: Callable[[socket.socket], None] = socket.socket.close,
+        scheduler: LayerScheduler,
+        linger: Callable[[socket.socket], None] = socket.socket.close,
     ) -> None:
-        self._entries = turns.entries
+        self._entries = scheduler.entries
         self._loop = self._entries.loop
         #: The end of the handshake, and why it failed if it did.
         self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
         self._protocol = protocol
-        self._part = part
+        self._linger = linger
         #: The connection under the TCP transport, when an alert is the last thing written to it.
         self._connection: socket.socket | None = None
-        self._turns = turns
+        self._scheduler = scheduler
         #: What arrived and OpenSSL was not given, and whether that or OpenSSL has more to read.
         self._rest = _NOTHING
-        self._set_apart = 0  # bytes that it takes, as the protocol was told
+        self._buffered = 0  # bytes that it takes, as the protocol was told
         self._waits = False
         self._queued = False
         self._incoming = ssl.MemoryBIO()
@@ -149,7 +151,7 @@ class TlsTransport:
     def fault(self, entry: str, error: Exception) -> None:
         """End this connection, as something that nobody expected escaped while it was served."""
         if self._connected and self._protocol is not _NOBODY:
-            cast(Faulty, self._protocol).fault(entry, error)
+            cast(FaultHandler, self._protocol).fault(entry, error)
             return
         self._entries.faults.caught(entry, error)
         if not self._handshake.done():
@@ -168,8 +170,8 @@ class TlsTransport:
             if not self._open:
                 if not self._connected:
                     self._handshake_received(data)
-            elif self._waits or self._turns.has_to_wait(
-                cast(Charged, self._protocol), is_little=len(data) <= LITTLE
+            elif self._waits or self._scheduler.must_wait(
+                cast(UpperLayer, self._protocol), is_small=len(data) <= SMALL_CHUNK
             ):
                 self._rest = memoryview(bytes(self._rest) + data if self._rest else data)
                 self._count_rest()
@@ -192,15 +194,15 @@ class TlsTransport:
                 view = view[PIECE:]
                 self._read(parts)
             self._rest = view or _NOTHING  # an empty part would keep the whole
-        if self._rest or self._set_apart:
+        if self._rest or self._buffered:
             self._count_rest()
         if len(parts) > 1:
-            self._turns.count(RECORD_COST * len(parts), cast(Charged, self._protocol))
+            self._scheduler.count_cost(RECORD_COST * len(parts), cast(UpperLayer, self._protocol))
         if parts:
             self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
         if self._cut or self._has_told_cut:  # each time: what was told is over with what came
             self._has_told_cut = self._cut
-            cast(Charged, self._protocol).has_part(self._cut)
+            cast(UpperLayer, self._protocol).partial_record(self._cut)
         if self._waits and not self._ended:
             self._wait()
         elif self._ended or self._outgoing.pending:
@@ -212,8 +214,8 @@ class TlsTransport:
         try:
             # Room for no more than there can be: OpenSSL's caller has it set apart beforehand.
             size = RECORD_SIZE if self._cut else self._incoming.pending
-            while part := self._tls.read(size):
-                parts.append(part)
+            while linger := self._tls.read(size):
+                parts.append(linger)
                 if not self._incoming.pending:  # not to be told so by an exception
                     self._cut = False
                     return
@@ -230,9 +232,9 @@ class TlsTransport:
     def _count_rest(self) -> None:
         """Tell the protocol what memory is taken by what OpenSSL was not given: a whole chunk."""
         size = len(cast(bytes, self._rest.obj))
-        if size != self._set_apart:
-            self._set_apart = size
-            cast(Charged, self._protocol).set_apart(size)
+        if size != self._buffered:
+            self._buffered = size
+            cast(UpperLayer, self._protocol).count_buffered(size)
 
     def _wait(self) -> None:
         """Read nothing more until the others have had their turn."""
@@ -240,10 +242,10 @@ class TlsTransport:
         if not self._open:
             return
         self._tcp.pause_reading()
-        cast(Charged, self._protocol).is_not_read()
+        cast(UpperLayer, self._protocol).input_paused()
         if self._reading and not self._queued:
             self._queued = True
-            self._turns.queue_turn(self)
+            self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
         """The others have had their turn."""
@@ -259,7 +261,7 @@ class TlsTransport:
             self._ended = True
             self._react()
         elif self._reading:
-            cast(Charged, self._protocol).is_read()
+            cast(UpperLayer, self._protocol).input_resumed()
             self._tcp.resume_reading()
 
     def _react(self) -> None:
@@ -327,7 +329,7 @@ class TlsTransport:
             error = ConnectionResetError("it hung up before the end of the handshake")
             self._handshake.set_result(exc or error)
         if self._connection is not None:
-            self._part(self._connection)
+            self._linger(self._connection)
         protocol, self._protocol = self._protocol, _NOBODY
         if self._connected:
             protocol.connection_lost(exc or self._error)
@@ -479,8 +481,8 @@ def name_in(certificate: Mapping[str, Any] | None) -> str:
     """The common name of a certificate's subject, or else its first alternative name."""
     if not certificate:
         return ""
-    for part in certificate.get("subject", ()):
-        for key, value in part:
+    for linger in certificate.get("subject", ()):
+        for key, value in linger:
             if key == "commonName":
                 return str(value)
     return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")

@@ -16,7 +16,7 @@ from websockets.typing import Subprotocol
 
 from appliance.broker.accounts import Account
 from appliance.net.callbacks import contained, contained_made
-from appliance.net.turns import Charged, Turns
+from appliance.net.layers import LayerScheduler, UpperLayer
 
 #: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
 PATH = "/mqtt"
@@ -49,7 +49,7 @@ _library_log = logging.getLogger(f"{__name__}.frames")
 _library_log.setLevel(logging.ERROR)
 
 
-class Upper(Charged, Protocol):
+class WebSocketHandler(UpperLayer, Protocol):
     """What can be above a WebSocket: an `asyncio.Protocol` that answers for the connection."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -73,10 +73,10 @@ class Upper(Charged, Protocol):
     def frame_limit(self) -> int:
         """How large a frame may be that is received now, in bytes."""
 
-    def keep(self, size: int) -> None:
+    def count_partial_frame(self, size: int) -> None:
         """So many bytes of a frame are kept until it is complete."""
 
-    def complain(self, what: str, why: str) -> None:
+    def log_refusal(self, what: str, why: str) -> None:
         """Tell the log what was refused or ended."""
 
     def close(self) -> None:
@@ -99,20 +99,20 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     password to it by itself.
     """
 
-    def __init__(self, protocol: Upper, turns: Turns) -> None:
+    def __init__(self, protocol: WebSocketHandler, scheduler: LayerScheduler) -> None:
         super().__init__()
         self._protocol = protocol
-        self._turns = turns
+        self._scheduler = scheduler
         self._queued = False
         self._frames_left = FRAMES_A_TURN
         self._frames = _Frames(logger=_library_log)
         #: The HTTP request, until it is complete.
         self._head = bytearray()
         #: Received, and not yet taken apart.
-        self._held = _NOTHING
+        self._backlog = _NOTHING
         #: Bytes that TLS below has kept, and that are kept here beside them.
         self._below = 0
-        self._set_apart = 0
+        self._buffered = 0
         self._reading = True
         self._writing = True
         #: The answer to the last ping, while it cannot be written.
@@ -133,76 +133,78 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     @contained("websocket.chunk")
     def data_received(self, data: bytes) -> None:
         """Hand on what the frames hold, whole or in part."""
-        self._held = memoryview(bytes(self._held) + data if self._held else data)
-        is_little = len(self._held) <= PORTION
-        if self._queued or self._turns.has_to_wait(self._protocol, is_little=is_little):
+        self._backlog = memoryview(bytes(self._backlog) + data if self._backlog else data)
+        is_small = len(self._backlog) <= PORTION
+        if self._queued or self._scheduler.must_wait(self._protocol, is_small=is_small):
             self._take_later()
         else:
             self._take()
-        self._count_held()
+        self._count_backlog()
 
-    def _count_held(self) -> None:
+    def _count_backlog(self) -> None:
         """Tell what is above what memory is taken by what is not taken apart: a whole chunk."""
-        size = len(cast(bytes, self._held.obj)) + len(self._head)
-        if size != self._set_apart:
-            self._set_apart = size
-            self._protocol.set_apart(self._below + size)
+        size = len(cast(bytes, self._backlog.obj)) + len(self._head)
+        if size != self._buffered:
+            self._buffered = size
+            self._protocol.count_buffered(self._below + size)
 
     @property
     def account(self) -> Account:
         """Whose user is charged for what TLS does below."""
         return self._protocol.account
 
-    def set_apart(self, size: int) -> None:
+    def count_buffered(self, size: int) -> None:
         """TLS below keeps so many bytes."""
         self._below = size
-        self._protocol.set_apart(size + self._set_apart)
+        self._protocol.count_buffered(size + self._buffered)
 
-    def is_not_read(self) -> None:
+    def input_paused(self) -> None:
         """What has come waits in TLS."""
-        self._protocol.is_not_read()
+        self._protocol.input_paused()
 
-    def is_read(self) -> None:
+    def input_resumed(self) -> None:
         """It waits there no longer."""
-        self._protocol.is_read()
+        self._protocol.input_resumed()
 
-    def has_part(self, part: bool) -> None:
+    def partial_record(self, part: bool) -> None:
         """Whether TLS keeps the beginning of a record."""
-        self._protocol.has_part(part)
+        self._protocol.partial_record(part)
 
     def _take(self) -> None:
         """Take apart what is there, until others have their turn; reading is paused then."""
         self._frames_left = FRAMES_A_TURN
-        while self._held and self._reading and not self._transport.is_closing():
-            data = bytes(self._held[:PORTION])
-            self._held = self._held[PORTION:] or _NOTHING  # an empty part would keep the whole
+        while self._backlog and self._reading and not self._transport.is_closing():
+            data = bytes(self._backlog[:PORTION])
+            self._backlog = (
+                self._backlog[PORTION:] or _NOTHING
+            )  # an empty part would keep the whole
             if self._frames.state is State.CONNECTING:
                 data = self._receive_head(data)
             if data:
                 self._receive_frames(data)
-            if self._held and self._frames_left <= 0:
+            if self._backlog and self._frames_left <= 0:
                 self._take_later()
                 break
 
     def _take_later(self) -> None:
         """Let the others have their turn first."""
         self._transport.pause_reading()
-        self._protocol.is_not_read()
+        self._protocol.input_paused()
         if not self._queued:
             self._queued = True
-            self._turns.queue_turn(self)
+            self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
         """The others have had their turn."""
         self._queued = False
         self._take()
-        self._count_held()
+        self._count_backlog()
         if not self._reading or self._transport.is_closing():
             return
         if self._frames.close_rcvd is not None:
             self._transport.close()
-        elif not (self._held or self._queued):
-            self._protocol.is_read()
+        elif not (self._backlog or self._queued):
+            self._protocol.input_resumed()
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:
@@ -213,7 +215,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if not head[:1].isupper():
             self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
         elif end > 3:
-            self._turns.count(HEAD_COST, self._protocol)
+            self._scheduler.count_cost(HEAD_COST, self._protocol)
             # The library would read frames before the answer to the request, so it gets the two
             # one after the other.
             self._frames.receive_data(bytes(head[:end]))
@@ -262,7 +264,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
 
     def _send_refusal(self, response: Response | None, reason: str) -> None:
-        self._protocol.complain("no WebSocket connection", reason)
+        self._protocol.log_refusal("no WebSocket connection", reason)
         if response is not None:
             self._transport.write(response.serialize())
         self._protocol.close()
@@ -276,7 +278,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         events = frames.events_received()
         self._frames_left -= len(events)
         if len(events) > 1:
-            self._turns.count(FRAME_COST * len(events), self._protocol)
+            self._scheduler.count_cost(FRAME_COST * len(events), self._protocol)
         for frame in events:
             assert not isinstance(frame, Request | Response)
             if frame.opcode is Opcode.TEXT:  # [MQTT-6.0.0-1]
@@ -289,8 +291,8 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._answer(frames.data_to_send())
         kept = len(frames.reader.buffer)
         if kept and events:  # of the next one
-            self._protocol.keep(0)
-        self._protocol.keep(kept)
+            self._protocol.count_partial_frame(0)
+        self._protocol.count_partial_frame(kept)
         error = frames.parser_exc
         if is_text:
             self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
@@ -311,7 +313,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._pong = writes[-1]
 
     def _fail(self, code: CloseCode, reason: str) -> None:
-        self._protocol.complain("not the WebSocket protocol", reason)
+        self._protocol.log_refusal("not the WebSocket protocol", reason)
         if self._frames.state is State.OPEN:
             self._frames.send_close(code, reason)
             self._send(self._frames.data_to_send())
@@ -377,7 +379,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def resume_reading(self) -> None:
         """Go on with what was received meanwhile."""
         self._reading = True
-        if self._held or self._frames.close_rcvd is not None:
+        if self._backlog or self._frames.close_rcvd is not None:
             self._take_later()
         else:
             self._transport.resume_reading()
@@ -397,7 +399,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         """What the transport below knows; `has_unread`: whether any of the two keeps what has come
         and was not handed on, be it a part of a frame."""
-        if name == "has_unread" and (self._held or self._frames.reader.buffer):
+        if name == "has_unread" and (self._backlog or self._frames.reader.buffer):
             return True
         return self._transport.get_extra_info(name, default)
 

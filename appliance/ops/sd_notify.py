@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 
-from appliance.net.callbacks import Entries, Repeated
+from appliance.net.callbacks import Entries, PeriodicCallback
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class Notifier:
         """`address` is a path, or a name behind `@` of an abstract socket; None tells nobody."""
         self.watchdog = watchdog if address else None
         self._socket = _connect(address) if address else None
-        self._timer: Repeated | None = None
+        self._timer: PeriodicCallback | None = None
         self._status = ""
         self._owes_ready = False
 

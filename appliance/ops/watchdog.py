@@ -27,10 +27,10 @@ class Pulse:
     """
 
     def __init__(
-        self, broker: Broker, network: Scheduler, session: Session, time: Callable[[], float]
+        self, broker: Broker, scheduler: Scheduler, session: Session, time: Callable[[], float]
     ) -> None:
         self._broker = broker
-        self._network = network
+        self._scheduler = scheduler
         self._session = session
         self._time = time
         #: Whether the last message is on its way, and whether one has gone through.
@@ -54,7 +54,7 @@ class Pulse:
         self._came_through = False
         if not self._is_sent:
             self._is_sent = True
-            self._network.queue_turn(self)
+            self._scheduler.queue_turn(self)
         return not problem
 
     def take_turn(self) -> None:

@@ -34,7 +34,7 @@ from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect, Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
-from appliance.net.callbacks import Entries, Repeated, shield
+from appliance.net.callbacks import Entries, PeriodicCallback, contained_proxy
 from appliance.plugins.access import PluginAccess
 from appliance.plugins.adapters import RetainedMessages, Sessions, Unclaimed, login_of
 from appliance.plugins.events import PluginEvents
@@ -203,7 +203,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._certificate_user = certificate_user
         self._views = Sessions(broker)
         self._inside: Session | None = None
-        self._timer: Repeated | None = None
+        self._timer: PeriodicCallback | None = None
         try:
             super().__init__(config)
         except (PluginError, PluginLoadError) as error:
@@ -248,7 +248,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             self.broker.access = self.broker.router.pending_decisions = self._access
             if self._events.about_clients:
                 faults = self.broker.faults
-                self.broker.observer = shield("plugins.observer", faults, self._events)
+                self.broker.observer = contained_proxy("plugins.observer", faults, self._events)
             interval = self._answers.of_topic(allowed=True)
             entries = Entries(asyncio.get_running_loop(), self.broker.faults)
             self._timer = entries.every("plugins.tick", interval, self._tick, 0)

@@ -28,7 +28,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.callbacks import Entries, Repeated
+from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics
 from appliance.ros.mailbox import Lane, Mailbox
@@ -141,7 +141,7 @@ class Bridge:
             entries, self._post, broker, Leases(), self._turns, StalenessDetector()
         )
         self._diagnostics = Diagnostics(robot, broker, self, diagnostics) if diagnostics else None
-        self._meter_timer: Repeated | None = None
+        self._meter_timer: PeriodicCallback | None = None
         self._metered = 0
         #: What was last told of what is bridged.
         self._announced = b""

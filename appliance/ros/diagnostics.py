@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any, Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
-from appliance.net.callbacks import Entries, Repeated
+from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.ros.node import BusError, QosProfile, RosNode, RosPublisher
 from appliance.ros.payload.converter import ConversionError, Converter, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
@@ -62,7 +62,7 @@ class Diagnostics:
         #: Replaced as one by the ROS thread.
         self._out: tuple[Converter, RosPublisher] | None = None
         self._has_looked = False
-        self._timer: Repeated | None = None
+        self._timer: PeriodicCallback | None = None
         #: What had been counted when it was last told, by the name of the status.
         self._told: _Told = {}
 

@@ -21,7 +21,7 @@ from appliance.broker.saved_sessions import restore
 from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.host.clock import NUDGE, StepWatch
 from appliance.mqtt.packets import Subscription
-from appliance.net.callbacks import Entries, Repeated
+from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.store import database
 from appliance.store.clock import KEY, Clocks, Stamp, boot_id, stamp_of
 from appliance.store.loader import (
@@ -141,7 +141,7 @@ class SqliteStore:
         self._writing = False
         self._running = False
         self._timer: asyncio.TimerHandle | None = None
-        self._clock: Repeated | None = None
+        self._clock: PeriodicCallback | None = None
         self._tell: Callable[[bool], None] = lambda kept: None
         #: Whether somebody waits for what is in the open batch.
         self._urgent = False

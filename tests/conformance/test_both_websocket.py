@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
-from house import abort
+from harness import abort
 from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
@@ -50,7 +50,7 @@ def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
     return bytes((last << 7 | opcode,)) + length + mask + masked
 
 
-class Caller:
+class Peer:
     """The client's end of a connection."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -64,25 +64,25 @@ class Caller:
         lines += ["Connection: Upgrade", f"Sec-WebSocket-Key: {KEY}", "Sec-WebSocket-Version: 13"]
         if subprotocols:
             lines.append(f"Sec-WebSocket-Protocol: {', '.join(subprotocols)}")
-        self.say("\r\n".join([*lines, "", ""]).encode())
+        self.send("\r\n".join([*lines, "", ""]).encode())
         answer = await asyncio.wait_for(self._reader.readuntil(b"\r\n\r\n"), PATIENCE)
         first, *headers = answer.decode().split("\r\n")[:-2]
         pairs = (header.partition(": ") for header in headers)
         return {"": first} | {name.lower(): value for name, _, value in pairs}
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self._writer.write(data)
 
-    async def hear(self, size: int) -> bytes:
+    async def receive(self, size: int) -> bytes:
         """So many bytes of MQTT, out of as many frames as it takes; all of them are binary."""
         while len(self._heard) < size:
-            opcode, payload = await self.hear_frame()
+            opcode, payload = await self.receive_frame()
             assert opcode == BINARY
             self._heard += payload
         heard, self._heard = self._heard[:size], self._heard[size:]
         return heard
 
-    async def hear_frame(self) -> tuple[int, bytes]:
+    async def receive_frame(self) -> tuple[int, bytes]:
         """Opcode and payload of the next frame, which is a whole message and not masked."""
         return await asyncio.wait_for(self._hear_frame(), PATIENCE)
 
@@ -97,23 +97,23 @@ class Caller:
         """Whether the connection ends without another packet of MQTT."""
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
             while True:
-                opcode, _ = await self.hear_frame()
+                opcode, _ = await self.receive_frame()
                 if opcode == BINARY:
                     return False
         return True
 
     async def log_in(self, version: int) -> None:
         assert (await self.ask("mqtt"))[""].split()[1] == "101"
-        self.say(frame(BINARY, Connect("c", version=version).encode()))
+        self.send(frame(BINARY, Connect("c", version=version).encode()))
         await self.hear_connack()
 
     async def hear_connack(self) -> None:
-        first, size = await self.hear(2)
+        first, size = await self.receive(2)
         assert first == 0x20
-        assert (await self.hear(size))[:2] == b"\0\0"
+        assert (await self.receive(size))[:2] == b"\0\0"
 
 
-Dial = Callable[[], Awaitable[Caller]]
+Dial = Callable[[], Awaitable[Peer]]
 
 
 @pytest.fixture
@@ -128,10 +128,10 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
     ((host, port),) = await listeners.start([settings])
     async with contextlib.AsyncExitStack() as stack:
 
-        async def dial() -> Caller:
+        async def dial() -> Peer:
             reader, writer = await asyncio.open_connection(host, port)
             stack.callback(abort, writer.transport)
-            return Caller(reader, writer)
+            return Peer(reader, writer)
 
         yield dial
     await listeners.stop()
@@ -151,23 +151,23 @@ async def test_the_subprotocol_is_mqtt(dial: Dial, offered: list[str]) -> None:
 async def test_without_that_subprotocol_there_is_no_mqtt(
     broker: Broker, dial: Dial, offered: list[str]
 ) -> None:
-    caller = await dial()
-    assert not (await caller.ask(*offered))[""].startswith("HTTP/1.1 101 ")
+    peer = await dial()
+    assert not (await peer.ask(*offered))[""].startswith("HTTP/1.1 101 ")
     assert broker.sessions == {}
 
 
 @statement("MQTT-6.0.0-1")
 async def test_packets_come_in_binary_frames(dial: Dial, version: int) -> None:
-    caller = await dial()
-    await caller.log_in(version)
-    caller.say(frame(BINARY, Subscribe(1, [Subscription("a")]).encode(version)))
-    assert (await caller.hear(5))[:1] == b"\x90"
+    peer = await dial()
+    await peer.log_in(version)
+    peer.send(frame(BINARY, Subscribe(1, [Subscription("a")]).encode(version)))
+    assert (await peer.receive(5))[:1] == b"\x90"
     if version == 5:
-        await caller.hear(1)
+        await peer.receive(1)
     for size in (0, 100, 200, 70_000):
         message = Publish("a", bytes(size)).encode(version)
-        caller.say(frame(BINARY, message))
-        assert await caller.hear(len(message)) == message
+        peer.send(frame(BINARY, message))
+        assert await peer.receive(len(message)) == message
 
 
 @statement("MQTT-6.0.0-1")
@@ -176,28 +176,28 @@ async def test_packets_come_in_binary_frames(dial: Dial, version: int) -> None:
 async def test_a_text_frame_closes_the_connection(
     broker: Broker, dial: Dial, version: int, payload: str, logged_in: bool
 ) -> None:
-    caller = await dial()
+    peer = await dial()
     if logged_in:
-        await caller.log_in(version)
+        await peer.log_in(version)
     else:
-        await caller.ask("mqtt")
+        await peer.ask("mqtt")
     data = payload.encode()
     if payload == "a packet":
         data = Publish("a", b"x", retain=True).encode(version)  # UTF-8, as it happens
-    caller.say(frame(TEXT, data) + frame(BINARY, Pingreq().encode(version)))
-    assert await caller.is_hung_up()
+    peer.send(frame(TEXT, data) + frame(BINARY, Pingreq().encode(version)))
+    assert await peer.is_hung_up()
     assert len(broker.retained) == 0
     assert broker.clients == set()
 
 
 @statement("MQTT-6.0.0-2")
 async def test_one_frame_may_hold_many_packets(dial: Dial, version: int) -> None:
-    caller = await dial()
-    await caller.ask("mqtt")
+    peer = await dial()
+    await peer.ask("mqtt")
     pings = Pingreq().encode(version) * 1000
-    caller.say(frame(BINARY, Connect("c", version=version).encode() + pings))
-    await caller.hear_connack()
-    assert await caller.hear(2000) == b"\xd0\0" * 1000
+    peer.send(frame(BINARY, Connect("c", version=version).encode() + pings))
+    await peer.hear_connack()
+    assert await peer.receive(2000) == b"\xd0\0" * 1000
 
 
 @statement("MQTT-6.0.0-2")
@@ -207,25 +207,25 @@ async def test_packets_may_be_cut_over_frames(
     dial: Dial, version: int, size: int, fragments: bool
 ) -> None:
     """As messages of their own, or as the fragments of one."""
-    caller = await dial()
-    await caller.ask("mqtt")
+    peer = await dial()
+    await peer.ask("mqtt")
     message = Publish("a", bytes(range(256))).encode(version)
     data = Connect("c", version=version).encode()
     data += Subscribe(1, [Subscription("a")]).encode(version) + message + Pingreq().encode(version)
     pieces = [data[start : start + size] for start in range(0, len(data), size)]
     for index, piece in enumerate(pieces):
         opcode = BINARY if index == 0 or not fragments else CONTINUATION
-        caller.say(frame(opcode, piece, last=not fragments or index == len(pieces) - 1))
-    await caller.hear_connack()
-    assert (await caller.hear(5 if version == 4 else 6))[:1] == b"\x90"
-    assert await caller.hear(len(message)) == message
-    assert await caller.hear(2) == b"\xd0\0"
+        peer.send(frame(opcode, piece, last=not fragments or index == len(pieces) - 1))
+    await peer.hear_connack()
+    assert (await peer.receive(5 if version == 4 else 6))[:1] == b"\x90"
+    assert await peer.receive(len(message)) == message
+    assert await peer.receive(2) == b"\xd0\0"
 
 
 @statement("MQTT-6.0.0-2")
 async def test_control_frames_in_the_middle_of_a_packet(dial: Dial, version: int) -> None:
-    caller = await dial()
-    await caller.log_in(version)
-    caller.say(frame(BINARY, b"\xc0") + frame(PING, b"there?") + frame(BINARY, b"\0"))
-    frames = [await caller.hear_frame(), await caller.hear_frame()]
+    peer = await dial()
+    await peer.log_in(version)
+    peer.send(frame(BINARY, b"\xc0") + frame(PING, b"there?") + frame(BINARY, b"\0"))
+    frames = [await peer.receive_frame(), await peer.receive_frame()]
     assert sorted(frames) == [(BINARY, b"\xd0\0"), (PONG, b"there?")]

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from appliance.broker.faults import Faults
-from appliance.net.callbacks import Entries, contained, shield
+from appliance.net.callbacks import Entries, contained, contained_proxy
 
 PACKAGE = Path(__file__).parents[2] / "appliance"
 
 #: The one module that may hand callbacks to the loop.
-ENTRIES = PACKAGE / "entries.py"
+ENTRIES = PACKAGE / "net/callbacks.py"
 
 #: How a callback gets to a loop, or to a future of it.
 TO_THE_LOOP = {
@@ -49,7 +49,7 @@ OF_A_PROTOCOL = {
 }
 
 #: These are programs of their own, or clients: they have nobody else to harm.
-PROGRAMS = ("bench/", "cli.py", "client.py", "caller.py", "commands/", "demo.py", "tour.py")
+PROGRAMS = ("bench/", "cli/")
 
 #: These know no loop.
 PURE = ("broker/", "mqtt/")
@@ -57,25 +57,26 @@ PURE = ("broker/", "mqtt/")
 #: Those that stay: what is called there cannot fail, or is contained where it is.
 ALLOWED = {
     # Sets an event, and has to work before there is anything else.
-    ("app.py", "add_signal_handler"),
+    ("app/main.py", "add_signal_handler"),
     # Another object's, which hands it on to the ROS thread's executor and contains it there.
-    ("ros/*", "call_soon"),
+    ("ros/calls/*", "call_soon"),
+    ("ros/ros1/*", "call_soon"),
     # A future that `checks` settles itself; and one that the login waits for, and with it ends.
     ("access/checks.py", "add_done_callback"),
     ("access/files.py", "create_task"),
     ("access/files.py", "add_done_callback"),
     # Waited for where they are made, or made so that nothing escapes: plugins may raise anything.
-    ("amqtt_broker/guard.py", "ensure_future"),
-    ("amqtt_broker/access.py", "ensure_future"),
-    ("amqtt_broker/logins.py", "ensure_future"),
-    ("amqtt_broker/logins.py", "add_done_callback"),
-    ("amqtt_broker/events.py", "add_done_callback"),
-    ("amqtt_broker/threads.py", "call_soon_threadsafe"),
+    ("plugins/guard.py", "ensure_future"),
+    ("plugins/access.py", "ensure_future"),
+    ("plugins/logins.py", "ensure_future"),
+    ("plugins/logins.py", "add_done_callback"),
+    ("plugins/events.py", "add_done_callback"),
+    ("plugins/threads.py", "call_soon_threadsafe"),
     # Waited for where it is made.
-    ("ros/actions.py", "ensure_future"),
+    ("ros/calls/actions.py", "ensure_future"),
     # The executor's, and a Future of rclpy's: `run` contains it.
-    ("ros/ros2.py", "create_task"),
-    ("ros/ros2.py", "add_done_callback"),
+    ("ros/ros2/node.py", "create_task"),
+    ("ros/ros2/node.py", "add_done_callback"),
 }
 
 
@@ -253,7 +254,7 @@ def test_who_is_told_harms_nobody(escaped):
         refused = fail
 
     faults = Faults()
-    observer = shield("observer", faults, Observer())
+    observer = contained_proxy("observer", faults, Observer())
     assert observer.told("x") == "x" and observer.refused("y") is None
     assert faults.by_entry == {"observer": 1}
     escaped.clear()

@@ -9,38 +9,38 @@ import socket
 import time
 
 import pytest
-from house import House, Watches
-from test_websocket import frame, hear_frame, shake_hands
+from harness import Harness, PublishObserver
+from test_websocket import frame, receive_frame, shake_hands
 from waiting import PATIENCE, until
 
 from appliance.broker.ports import LOCAL_PEER, PeerStatus
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.net import connection as wire_module
 from appliance.net.connection import ClientConnection
-from appliance.net.sockets import Probe, inbox, peer_status
+from appliance.net.sockets import Probe, peer_status, receive_buffer
 
 HOST = "127.0.0.1"
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_INFO"), reason="only Linux tells")
 
-__all__ = ["House"]
+__all__ = ["Harness"]
 
 
 @pytest.fixture
-async def house(tmp_path_factory):
-    from house import make_contexts
+async def harness(tmp_path_factory):
+    from harness import make_contexts
 
-    house = House(*make_contexts(tmp_path_factory.mktemp("certs")))
-    await house.start()
-    yield house
-    await house.close()
+    harness = Harness(*make_contexts(tmp_path_factory.mktemp("certs")))
+    await harness.start()
+    yield harness
+    await harness.close()
 
 
 @pytest.mark.parametrize("tls", [False, True])
-async def test_a_probe_is_answered_by_the_computer_and_not_by_the_client(house, tls):
+async def test_a_probe_is_answered_by_the_computer_and_not_by_the_client(harness, tls):
     """The client itself reads nothing and says nothing."""
-    await house.join("a", tls=tls)
-    wire = house.protocol("a")
+    await harness.log_in("a", tls=tls)
+    wire = harness.protocol("a")
     begun = time.monotonic()
     while wire.peer_status().silence < 0.3:
         assert time.monotonic() < begun + 20, f"it is never silent: {wire.peer_status()}"
@@ -56,35 +56,35 @@ async def test_a_probe_is_answered_by_the_computer_and_not_by_the_client(house, 
     assert 0 <= wire.peer_status().round_trip < 5
 
 
-async def test_what_is_withheld_comes_in_its_order(house):
-    caller = await house.join("a")
-    wire = house.protocol("a")
+async def test_what_is_withheld_comes_in_its_order(harness):
+    peer = await harness.log_in("a")
+    wire = harness.protocol("a")
     wire.withhold(60)
-    await caller.say(Pingreq(), Subscribe(1, [Subscription("x")]))
+    await peer.send(Pingreq(), Subscribe(1, [Subscription("x")]))
     await until_waiting(wire)
     wire.resume_writing()  # the network takes more, and that is no reason
     assert wire._waiting
     wire.withhold(0)
-    assert isinstance(await caller.hear(), Pingresp)
-    assert (await caller.hear()).packet_id == 1
+    assert isinstance(await peer.receive(), Pingresp)
+    assert (await peer.receive()).packet_id == 1
     wire.withhold(0.01)
-    await caller.say(Pingreq())
-    assert isinstance(await caller.hear(), Pingresp)
+    await peer.send(Pingreq())
+    assert isinstance(await peer.receive(), Pingresp)
     assert not wire._paused
 
 
-async def test_who_leaves_or_is_closed_while_something_is_withheld(house):
-    gone, closed = await house.join("gone"), await house.join("closed")
-    for name, caller in (("gone", gone), ("closed", closed)):
-        wire = house.protocol(name)
+async def test_who_leaves_or_is_closed_while_something_is_withheld(harness):
+    gone, closed = await harness.log_in("gone"), await harness.log_in("closed")
+    for name, peer in (("gone", gone), ("closed", closed)):
+        wire = harness.protocol(name)
         wire.withhold(0.2)
-        await caller.say(Pingreq())
+        await peer.send(Pingreq())
         await until_waiting(wire)
-    house.protocol("closed").close()
+    harness.protocol("closed").close()
     gone.writer.transport.abort()
-    assert isinstance(await closed.hear(), Pingresp)
+    assert isinstance(await closed.receive(), Pingresp)
     with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
-        await closed.hear()
+        await closed.receive()
 
 
 async def until_waiting(wire):
@@ -118,25 +118,25 @@ def test_a_unix_socket_is_on_this_computer():
 
 
 @pytest.mark.parametrize("in_a_frame", [False, True])
-async def test_a_packet_is_as_old_as_its_first_byte(house, in_a_frame):
-    caller = await house.join("a")
+async def test_a_packet_is_as_old_as_its_first_byte(harness, in_a_frame):
+    peer = await harness.log_in("a")
     heard = []
-    Watches(house, lambda message: heard.append((message.payload, message.age)))
+    PublishObserver(harness, lambda message: heard.append((message.payload, message.age)))
     packet, behind = (Publish("x", payload).encode(5) for payload in (b"late", b"new"))
     begun = time.monotonic()
     if in_a_frame:  # which is kept until it has come
-        house.protocol("a").keep(9)
-        house.protocol("a").keep(10)
+        harness.protocol("a").keep(9)
+        harness.protocol("a").keep(10)
         await asyncio.sleep(0.5)
         parts = [packet + behind, behind]
     else:
         parts = [packet[:3], packet[3:6], packet[6:] + behind, behind]
     for part in parts:
-        caller.writer.write(part)
+        peer.writer.write(part)
         await asyncio.sleep(0.25)
         if in_a_frame:
             await until(lambda: heard)
-            house.protocol("a").keep(0)
+            harness.protocol("a").keep(0)
     took = time.monotonic() - begun
     await until(lambda: len(heard) >= 3)
     assert heard[0][0] == b"late" and 0.3 < heard[0][1] <= took
@@ -144,39 +144,39 @@ async def test_a_packet_is_as_old_as_its_first_byte(house, in_a_frame):
     assert heard[1:] == [(b"new", 0.0)] * 2
 
 
-async def test_what_was_not_read_for_a_time_is_told(house):
-    caller = await house.join("a")
-    wire = house.protocol("a")
+async def test_what_was_not_read_for_a_time_is_told(harness):
+    peer = await harness.log_in("a")
+    wire = harness.protocol("a")
     held = []
-    Watches(house, lambda message: held.append(wire.peer_status().held))
-    await caller.say(Publish("x", b""))
+    PublishObserver(harness, lambda message: held.append(wire.peer_status().held))
+    await peer.send(Publish("x", b""))
     await until(lambda: len(held) == 1)
     wire._rest(0.3)
-    await caller.say(Publish("x", b""))
+    await peer.send(Publish("x", b""))
     await until(lambda: len(held) == 2)
-    await caller.say(Publish("x", b""))
+    await peer.send(Publish("x", b""))
     await until(lambda: len(held) == 3)
     assert held[0] < 0.2  # the login
     assert held[1] > 0.29
     assert held[2] == 0
 
 
-async def test_what_has_come_and_was_not_read_is_told(house):
-    caller = await house.join("a")
-    wire = house.protocol("a")
+async def test_what_has_come_and_was_not_read_is_told(harness):
+    peer = await harness.log_in("a")
+    wire = harness.protocol("a")
     assert not wire.peer_status().has_unread
     wire._rest(PATIENCE)
-    await caller.say(Publish("x", b"1"))
+    await peer.send(Publish("x", b"1"))
     await until(lambda: wire.peer_status().has_unread, "bytes that the system holds")
     heard = []
-    Watches(house, lambda message: heard.append(wire.peer_status().has_unread))
+    PublishObserver(harness, lambda message: heard.append(wire.peer_status().has_unread))
     wire._rest(0)
     await until(lambda: heard, "the message")
     assert heard == [False] and not wire.peer_status().has_unread
     # And what was read, and waits in here for its turn.
-    wire._hold(Publish("x", b"2").encode(5), 0)
+    wire._keep_backlog(Publish("x", b"2").encode(5), 0)
     assert wire.peer_status().has_unread
-    wire._read_on()
+    wire._resume_input()
     await until(lambda: len(heard) == 2, "the message that waited")
     assert not wire.peer_status().has_unread
 
@@ -215,51 +215,53 @@ class FarAway:
 
 @pytest.mark.parametrize("tls", [False, True])
 @pytest.mark.parametrize("websocket", [False, True])
-async def test_what_a_far_client_kept_back_is_not_new(house, monkeypatch, websocket, tls):
+async def test_what_a_far_client_kept_back_is_not_new(harness, monkeypatch, websocket, tls):
     """It says all at once, and is not read for a time; the last of it comes long behind that."""
     monkeypatch.setattr(
-        wire_module, "inbox", lambda sock: inbox(sock)._replace(round_trip=ROUND_TRIP)
+        wire_module,
+        "receive_buffer",
+        lambda sock: receive_buffer(sock)._replace(round_trip=ROUND_TRIP),
     )
     at = 2 * websocket + tls
-    house.ports[at] = await FarAway().start(house.ports[at])
+    harness.ports[at] = await FarAway().start(harness.ports[at])
     if websocket:
-        caller = await shake_hands(house, tls)
-        await caller.say(frame(Connect("a").encode(5)))
-        await hear_frame(caller)
+        peer = await shake_hands(harness, tls)
+        await peer.send(frame(Connect("a").encode(5)))
+        await receive_frame(peer)
     else:
-        caller = await house.join("a", tls=tls)
-    wire, held = house.protocol("a"), []
+        peer = await harness.log_in("a", tls=tls)
+    wire, held = harness.protocol("a"), []
 
     def published(_):
         held.append(wire.peer_status().held)
         if len(held) == 1:
             wire._rest(0.5)
 
-    def say(packet: bytes, times: int = 1) -> None:
+    def send(packet: bytes, times: int = 1) -> None:
         for _ in range(times):
-            caller.writer.write(frame(packet) if websocket else packet)
+            peer.writer.write(frame(packet) if websocket else packet)
 
-    Watches(house, published)
-    say(Publish("x", bytes(1000)).encode(5), 700)
+    PublishObserver(harness, published)
+    send(Publish("x", bytes(1000)).encode(5), 700)
     await until(lambda: len(held) == 700)
     late = [seconds for seconds in held if seconds >= 0.5]
     assert len(late) > 350 and held[-len(late) :] == late
     await until(lambda: not wire._client.inflow.is_behind)
-    say(Publish("x", b"new").encode(5))
+    send(Publish("x", b"new").encode(5))
     await until(lambda: len(held) == 701)
     assert held[-1] == 0
 
 
-async def test_who_streams_on_is_new_again_after_a_pause(house):
+async def test_who_streams_on_is_new_again_after_a_pause(harness):
     """What it had kept back comes faster than what it says from then on."""
-    caller = await house.join("a")
-    wire, held = house.protocol("a"), []
-    Watches(house, lambda _: held.append(wire.peer_status().held))
+    peer = await harness.log_in("a")
+    wire, held = harness.protocol("a"), []
+    PublishObserver(harness, lambda _: held.append(wire.peer_status().held))
     chunk = Publish("x", bytes(3000)).encode(5)
 
     async def stream():
         while True:
-            caller.writer.write(chunk)
+            peer.writer.write(chunk)
             await asyncio.sleep(0.004)
 
     streaming = asyncio.create_task(stream())
@@ -272,57 +274,57 @@ async def test_who_streams_on_is_new_again_after_a_pause(house):
         streaming.cancel()
 
 
-async def test_what_answers_connack_is_new_however_long_the_login_took(house, monkeypatch):
+async def test_what_answers_connack_is_new_however_long_the_login_took(harness, monkeypatch):
     """The client is faster than the rest of what the broker does when it has answered."""
     answer_connect = ClientConnection._answer_connect
 
     def answer_and_be_slow(wire, who):
         answer_connect(wire, who)
-        Watches(house, lambda _: held.append(wire.peer_status().held))
+        PublishObserver(harness, lambda _: held.append(wire.peer_status().held))
         sock = wire._transport.get_extra_info("socket")
         deadline = time.monotonic() + PATIENCE
-        while not inbox(sock).unread:
+        while not receive_buffer(sock).unread:
             assert time.monotonic() < deadline, "no message behind CONNACK"
             time.sleep(0.001)
 
     monkeypatch.setattr(ClientConnection, "_answer_connect", answer_and_be_slow)
     held = []
-    house.gate.clear()
+    harness.gate.clear()
 
     def client() -> None:
-        with socket.create_connection(house.ports[0]) as sock:
+        with socket.create_connection(harness.ports[0]) as sock:
             sock.sendall(Connect("a").encode(5))
             sock.recv(1000)
             sock.sendall(Publish("x", b"").encode(5))
             sock.recv(1000)
 
     talking = asyncio.create_task(asyncio.to_thread(client))
-    await until(lambda: any(wire._logging_in for wire in house.network.open))
+    await until(lambda: any(wire._logging_in for wire in harness.scheduler.connections))
     await asyncio.sleep(0.3)
-    house.gate.set()
+    harness.gate.set()
     await until(lambda: held, "the message")
     assert held[0] < 0.2
-    (wire,) = house.network.open
+    (wire,) = harness.scheduler.connections
     wire.abort()
     await talking
 
 
-async def test_what_comes_long_behind_a_slow_login_is_new(house):
+async def test_what_comes_long_behind_a_slow_login_is_new(harness):
     """Nobody asks before."""
-    house.gate.clear()
-    caller = await house.dial()
-    await caller.say(Connect("a"))
-    await until(lambda: any(wire._logging_in for wire in house.network.open))
-    (wire,) = house.network.open
-    await caller.say(Subscribe(1, [Subscription("y")]))
-    await until(lambda: inbox(wire._transport.get_extra_info("socket")).unread)
+    harness.gate.clear()
+    peer = await harness.dial()
+    await peer.send(Connect("a"))
+    await until(lambda: any(wire._logging_in for wire in harness.scheduler.connections))
+    (wire,) = harness.scheduler.connections
+    await peer.send(Subscribe(1, [Subscription("y")]))
+    await until(lambda: receive_buffer(wire._transport.get_extra_info("socket")).unread)
     await asyncio.sleep(0.1)
-    house.gate.set()
-    await caller.hear()
-    await caller.hear()
+    harness.gate.set()
+    await peer.receive()
+    await peer.receive()
     held = []
     await until(lambda: not wire._client.inflow.is_behind, "a look by itself")
-    Watches(house, lambda _: held.append(wire.peer_status().held))
-    await caller.say(Publish("x", b""))
+    PublishObserver(harness, lambda _: held.append(wire.peer_status().held))
+    await peer.send(Publish("x", b""))
     await until(lambda: held)
     assert held == [0]

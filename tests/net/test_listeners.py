@@ -20,7 +20,7 @@ from unittest.mock import Mock
 import pytest
 import uvloop
 import yaml
-from house import Caller, House, make_contexts
+from harness import Harness, Peer, make_contexts
 from waiting import PATIENCE, until
 
 from appliance import config
@@ -44,9 +44,8 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.net import connection as wire
-from appliance.net import lingering as farewell
-from appliance.net import listeners, sockets
-from appliance.net import scheduler as network
+from appliance.net import lingering as lingering
+from appliance.net import listeners, scheduler, sockets
 from appliance.net.listeners import Admission, ListenerSettings
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
@@ -71,68 +70,71 @@ def contexts(tmp_path_factory: pytest.TempPathFactory) -> tuple[ssl.SSLContext, 
 
 
 @pytest.fixture
-async def house(contexts) -> AsyncIterator[House]:
-    house = House(*contexts)
-    house.broker.tick(asyncio.get_running_loop().time())
-    yield house
-    await house.close()
+async def harness(contexts) -> AsyncIterator[Harness]:
+    harness = Harness(*contexts)
+    harness.broker.tick(asyncio.get_running_loop().time())
+    yield harness
+    await harness.close()
 
 
 both = pytest.mark.parametrize("tls", [False, True], ids=["tcp", "tls"])
 
 
 @both
-async def test_a_message_goes_from_one_client_to_another(house: House, tls):
-    await house.start()
-    subscriber, publisher = await house.join("sub", tls=tls), await house.join("pub", tls=not tls)
-    await subscriber.say(Subscribe(1, [Subscription("a", 1)]))
-    assert await subscriber.hear() == Suback(1, [1])
+async def test_a_message_goes_from_one_client_to_another(harness: Harness, tls):
+    await harness.start()
+    subscriber, publisher = (
+        await harness.log_in("sub", tls=tls),
+        await harness.log_in("pub", tls=not tls),
+    )
+    await subscriber.send(Subscribe(1, [Subscription("a", 1)]))
+    assert await subscriber.receive() == Suback(1, [1])
     for size in (0, 1, 10_000, 3_000_000):
         message = Publish("a", bytes(size), 1, packet_id=1 + size)
         message.packet_id = 7
-        await publisher.say(message)
-        assert await publisher.hear() == Puback(7)
-        heard = await subscriber.hear()
+        await publisher.send(message)
+        assert await publisher.receive() == Puback(7)
+        heard = await subscriber.receive()
         assert isinstance(heard, Publish) and len(heard.payload) == size
-        await subscriber.say(Puback(heard.packet_id or 0))
+        await subscriber.send(Puback(heard.packet_id or 0))
 
 
 @both
-async def test_bytes_that_drip(house: House, tls):
+async def test_bytes_that_drip(harness: Harness, tls):
     """Each byte a segment and a TLS record of its own."""
-    await house.start()
-    caller = await house.dial(tls)
+    await harness.start()
+    peer = await harness.dial(tls)
     packets = [Connect("drip"), Subscribe(1, [Subscription("a")]), Publish("a", b"x" * 200)]
     for byte in b"".join(packet.encode(5) for packet in packets):
-        await caller.say(bytes((byte,)))
+        await peer.send(bytes((byte,)))
         await asyncio.sleep(0)
-    kinds = [type(await caller.hear()) for _ in range(3)]
+    kinds = [type(await peer.receive()) for _ in range(3)]
     assert kinds == [Connack, Suback, Publish]
 
 
 @both
-async def test_packets_behind_connect_wait_for_the_login(house: House, tls):
-    house.gate.clear()
-    await house.start()
-    caller = await house.dial(tls)
-    await caller.say(Connect("quick"), Subscribe(1, [Subscription("a")]), Publish("a", b"x"))
-    await until(lambda: house.network.tasks)
-    await caller.say(Pingreq())
-    assert not house.broker.sessions
-    house.gate.set()
-    kinds = [type(await caller.hear()) for _ in range(4)]
+async def test_packets_behind_connect_wait_for_the_login(harness: Harness, tls):
+    harness.gate.clear()
+    await harness.start()
+    peer = await harness.dial(tls)
+    await peer.send(Connect("quick"), Subscribe(1, [Subscription("a")]), Publish("a", b"x"))
+    await until(lambda: harness.scheduler.tasks)
+    await peer.send(Pingreq())
+    assert not harness.broker.sessions
+    harness.gate.set()
+    kinds = [type(await peer.receive()) for _ in range(4)]
     assert kinds == [Connack, Suback, Publish, Pingresp]
 
 
-async def test_packets_right_behind_the_tls_handshake(house: House):
+async def test_packets_right_behind_the_tls_handshake(harness: Harness):
     """The client's last flight of the handshake and its CONNECT in one segment."""
-    await house.start()
+    await harness.start()
     loop = asyncio.get_running_loop()
     incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-    tls = house.client_context.wrap_bio(incoming, outgoing, server_hostname="localhost")
+    tls = harness.client_context.wrap_bio(incoming, outgoing, server_hostname="localhost")
     with socket.socket() as sock:
         sock.setblocking(False)
-        await loop.sock_connect(sock, house.ports[1])
+        await loop.sock_connect(sock, harness.ports[1])
         while True:
             try:
                 tls.do_handshake()
@@ -161,112 +163,114 @@ async def test_packets_right_behind_the_tls_handshake(house: House):
 
 
 @both
-async def test_a_refused_client_hears_why(house: House, tls):
-    house.refused.add("bad")
-    await house.start()
-    caller = await house.dial(tls)
-    await caller.say(Connect("bad"), Publish("a", b"x", retain=True))
-    assert await caller.hear() == Connack(False, ReasonCode.NOT_AUTHORIZED)
-    assert await caller.hear_the_end() == b""
-    assert len(house.broker.retained) == 0
-    await until(lambda: not house.network.open)
+async def test_a_refused_client_hears_why(harness: Harness, tls):
+    harness.refused.add("bad")
+    await harness.start()
+    peer = await harness.dial(tls)
+    await peer.send(Connect("bad"), Publish("a", b"x", retain=True))
+    assert await peer.receive() == Connack(False, ReasonCode.NOT_AUTHORIZED)
+    assert await peer.receive_rest() == b""
+    assert len(harness.broker.retained) == 0
+    await until(lambda: not harness.scheduler.connections)
 
 
 @pytest.mark.parametrize("said", [b"", b"\x10", b"\x10\x20\x00\x04MQTT"])
 @both
-async def test_who_does_not_connect_in_time_is_cut_off(house: House, tls, said, caplog):
-    await house.start(connect_timeout=0.2)
-    caller = await house.dial(tls)
-    await caller.say(said)
-    assert await caller.hear_the_end() == b""
-    await until(lambda: not house.network.open)
+async def test_who_does_not_connect_in_time_is_cut_off(harness: Harness, tls, said, caplog):
+    await harness.start(connect_timeout=0.2)
+    peer = await harness.dial(tls)
+    await peer.send(said)
+    assert await peer.receive_rest() == b""
+    await until(lambda: not harness.scheduler.connections)
     assert "no complete CONNECT within 0.2 s" in caplog.text
 
 
-async def test_who_does_not_shake_hands_in_time_is_cut_off(house: House):
-    await house.start(connect_timeout=0.2)
-    house.ports[0] = house.ports[1]
-    caller = await house.dial()  # and not a byte of TLS
-    assert await caller.hear_the_end() == b""
-    await until(lambda: not house.network.open and not house.network.tasks)
+async def test_who_does_not_shake_hands_in_time_is_cut_off(harness: Harness):
+    await harness.start(connect_timeout=0.2)
+    harness.ports[0] = harness.ports[1]
+    peer = await harness.dial()  # and not a byte of TLS
+    assert await peer.receive_rest() == b""
+    await until(lambda: not harness.scheduler.connections and not harness.scheduler.tasks)
 
 
-async def test_what_is_not_tls_is_told_in_the_log(house: House, caplog):
-    await house.start()
-    house.ports[0] = house.ports[1]
-    caller = await house.dial()
-    await caller.say(Connect("plain"))
-    await caller.hear_the_end()
-    await until(lambda: not house.network.open)
+async def test_what_is_not_tls_is_told_in_the_log(harness: Harness, caplog):
+    await harness.start()
+    harness.ports[0] = harness.ports[1]
+    peer = await harness.dial()
+    await peer.send(Connect("plain"))
+    await peer.receive_rest()
+    await until(lambda: not harness.scheduler.connections)
     assert "not TLS" in caplog.text
-    assert not house.broker.sessions
+    assert not harness.broker.sessions
 
 
-async def test_a_slow_login_is_part_of_the_time_to_connect(house: House):
-    house.gate.clear()
-    await house.start(connect_timeout=0.2)
-    caller = await house.dial()
-    await caller.say(Connect("slow"))
-    assert await caller.hear_the_end() == b""
-    house.gate.set()
-    await until(lambda: not house.network.tasks)
-    assert not house.broker.sessions
+async def test_a_slow_login_is_part_of_the_time_to_connect(harness: Harness):
+    harness.gate.clear()
+    await harness.start(connect_timeout=0.2)
+    peer = await harness.dial()
+    await peer.send(Connect("slow"))
+    assert await peer.receive_rest() == b""
+    harness.gate.set()
+    await until(lambda: not harness.scheduler.tasks)
+    assert not harness.broker.sessions
 
 
 @both
-async def test_connections_over_the_limit_are_refused(house: House, tls, caplog):
-    house.broker.use(Limits(connections=2), Features())
-    await house.start(connections=2)
-    first, second = await house.join("1", tls=tls), await house.join("2", tls=tls)
+async def test_connections_over_the_limit_are_refused(harness: Harness, tls, caplog):
+    harness.broker.use(Limits(connections=2), Features())
+    await harness.start(connections=2)
+    first, second = await harness.log_in("1", tls=tls), await harness.log_in("2", tls=tls)
     for _ in range(20):
-        assert await _is_refused(house, tls=tls)
-    assert house.broker.counters.connects_refused == 20
+        assert await _is_refused(harness, tls=tls)
+    assert harness.broker.counters.connects_refused == 20
     assert "(broker.limits.connections)" in caplog.text
     first.hang_up()
-    await until(lambda: len(house.network.open) == 1)
-    third = await house.join("3", tls=tls)
-    for caller in (second, third):
-        await caller.say(Pingreq())
-        assert isinstance(await caller.hear(), Pingresp)
+    await until(lambda: len(harness.scheduler.connections) == 1)
+    third = await harness.log_in("3", tls=tls)
+    for peer in (second, third):
+        await peer.send(Pingreq())
+        assert isinstance(await peer.receive(), Pingresp)
 
 
 @both
-async def test_a_slow_reader_is_bounded_and_delays_nobody(house: House, tls):
+async def test_a_slow_reader_is_bounded_and_delays_nobody(harness: Harness, tls):
     """Rule 3 of the design: 100 MB for someone who does not read."""
-    await house.start()
-    slow = await house.join("slow", tls=tls, receive_buffer=8192)
-    quick = await house.join("quick", tls=tls)
-    for caller in (slow, quick):
-        await caller.say(Subscribe(1, [Subscription("a")]))
-        await caller.hear()
-    publisher = await house.join("pub")
-    protocol = house.protocol("slow")
+    await harness.start()
+    slow = await harness.log_in("slow", tls=tls, receive_buffer=8192)
+    quick = await harness.log_in("quick", tls=tls)
+    for peer in (slow, quick):
+        await peer.send(Subscribe(1, [Subscription("a")]))
+        await peer.receive()
+    publisher = await harness.log_in("pub")
+    protocol = harness.protocol("slow")
     largest = 0
     for n in range(100):
-        await publisher.say(Publish("a", b"%04d" % n + bytes(MIB)), Pingreq())
-        assert isinstance(await publisher.hear(), Pingresp)
-        heard = await quick.hear()
+        await publisher.send(Publish("a", b"%04d" % n + bytes(MIB)), Pingreq())
+        assert isinstance(await publisher.receive(), Pingresp)
+        heard = await quick.receive()
         assert isinstance(heard, Publish) and heard.payload[:4] == b"%04d" % n
         largest = max(largest, protocol._output_size())
     assert largest < 4 * MIB
     assert len(protocol._client.session.large) == 1  # type: ignore[union-attr]
     numbers = []
     while not numbers or numbers[-1] != 99:
-        heard = await slow.hear()
+        heard = await slow.receive()
         assert isinstance(heard, Publish)
         numbers.append(int(heard.payload[:4]))
     assert numbers == sorted(set(numbers)) and len(numbers) < 30
 
 
 @both
-async def test_who_asks_and_does_not_read_the_answers_is_bounded(house: House, tls, monkeypatch):
+async def test_who_asks_and_does_not_read_the_answers_is_bounded(
+    harness: Harness, tls, monkeypatch
+):
     """Rule 3: it is not listened to until it reads."""
     monkeypatch.setattr(wire, "OUTPUT_HIGH_WATER", 65536)
-    await house.start()
-    caller = await house.join("mute", tls=tls)
-    protocol = house.protocol("mute")
+    await harness.start()
+    peer = await harness.log_in("mute", tls=tls)
+    protocol = harness.protocol("mute")
     assert protocol._transport is not None
-    for end in (protocol._transport, caller.writer):  # little in the system's buffers
+    for end in (protocol._transport, peer.writer):  # little in the system's buffers
         sock = end.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
@@ -274,101 +278,106 @@ async def test_who_asks_and_does_not_read_the_answers_is_bounded(house: House, t
     said = 0
     with contextlib.suppress(asyncio.TimeoutError):
         while said < 1000:
-            caller.writer.write(chunk)
+            peer.writer.write(chunk)
             said += 1
-            await asyncio.wait_for(caller.writer.drain(), 0.5)
+            await asyncio.wait_for(peer.writer.drain(), 0.5)
     assert said < 1000, "it was listened to all the time"
     assert protocol._output_size() < MIB
     expected = Unsuback(1, [ReasonCode.NO_SUBSCRIPTION_EXISTED]).encode(5) * (said * 160)
-    assert await asyncio.wait_for(caller.reader.readexactly(len(expected)), PATIENCE) == expected
-    await caller.say(Subscribe(1, [Subscription("a")]))
-    assert isinstance(await caller.hear(), Suback)
+    assert await asyncio.wait_for(peer.reader.readexactly(len(expected)), PATIENCE) == expected
+    await peer.send(Subscribe(1, [Subscription("a")]))
+    assert isinstance(await peer.receive(), Suback)
 
 
 @both
-async def test_retained_messages_wait_for_a_slow_reader(house: House, tls):
+async def test_retained_messages_wait_for_a_slow_reader(harness: Harness, tls):
     """Rule 3: a small chunk of SUBSCRIBEs asks for a thousand times a megabyte."""
-    await house.start()
-    publisher = await house.join("pub")
+    await harness.start()
+    publisher = await harness.log_in("pub")
     for n in range(20):
-        await publisher.say(Publish(f"a/{n}", bytes(MIB), 0, retain=True))
-    await publisher.say(Pingreq())
-    await publisher.hear()
-    greedy = await house.join("greedy", tls=tls, receive_buffer=8192)
-    await greedy.say(*[Subscribe(1, [Subscription("a/#")])] * 1000)
+        await publisher.send(Publish(f"a/{n}", bytes(MIB), 0, retain=True))
+    await publisher.send(Pingreq())
+    await publisher.receive()
+    greedy = await harness.log_in("greedy", tls=tls, receive_buffer=8192)
+    await greedy.send(*[Subscribe(1, [Subscription("a/#")])] * 1000)
     for _ in range(50):
-        await publisher.say(Pingreq())
-        await publisher.hear()
-        assert house.protocol("greedy")._output_size() < 6 * MIB
+        await publisher.send(Pingreq())
+        await publisher.receive()
+        assert harness.protocol("greedy")._output_size() < 6 * MIB
     heard = []
     while len(set(heard)) < 20:
-        packet = await greedy.hear()
+        packet = await greedy.receive()
         if isinstance(packet, Publish):
             heard.append(packet.topic)
     assert len(heard) < 60
 
 
-async def test_a_stranger_is_not_listened_to_during_the_login(house: House):
+async def test_a_stranger_is_not_listened_to_during_the_login(harness: Harness):
     """Rule 3: nothing is buffered for who has not logged in, however large the chunks are."""
-    house.gate.clear()
-    await house.start()
-    caller = await house.dial()
-    await until(lambda: house.network.open and any(p._transport for p in house.network.open))
-    (protocol,) = house.network.open
+    harness.gate.clear()
+    await harness.start()
+    peer = await harness.dial()
+    await until(
+        lambda: (
+            harness.scheduler.connections
+            and any(p._transport for p in harness.scheduler.connections)
+        )
+    )
+    (protocol,) = harness.scheduler.connections
     assert protocol._transport is not None
     # One large chunk, as a fast network gives it: after these, reading is paused in any case.
     protocol.data_received(Connect("flood").encode() + bytes(MIB))
-    caller.writer.write(bytes(100 * MIB))
+    peer.writer.write(bytes(100 * MIB))
     for _ in range(50):
         await asyncio.sleep(0)
         assert not protocol._transport.is_reading()
     assert protocol._client.connection.held <= MIB
-    caller.hang_up()
-    house.gate.set()
-    await until(lambda: not house.network.open)
+    peer.hang_up()
+    harness.gate.set()
+    await until(lambda: not harness.scheduler.connections)
 
 
 @both
-async def test_a_client_that_has_no_more_to_say(house: House, tls):
+async def test_a_client_that_has_no_more_to_say(harness: Harness, tls):
     """Half closed: what it said is done, then the connection ends, and the will is due."""
-    await house.start()
-    watcher = await house.join("watcher")
-    await watcher.say(Subscribe(1, [Subscription("#")]))
-    await watcher.hear()
-    caller = await house.dial(tls)
-    await caller.say(
+    await harness.start()
+    watcher = await harness.log_in("watcher")
+    await watcher.send(Subscribe(1, [Subscription("#")]))
+    await watcher.receive()
+    peer = await harness.dial(tls)
+    await peer.send(
         Connect("brief", will=Will("w", b"gone")), Publish("a", b"x"), Publish("b", b"y" * MIB)
     )
     if tls:
-        caller.writer.close()
+        peer.writer.close()
     else:
-        caller.writer.write_eof()
-        assert isinstance(await caller.hear(), Connack)
-        assert await caller.hear_the_end() == b""
-    heard = [await watcher.hear() for _ in range(3)]
+        peer.writer.write_eof()
+        assert isinstance(await peer.receive(), Connack)
+        assert await peer.receive_rest() == b""
+    heard = [await watcher.receive() for _ in range(3)]
     assert [packet.topic for packet in heard] == ["a", "b", "w"]  # type: ignore[union-attr]
-    await until(lambda: len(house.network.open) == 1)
+    await until(lambda: len(harness.scheduler.connections) == 1)
 
 
 @both
-async def test_a_connection_that_breaks(house: House, tls):
+async def test_a_connection_that_breaks(harness: Harness, tls):
     """A reset, at any moment, is a lost connection and nothing else."""
-    await house.start()
-    watcher = await house.join("watcher")
-    await watcher.say(Subscribe(1, [Subscription("w/#")]))
-    await watcher.hear()
+    await harness.start()
+    watcher = await harness.log_in("watcher")
+    await watcher.send(Subscribe(1, [Subscription("w/#")]))
+    await watcher.receive()
     for n, packets in enumerate([[], [Subscribe(1, [Subscription("#")])], [b"\x30\x7f\x00"]]):
-        caller = await house.dial(tls)
-        await caller.say(Connect(f"c{n}", will=Will(f"w/{n}", b"gone")))
-        await caller.hear()
-        await caller.say(*packets)
-        caller.writer.get_extra_info("socket").setsockopt(
+        peer = await harness.dial(tls)
+        await peer.send(Connect(f"c{n}", will=Will(f"w/{n}", b"gone")))
+        await peer.receive()
+        await peer.send(*packets)
+        peer.writer.get_extra_info("socket").setsockopt(
             socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0"
         )
-        caller.hang_up()
-        heard = await watcher.hear()
+        peer.hang_up()
+        heard = await watcher.receive()
         assert isinstance(heard, Publish) and heard.topic == f"w/{n}"
-    await until(lambda: len(house.network.open) == 1)
+    await until(lambda: len(harness.scheduler.connections) == 1)
 
 
 def break_packets(protocol: wire.ClientConnection) -> None:
@@ -377,97 +386,99 @@ def break_packets(protocol: wire.ClientConnection) -> None:
 
 
 @pytest.mark.parametrize("why", ["wrong bytes", "a fault"])
-async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeypatch, escaped, why):
+async def test_who_does_not_read_the_last_bytes_is_cut_off(
+    harness: Harness, monkeypatch, escaped, why
+):
     """A closed connection does not stay because its output cannot be written."""
     monkeypatch.setattr(wire, "CLOSE_TIMEOUT", 0.2)
-    await house.start()
-    caller = await house.join("deaf", receive_buffer=8192)
-    await caller.say(Subscribe(1, [Subscription("a")]))
-    await caller.hear()
-    publisher = await house.join("pub")
+    await harness.start()
+    peer = await harness.log_in("deaf", receive_buffer=8192)
+    await peer.send(Subscribe(1, [Subscription("a")]))
+    await peer.receive()
+    publisher = await harness.log_in("pub")
     for _ in range(10):
-        await publisher.say(Publish("a", bytes(MIB)))
-    await until(lambda: not house.protocol("deaf")._client.output.writable)
-    protocol = house.protocol("deaf")
+        await publisher.send(Publish("a", bytes(MIB)))
+    await until(lambda: not harness.protocol("deaf")._client.output.writable)
+    protocol = harness.protocol("deaf")
     if why == "wrong bytes":
-        await caller.say(b"\0\0")
+        await peer.send(b"\0\0")
     else:
         break_packets(protocol)
-        await caller.say(Pingreq())
-        await until(lambda: house.broker.faults.count)
+        await peer.send(Pingreq())
+        await until(lambda: harness.broker.faults.count)
     await until(lambda: protocol._transport is None, "its connection to be cut")
-    await until(lambda: len(house.network.open) == 1)
+    await until(lambda: len(harness.scheduler.connections) == 1)
     escaped.clear()
 
 
 @both
-async def test_stop_with_open_clients(house: House, tls):
-    await house.start()
-    callers = [await house.join(f"c{n}", tls=tls) for n in range(3)]
-    silent = await house.dial(tls)
-    deaf = await house.join("deaf", tls=tls, receive_buffer=8192)
-    await deaf.say(Subscribe(1, [Subscription("a")]))
-    await deaf.hear()
+async def test_stop_with_open_clients(harness: Harness, tls):
+    await harness.start()
+    peers = [await harness.log_in(f"c{n}", tls=tls) for n in range(3)]
+    silent = await harness.dial(tls)
+    deaf = await harness.log_in("deaf", tls=tls, receive_buffer=8192)
+    await deaf.send(Subscribe(1, [Subscription("a")]))
+    await deaf.receive()
     for _ in range(10):
-        await callers[0].say(Publish("a", bytes(MIB)))
-    await callers[0].say(Pingreq())  # all of it has been read, or a reset would be the answer
-    assert isinstance(await callers[0].hear(), Pingresp)
-    assert not house.protocol("deaf")._client.output.writable
-    await asyncio.wait_for(house.listeners.stop(), PATIENCE)
-    for caller in callers:
-        assert await caller.hear() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
-        assert await caller.hear_the_end() == b""
-    assert await silent.hear_the_end() == b""
-    assert not house.network.open and not house.network.tasks
+        await peers[0].send(Publish("a", bytes(MIB)))
+    await peers[0].send(Pingreq())  # all of it has been read, or a reset would be the answer
+    assert isinstance(await peers[0].receive(), Pingresp)
+    assert not harness.protocol("deaf")._client.output.writable
+    await asyncio.wait_for(harness.listeners.stop(), PATIENCE)
+    for peer in peers:
+        assert await peer.receive() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
+        assert await peer.receive_rest() == b""
+    assert await silent.receive_rest() == b""
+    assert not harness.scheduler.connections and not harness.scheduler.tasks
     with pytest.raises(OSError):
-        await house.dial()
-    await house.listeners.stop()  # again
+        await harness.dial()
+    await harness.listeners.stop()  # again
 
 
-async def test_stop_during_a_login(house: House):
-    house.gate.clear()
-    await house.start()
-    caller = await house.dial()
-    await caller.say(Connect("late"))
-    await until(lambda: house.network.tasks)
-    await asyncio.wait_for(house.listeners.stop(), PATIENCE)
-    assert await caller.hear_the_end() == b""
-    assert not house.broker.sessions
+async def test_stop_during_a_login(harness: Harness):
+    harness.gate.clear()
+    await harness.start()
+    peer = await harness.dial()
+    await peer.send(Connect("late"))
+    await until(lambda: harness.scheduler.tasks)
+    await asyncio.wait_for(harness.listeners.stop(), PATIENCE)
+    assert await peer.receive_rest() == b""
+    assert not harness.broker.sessions
 
 
-async def test_an_address_in_use(house: House):
+async def test_an_address_in_use(harness: Harness):
     """Nothing is left listening, and the message names the key."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=rf"127\.0\.0\.1:{port} \(broker\.listeners\)"):
-            await house.listeners.start(
+            await harness.listeners.start(
                 [ListenerSettings("127.0.0.1", 0, None), ListenerSettings("127.0.0.1", port, None)]
             )
-    assert not house.listeners._doors
+    assert not harness.listeners._sockets
 
 
-async def test_a_port_moves_to_all_addresses_and_back(house: House):
+async def test_a_port_moves_to_all_addresses_and_back(harness: Harness):
     """What listens on the port until then does not keep its successor from it, others do."""
 
     def use(*wanted: ListenerSettings):
         listeners.take(listeners.prepare([*wanted]), [*wanted], listeners.admission)
 
-    listeners = house.listeners
+    listeners = harness.listeners
     ((_, port),) = await listeners.start([ListenerSettings("127.0.0.1", 0, None)])
-    house.ports = [("127.0.0.1", port)]
-    early = await house.join("early")
+    harness.ports = [("127.0.0.1", port)]
+    early = await harness.log_in("early")
     for host in ("", "0.0.0.0", "127.0.0.1"):
         use(ListenerSettings(host, port, None))
         assert listeners.addresses == [(host, port)]
-        await house.join(f"by {host or 'any'}")
+        await harness.log_in(f"by {host or 'any'}")
         with pytest.raises(OSError, match="in use already"):
             sockets.listen(host, port)
     with socket.create_server(("127.0.0.2", port)), pytest.raises(OSError, match="in use already"):
         use(ListenerSettings("", port, None))
     assert listeners.addresses == [("127.0.0.1", port)]
-    await house.join("late")
-    await early.say(Pingreq())
-    assert isinstance(await early.hear(), Pingresp)
+    await harness.log_in("late")
+    await early.send(Pingreq())
+    assert isinstance(await early.receive(), Pingresp)
 
 
 def test_where_nobody_can_listen(monkeypatch: pytest.MonkeyPatch):
@@ -483,68 +494,68 @@ def test_where_nobody_can_listen(monkeypatch: pytest.MonkeyPatch):
         sockets.listen("robot", 8883)
 
 
-async def test_every_address(house: House):
+async def test_every_address(harness: Harness):
     """An empty host listens on IPv4, and on IPv6 where there is any."""
-    ((host, port),) = await house.listeners.start([ListenerSettings("", 0, None)])
+    ((host, port),) = await harness.listeners.start([ListenerSettings("", 0, None)])
     assert host == ""
-    house.ports = [("127.0.0.1", port)]
-    await house.join("four")
+    harness.ports = [("127.0.0.1", port)]
+    await harness.log_in("four")
     if socket.has_dualstack_ipv6():
         with contextlib.suppress(OSError):  # no loopback address of IPv6 on this computer
             reader, writer = await asyncio.open_connection("::1", port)
-            caller = Caller(reader, writer)
-            await caller.say(Connect("six"))
-            assert isinstance(await caller.hear(), Connack)
+            peer = Peer(reader, writer)
+            await peer.send(Connect("six"))
+            assert isinstance(await peer.receive(), Connack)
 
 
-async def test_a_take_over_by_the_network(house: House, caplog):
+async def test_a_take_over_by_the_network(harness: Harness, caplog):
     caplog.set_level(logging.INFO)
-    await house.start()
-    first = await house.join("same")
-    second = await house.join("same", tls=True)
-    assert await first.hear() == Disconnect(ReasonCode.SESSION_TAKEN_OVER)
-    assert await first.hear_the_end() == b""
-    await second.say(Pingreq())
-    assert isinstance(await second.hear(), Pingresp)
+    await harness.start()
+    first = await harness.log_in("same")
+    second = await harness.log_in("same", tls=True)
+    assert await first.receive() == Disconnect(ReasonCode.SESSION_TAKEN_OVER)
+    assert await first.receive_rest() == b""
+    await second.send(Pingreq())
+    assert isinstance(await second.receive(), Pingresp)
 
 
 # --- the end of a connection ---------------------------------------------------------------------
 
 
 @both
-async def test_the_reason_reaches_who_is_still_sending(house: House, tls):
+async def test_the_reason_reaches_who_is_still_sending(harness: Harness, tls):
     """Closed with unread input, a connection is reset: the last packet would be lost."""
-    await house.start()
-    caller = await house.join("wrong", tls=tls)
+    await harness.start()
+    peer = await harness.log_in("wrong", tls=tls)
     # Of small packets that may come, many are behind the one that may not.
-    caller.writer.write(Connect("again").encode(5) + Pingreq().encode(5) * MIB)
+    peer.writer.write(Connect("again").encode(5) + Pingreq().encode(5) * MIB)
     await asyncio.sleep(0.1)  # a client that is busy with sending
-    assert await caller.hear() == Disconnect(ReasonCode.PROTOCOL_ERROR)
-    assert await asyncio.wait_for(caller.reader.read(-1), PATIENCE) == b""  # and no reset
-    await until(lambda: not house.network.open)
-    caller.hang_up()
-    await until(lambda: not house.network._farewells)
+    assert await peer.receive() == Disconnect(ReasonCode.PROTOCOL_ERROR)
+    assert await asyncio.wait_for(peer.reader.read(-1), PATIENCE) == b""  # and no reset
+    await until(lambda: not harness.scheduler.connections)
+    peer.hang_up()
+    await until(lambda: not harness.scheduler._lingering)
 
 
-async def test_a_farewell_is_bounded(house: House, monkeypatch):
+async def test_a_farewell_is_bounded(harness: Harness, monkeypatch):
     """Who neither closes its end nor stops sending is not listened to for long."""
-    monkeypatch.setattr(farewell, "TIMEOUT", 0.2)
-    monkeypatch.setattr(network, "FAREWELLS", 2)
-    await house.start()
-    callers = [await house.join(f"c{n}") for n in range(4)]
-    for caller in callers:
-        await caller.say(Connect("again"))
-        assert await caller.hear() == Disconnect(ReasonCode.PROTOCOL_ERROR)
-    await until(lambda: not house.network.open)
-    assert len(house.network._farewells) <= 2
-    await until(lambda: not house.network._farewells)
-    monkeypatch.setattr(farewell, "TIMEOUT", PATIENCE)
-    monkeypatch.setattr(farewell, "BYTES", MIB)
-    caller = await house.join("loud")
-    await caller.say(Connect("again"))
+    monkeypatch.setattr(lingering, "TIMEOUT", 0.2)
+    monkeypatch.setattr(scheduler, "FAREWELLS", 2)
+    await harness.start()
+    peers = [await harness.log_in(f"c{n}") for n in range(4)]
+    for peer in peers:
+        await peer.send(Connect("again"))
+        assert await peer.receive() == Disconnect(ReasonCode.PROTOCOL_ERROR)
+    await until(lambda: not harness.scheduler.connections)
+    assert len(harness.scheduler._lingering) <= 2
+    await until(lambda: not harness.scheduler._lingering)
+    monkeypatch.setattr(lingering, "TIMEOUT", PATIENCE)
+    monkeypatch.setattr(lingering, "BYTES", MIB)
+    peer = await harness.log_in("loud")
+    await peer.send(Connect("again"))
     with pytest.raises(ConnectionError):
         for _ in range(100):
-            await caller.say(bytes(MIB))
+            await peer.send(bytes(MIB))
 
 
 def _leave_abruptly(port: int, context: ssl.SSLContext, data: bytes) -> None:
@@ -560,14 +571,14 @@ def _leave_abruptly(port: int, context: ssl.SSLContext, data: bytes) -> None:
         connection.close()
 
 
-async def test_what_was_said_before_an_abrupt_end_is_done(house: House):
+async def test_what_was_said_before_an_abrupt_end_is_done(harness: Harness):
     """uvloop's TLS transport drops what it has received when the connection ends."""
-    await house.start()
+    await harness.start()
     data = Publish("a", bytes(100)).encode(5) * 20_000 + Disconnect().encode(5)
-    port = house.ports[1][1]
-    await asyncio.to_thread(_leave_abruptly, port, house.client_context, data)
-    await until(lambda: not house.network.open)
-    assert house.broker.counters.publish_received == 20_000  # and no will
+    port = harness.ports[1][1]
+    await asyncio.to_thread(_leave_abruptly, port, harness.client_context, data)
+    await until(lambda: not harness.scheduler.connections)
+    assert harness.broker.counters.publish_received == 20_000  # and no will
 
 
 # --- what appliance.yaml says ---------------------------------------------------------------------
@@ -624,199 +635,199 @@ def test_what_is_no_listener(listener, problem, tmp_path):
 # --- Unix sockets --------------------------------------------------------------------------------
 
 
-async def _dial_path(house: House, path: Path) -> Caller:
-    caller = Caller(*await asyncio.open_unix_connection(path))
-    house.callers.append(caller)
-    return caller
+async def _dial_path(harness: Harness, path: Path) -> Peer:
+    peer = Peer(*await asyncio.open_unix_connection(path))
+    harness.peers.append(peer)
+    return peer
 
 
-async def test_a_unix_socket(house: House, tmp_path, caplog):
+async def test_a_unix_socket(harness: Harness, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     path = tmp_path / "mqtt.sock"
-    house.make(connections_per_address=1)
+    harness.make(connections_per_address=1)
     umask = os.umask(0o077)
     try:
-        addresses = await house.listeners.start([ListenerSettings("", 0, None, path=path)])
+        addresses = await harness.listeners.start([ListenerSettings("", 0, None, path=path)])
     finally:
         os.umask(umask)
     assert addresses == [(f"unix:{path}", 0)]
     assert stat.S_IMODE(path.stat().st_mode) == 0o660
-    callers = [await _dial_path(house, path) for _ in range(3)]  # not counted an address
-    for number, caller in enumerate(callers):
-        await caller.say(Connect(f"c{number}"), Subscribe(1, [Subscription("a")]))
-        assert isinstance(await caller.hear(), Connack)
-        assert isinstance(await caller.hear(), Suback)
-    await callers[0].say(Publish("a", b"x" * MIB))
-    for caller in callers:
-        heard = await caller.hear()
+    peers = [await _dial_path(harness, path) for _ in range(3)]  # not counted an address
+    for number, peer in enumerate(peers):
+        await peer.send(Connect(f"c{number}"), Subscribe(1, [Subscription("a")]))
+        assert isinstance(await peer.receive(), Connack)
+        assert isinstance(await peer.receive(), Suback)
+    await peers[0].send(Publish("a", b"x" * MIB))
+    for peer in peers:
+        heard = await peer.receive()
         assert isinstance(heard, Publish) and len(heard.payload) == MIB
     # Each is told apart by a number in the place of a port.
     where = re.findall(rf"client 'c\d' \(anonymous\) at unix:{path}:(\d+) connected", caplog.text)
     assert len(set(where)) == 3
-    for caller in callers:
-        caller.hang_up()
-    await house.listeners.stop()
+    for peer in peers:
+        peer.hang_up()
+    await harness.listeners.stop()
     assert not path.exists()
 
 
-async def test_the_mode_of_a_unix_socket(house: House, tmp_path):
+async def test_the_mode_of_a_unix_socket(harness: Harness, tmp_path):
     path = tmp_path / "mqtt.sock"
-    await house.listeners.start([ListenerSettings("", 0, None, path=path, mode=0o600)])
+    await harness.listeners.start([ListenerSettings("", 0, None, path=path, mode=0o600)])
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-async def test_a_unix_socket_that_was_left_is_replaced(house: House, tmp_path):
+async def test_a_unix_socket_that_was_left_is_replaced(harness: Harness, tmp_path):
     path = tmp_path / "mqtt.sock"
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(path))
         left.listen()
-    await house.listeners.start([ListenerSettings("", 0, None, path=path)])
-    caller = await _dial_path(house, path)
-    await caller.say(Connect("here"))
-    assert isinstance(await caller.hear(), Connack)
+    await harness.listeners.start([ListenerSettings("", 0, None, path=path)])
+    peer = await _dial_path(harness, path)
+    await peer.send(Connect("here"))
+    assert isinstance(await peer.receive(), Connack)
 
 
-async def test_a_unix_socket_in_use_is_left_alone(house: House, tmp_path):
+async def test_a_unix_socket_in_use_is_left_alone(harness: Harness, tmp_path):
     path = tmp_path / "mqtt.sock"
     wanted = [ListenerSettings("", 0, None, path=path)]
     with socket.socket(socket.AF_UNIX) as other:
         other.bind(str(path))
         other.listen()
         with pytest.raises(OSError, match=rf"unix:{path} \(broker\.listeners\): another process"):
-            await house.listeners.start(wanted)
+            await harness.listeners.start(wanted)
         assert path.exists()
     path.unlink()
     path.write_text("precious")
     with pytest.raises(OSError, match="a file that is no socket"):
-        await house.listeners.start(wanted)
+        await harness.listeners.start(wanted)
     assert path.read_text() == "precious"
     with pytest.raises(OSError, match="No such file or directory"):
         nowhere = ListenerSettings("", 0, None, path=tmp_path / "nowhere/mqtt.sock")
-        await house.listeners.start([nowhere])
+        await harness.listeners.start([nowhere])
 
 
-async def test_another_ones_unix_socket_is_not_removed(house: House, tmp_path):
+async def test_another_ones_unix_socket_is_not_removed(harness: Harness, tmp_path):
     path = tmp_path / "mqtt.sock"
-    await house.listeners.start([ListenerSettings("", 0, None, path=path)])
+    await harness.listeners.start([ListenerSettings("", 0, None, path=path)])
     path.unlink()
     path.write_text("another's")
-    await house.listeners.stop()
+    await harness.listeners.stop()
     assert path.read_text() == "another's"
 
 
 # --- limits of connections -----------------------------------------------------------------------
 
 
-async def _is_refused(house: House, user: str | None = None, *, tls: bool = False) -> bool:
+async def _is_refused(harness: Harness, user: str | None = None, *, tls: bool = False) -> bool:
     try:
-        caller = await house.dial(tls)
-        await caller.say(Connect("one-more", username=user))
-        answer = await caller.hear()
-        caller.hang_up()
+        peer = await harness.dial(tls)
+        await peer.send(Connect("one-more", username=user))
+        answer = await peer.receive()
+        peer.hang_up()
         assert isinstance(answer, Connack)
         return answer.reason_code == ReasonCode.QUOTA_EXCEEDED
     except (OSError, asyncio.IncompleteReadError):
         return True
 
 
-async def test_connections_from_one_address(house: House, caplog):
-    await house.start(connections_per_address=2)
-    callers = [await house.join(f"c{n}") for n in range(2)]
-    assert await _is_refused(house)
-    assert house.broker.counters.connects_refused == 1
+async def test_connections_from_one_address(harness: Harness, caplog):
+    await harness.start(connections_per_address=2)
+    peers = [await harness.log_in(f"c{n}") for n in range(2)]
+    assert await _is_refused(harness)
+    assert harness.broker.counters.connects_refused == 1
     assert "refused: its address has 2 connections of its user" in caplog.text
     assert "broker.limits.connections_per_address" in caplog.text
-    callers[0].hang_up()
-    await until(lambda: len(house.network.open) == 1)
-    assert not await _is_refused(house)
+    peers[0].hang_up()
+    await until(lambda: len(harness.scheduler.connections) == 1)
+    assert not await _is_refused(harness)
 
 
-async def test_a_fault_before_a_commit_leaves_no_guest_for_ever(house: House, escaped):
+async def test_a_fault_before_a_commit_leaves_no_guest_for_ever(harness: Harness, escaped):
     """The last bytes are written at the commit, when the fault is long over; or not at all."""
-    await house.start(connections_per_address=2)
-    store = house.broker.store
+    await harness.start(connections_per_address=2)
+    store = harness.broker.store
     store.hurry = lambda: None  # type: ignore[method-assign]
     for n in range(3):
-        caller = await house.join(f"c{n}")
-        protocol = house.protocol(f"c{n}")
+        peer = await harness.log_in(f"c{n}")
+        protocol = harness.protocol(f"c{n}")
         break_packets(protocol)
         store.staged, store.batch, store.committed = True, 5, 4
         protocol._client.output.batch = 5
-        await caller.say(Pingreq())
-        await until(lambda count=n + 1: house.broker.faults.count == count)
+        await peer.send(Pingreq())
+        await until(lambda count=n + 1: harness.broker.faults.count == count)
         if n == 2:
             protocol._forget()  # it has ended already
         store.committed, store.staged = 5, False
-        house.broker._committed(True)
-        caller.hang_up()
-        await until(lambda: not house.network.open)
-        assert house.listeners._addresses.oldest_guest() is None
+        harness.broker._committed(True)
+        peer.hang_up()
+        await until(lambda: not harness.scheduler.connections)
+        assert harness.listeners._addresses.oldest_guest() is None
     escaped.clear()
 
 
-async def _say_who(caller: Caller, client_id: str, user: str) -> None:
-    await caller.say(Connect(client_id, username=user))
-    answer = await caller.hear()
+async def _say_who(peer: Peer, client_id: str, user: str) -> None:
+    await peer.send(Connect(client_id, username=user))
+    answer = await peer.receive()
     assert isinstance(answer, Connack) and answer.reason_code == ReasonCode.SUCCESS
 
 
-async def test_what_a_user_has_from_one_address_keeps_no_other_out(house: House):
-    await house.start(connections_per_address=2)
+async def test_what_a_user_has_from_one_address_keeps_no_other_out(harness: Harness):
+    await harness.start(connections_per_address=2)
     for number in range(2):
-        await _say_who(await house.dial(), f"m{number}", "mallory")
-    assert await _is_refused(house, "mallory")
-    await until(lambda: len(house.network.open) == 2)
-    await _say_who(await house.dial(), "alice", "alice")
+        await _say_who(await harness.dial(), f"m{number}", "mallory")
+    assert await _is_refused(harness, "mallory")
+    await until(lambda: len(harness.scheduler.connections) == 2)
+    await _say_who(await harness.dial(), "alice", "alice")
 
 
-async def test_what_a_user_has_of_all_connections_keeps_no_other_out(house: House):
-    house.broker.use(Limits(connections=3), Features())
-    await house.start(connections=3)
-    crowd = [await house.dial() for _ in range(3)]
-    for number, caller in enumerate(crowd):
-        await _say_who(caller, f"m{number}", "mallory")
-    assert await _is_refused(house, "mallory")
-    await _say_who(await house.dial(), "alice", "alice")
-    farewell = await crowd[2].hear()
-    assert isinstance(farewell, Disconnect) and farewell.reason_code == ReasonCode.QUOTA_EXCEEDED
-    await crowd[0].say(Pingreq())
-    assert isinstance(await crowd[0].hear(), Pingresp)
+async def test_what_a_user_has_of_all_connections_keeps_no_other_out(harness: Harness):
+    harness.broker.use(Limits(connections=3), Features())
+    await harness.start(connections=3)
+    crowd = [await harness.dial() for _ in range(3)]
+    for number, peer in enumerate(crowd):
+        await _say_who(peer, f"m{number}", "mallory")
+    assert await _is_refused(harness, "mallory")
+    await _say_who(await harness.dial(), "alice", "alice")
+    lingering = await crowd[2].receive()
+    assert isinstance(lingering, Disconnect) and lingering.reason_code == ReasonCode.QUOTA_EXCEEDED
+    await crowd[0].send(Pingreq())
+    assert isinstance(await crowd[0].receive(), Pingresp)
 
 
 @both
-async def test_strangers_keep_nobody_out(house: House, monkeypatch, caplog, tls):
+async def test_strangers_keep_nobody_out(harness: Harness, monkeypatch, caplog, tls):
     """Neither those who say nothing, nor those in the middle of their TLS handshake."""
     monkeypatch.setattr(listeners, "GUESTS", 4)
     monkeypatch.setattr(listeners, "HANDSHAKES", 1000)
-    await house.start(connections=2)
+    await harness.start(connections=2)
     for _ in range(3):  # more than there is room for
         for _ in range(4):
             sock = socket.socket()
             sock.setblocking(False)
-            house.strangers.append(sock)
-            await asyncio.get_running_loop().sock_connect(sock, house.ports[tls])
-        await until(lambda: house.network.open)
-        (await house.join("alice", tls=tls)).hang_up()
-        await until(lambda: not house.broker.clients)
-    assert len(house.network.open) <= 5
+            harness.raw_sockets.append(sock)
+            await asyncio.get_running_loop().sock_connect(sock, harness.ports[tls])
+        await until(lambda: harness.scheduler.connections)
+        (await harness.log_in("alice", tls=tls)).hang_up()
+        await until(lambda: not harness.broker.clients)
+    assert len(harness.scheduler.connections) <= 5
     assert "makes room for others" in caplog.text
-    await until(lambda: len(house.network.tasks) <= 5)
+    await until(lambda: len(harness.scheduler.tasks) <= 5)
 
 
-async def test_new_connections_from_one_address(house: House, caplog):
+async def test_new_connections_from_one_address(harness: Harness, caplog):
     """Bursts of five times the rate, then no more than the rate."""
-    await house.start(connection_rate=4)
+    await harness.start(connection_rate=4)
     allowed, began = 0, time.monotonic()
-    while not await _is_refused(house):
+    while not await _is_refused(harness):
         allowed += 1
         assert allowed < 100, "it is never refused"
     assert 20 <= allowed <= 21 + 4 * (time.monotonic() - began)
     assert "opens more than 4 connections a second" in caplog.text
     assert "broker.limits.connection_rate" in caplog.text
-    refused = house.broker.counters.connections_refused
+    refused = harness.broker.counters.connections_refused
     assert refused >= 1
     await asyncio.sleep(0.3)
-    assert not await _is_refused(house)
+    assert not await _is_refused(harness)
 
 
 class Neighbour:
@@ -827,7 +838,7 @@ class Neighbour:
         self.account = Accounts().strangers
 
 
-def come(addresses: listeners._Addresses, host: str, now: float) -> Neighbour | None:
+def come(addresses: listeners._AddressLimits, host: str, now: float) -> Neighbour | None:
     """A connection that has not logged in; None when it is refused."""
     if addresses.come(host, now):
         return None
@@ -837,7 +848,7 @@ def come(addresses: listeners._Addresses, host: str, now: float) -> Neighbour | 
 
 
 def test_what_counts_as_one_address():
-    addresses = listeners._Addresses(Admission(9, 9, 1, 100))
+    addresses = listeners._AddressLimits(Admission(9, 9, 1, 100))
     assert come(addresses, "192.0.2.1", 0)
     assert not come(addresses, "192.0.2.1", 0)
     assert not come(addresses, "::ffff:192.0.2.1", 0)  # the same, on a listener for both
@@ -853,7 +864,7 @@ def test_what_counts_as_one_address():
 
 
 def test_each_user_is_counted_for_itself():
-    addresses, accounts = listeners._Addresses(Admission(9, 9, 2, 1000)), Accounts()
+    addresses, accounts = listeners._AddressLimits(Admission(9, 9, 2, 1000)), Accounts()
     members = []
     for user, allowed in (("mallory", [1, 1, 0]), ("alice", [1, 1, 0]), (None, [1, 1, 0])):
         account = accounts.of_user(user)
@@ -876,7 +887,7 @@ def test_each_user_is_counted_for_itself():
 
 
 def test_idle_addresses_are_forgotten():
-    addresses = listeners._Addresses(Admission(9, 9, 10, 10))
+    addresses = listeners._AddressLimits(Admission(9, 9, 10, 10))
     for number in range(100_000):
         host = f"2001:db8:{number >> 16:x}:{number & 0xFFFF:x}::1"
         member = come(addresses, host, number * 0.001)
@@ -914,102 +925,102 @@ def test_files_that_may_be_open(monkeypatch, caplog):
 # --- TLS handshakes ------------------------------------------------------------------------------
 
 
-async def test_strangers_in_a_handshake_do_not_keep_others_out(house: House, monkeypatch):
+async def test_strangers_in_a_handshake_do_not_keep_others_out(harness: Harness, monkeypatch):
     """They hold every place that there is, and say nothing."""
     monkeypatch.setattr(listeners, "HANDSHAKES", 4)
-    await house.start(connect_timeout=600)
-    silent = [await asyncio.open_connection(*house.ports[1]) for _ in range(10)]
-    caller = await house.join("honest", tls=True)
-    await caller.say(Pingreq())
-    assert isinstance(await caller.hear(), Pingresp)
+    await harness.start(connect_timeout=600)
+    silent = [await asyncio.open_connection(*harness.ports[1]) for _ in range(10)]
+    peer = await harness.log_in("honest", tls=True)
+    await peer.send(Pingreq())
+    assert isinstance(await peer.receive(), Pingresp)
     for _, writer in silent:
         writer.transport.abort()
 
 
-async def test_handshakes_at_a_time(house: House, monkeypatch):
+async def test_handshakes_at_a_time(harness: Harness, monkeypatch):
     """More than that wait to be accepted, and all of them get in."""
     monkeypatch.setattr(listeners, "HANDSHAKES", 3)
     most = 0
-    await house.start()
-    begin = house.listeners._begin
+    await harness.start()
+    begin = harness.listeners._begin
 
     async def count(*arguments) -> None:
         nonlocal most
-        most = max(most, len(house.listeners._handshakes))
+        most = max(most, len(harness.listeners._handshakes))
         await begin(*arguments)
 
-    monkeypatch.setattr(house.listeners, "_begin", count)
-    callers = await asyncio.gather(*(house.join(f"c{n}", tls=True) for n in range(30)))
+    monkeypatch.setattr(harness.listeners, "_begin", count)
+    peers = await asyncio.gather(*(harness.log_in(f"c{n}", tls=True) for n in range(30)))
     assert most == 3
-    assert len(house.broker.clients) == 30
-    plain = await house.join("plain")
-    for caller in (*callers, plain):
-        caller.hang_up()
+    assert len(harness.broker.clients) == 30
+    plain = await harness.log_in("plain")
+    for peer in (*peers, plain):
+        peer.hang_up()
 
 
 # --- limits of what is sent ----------------------------------------------------------------------
 
 
 @both
-async def test_publishes_over_the_rate_are_read_later(house: House, tls):
+async def test_publishes_over_the_rate_are_read_later(harness: Harness, tls):
     """None is lost, nobody is cut off, and others are not slowed."""
-    await house.start(publish_rate=400)
+    await harness.start(publish_rate=400)
     loop = asyncio.get_running_loop()
-    subscriber, eager = await house.join("sub"), await house.join("eager", tls=tls)
-    await subscriber.say(Subscribe(1, [Subscription("a")]))
-    await subscriber.hear()
-    calm = await house.join("calm", tls=tls)
+    subscriber, eager = await harness.log_in("sub"), await harness.log_in("eager", tls=tls)
+    await subscriber.send(Subscribe(1, [Subscription("a")]))
+    await subscriber.receive()
+    calm = await harness.log_in("calm", tls=tls)
     began = loop.time()
-    await eager.say(*(Publish("a", b"%d" % number) for number in range(1000)))
+    await eager.send(*(Publish("a", b"%d" % number) for number in range(1000)))
     for number in range(1000):
-        heard = await subscriber.hear()
+        heard = await subscriber.receive()
         assert isinstance(heard, Publish) and heard.payload == b"%d" % number
         if number == 700:
-            await calm.say(Publish("b", b"", 1, packet_id=1))
-            assert isinstance(await calm.hear(), Puback)
+            await calm.send(Publish("b", b"", 1, packet_id=1))
+            assert isinstance(await calm.receive(), Puback)
     # A second's worth may come at once.
     assert 0.6 < loop.time() - began < 6
 
 
-async def test_a_rate_holds_for_the_smallest_messages(house: House):
+async def test_a_rate_holds_for_the_smallest_messages(harness: Harness):
     """Thousands are in one chunk: they are not taken as one."""
-    await house.start(publish_rate=100)
-    caller = await house.join("tiny")
-    counters = house.broker.counters
-    await caller.say(Publish("a", b"").encode(5) * 5000)
+    await harness.start(publish_rate=100)
+    peer = await harness.log_in("tiny")
+    counters = harness.broker.counters
+    await peer.send(Publish("a", b"").encode(5) * 5000)
     await asyncio.sleep(0.3)
     assert 0 < counters.publish_received <= 250
     await asyncio.sleep(0.5)
     assert counters.publish_received <= 300
-    caller.hang_up()
+    peer.hang_up()
 
 
-async def test_what_is_cut_in_portions_stays_in_order(house: House, monkeypatch):
-    monkeypatch.setattr(network, "LARGEST_PORTION", 16)
-    await house.start()
-    caller = await house.join("self")
-    await caller.say(Subscribe(1, [Subscription("#")]))
-    await caller.hear()
+async def test_what_is_cut_in_portions_stays_in_order(harness: Harness, monkeypatch):
+    monkeypatch.setattr(scheduler, "LARGEST_PORTION", 16)
+    await harness.start()
+    peer = await harness.log_in("self")
+    await peer.send(Subscribe(1, [Subscription("#")]))
+    await peer.receive()
     sizes = [0, 5, 100, 3, 2000, 1, 70_000, 8, 8, 8, 300_000, 0]
-    await caller.say(*(Publish(f"a/{n}", bytes(size)) for n, size in enumerate(sizes)))
+    await peer.send(*(Publish(f"a/{n}", bytes(size)) for n, size in enumerate(sizes)))
     for n, size in enumerate(sizes):
-        heard = await caller.hear()
+        heard = await peer.receive()
         assert isinstance(heard, Publish)
         assert (heard.topic, len(heard.payload)) == (f"a/{n}", size)
 
 
 @both
-async def test_a_flood_of_small_packets_leaves_others_their_turn(house: House, tls):
-    await house.start()
-    flood, other = await house.join("flood", tls=tls), await house.join("other", tls=tls)
+async def test_a_flood_of_small_packets_leaves_others_their_turn(harness: Harness, tls):
+    await harness.start()
+    flood, other = await harness.log_in("flood", tls=tls), await harness.log_in("other", tls=tls)
     count = 50_000
     flood.writer.write(Publish("a", b"").encode(5) * count)
-    received = house.broker.counters
+    received = harness.broker.counters
     await until(lambda: received.publish_received)
     answers = 0
     while received.publish_received < count:
-        await other.say(Pingreq())
-        assert isinstance(await other.hear(), Pingresp)
+        await other.send(Pingreq())
+        assert isinstance(await other.receive(), Pingresp)
         answers += 1
     assert answers > 10  # in chunks as they are received, it would be two or three
 
@@ -1018,35 +1029,35 @@ async def test_a_flood_of_small_packets_leaves_others_their_turn(house: House, t
 
 
 @pytest.fixture
-async def small_house(contexts) -> AsyncIterator[House]:
-    house = House(*contexts, Limits(memory=8 * MIB))
-    house.broker.tick(asyncio.get_running_loop().time())
-    yield house
-    await house.close()
+async def small_house(contexts) -> AsyncIterator[Harness]:
+    harness = Harness(*contexts, Limits(memory=8 * MIB))
+    harness.broker.tick(asyncio.get_running_loop().time())
+    yield harness
+    await harness.close()
 
 
 @both
-async def test_the_output_of_slow_readers_is_counted(small_house: House, tls):
+async def test_the_output_of_slow_readers_is_counted(small_house: Harness, tls):
     """And it is bounded in all: not a megabyte for each of them."""
-    house = small_house
-    await house.start()
-    readers = [await house.join(f"r{n}", tls=tls, receive_buffer=4096) for n in range(20)]
+    harness = small_house
+    await harness.start()
+    readers = [await harness.log_in(f"r{n}", tls=tls, receive_buffer=4096) for n in range(20)]
     for number, reader in enumerate(readers):
-        protocol = house.protocol(f"r{number}")
+        protocol = harness.protocol(f"r{number}")
         assert protocol._transport is not None
         protocol._transport.get_extra_info("socket").setsockopt(
             socket.SOL_SOCKET, socket.SO_SNDBUF, 4096
         )
-        await reader.say(Subscribe(1, [Subscription("a")]))
-        await reader.hear()
-    publisher = await house.join("pub")
+        await reader.send(Subscribe(1, [Subscription("a")]))
+        await reader.receive()
+    publisher = await harness.log_in("pub")
     for _ in range(150):
-        await publisher.say(Publish("a", bytes(20_000)), Pingreq())
-        assert isinstance(await publisher.hear(), Pingresp)
-    accounting = house.broker.accounting
-    protocols = [house.protocol(f"r{number}") for number in range(20)]
+        await publisher.send(Publish("a", bytes(20_000)), Pingreq())
+        assert isinstance(await publisher.receive(), Pingresp)
+    accounting = harness.broker.accounting
+    protocols = [harness.protocol(f"r{number}") for number in range(20)]
     waiting = sum(protocol._output_size() for protocol in protocols)
-    assert house.network.output >= waiting > 0
+    assert harness.scheduler.output >= waiting > 0
     assert accounting.queued_bytes >= waiting
     assert waiting < 3 * MIB
     for reader in readers:
@@ -1054,71 +1065,71 @@ async def test_the_output_of_slow_readers_is_counted(small_house: House, tls):
 
 
 @both
-async def test_a_large_message_is_not_copied_for_everyone(house: House, tls):
-    await house.start()
-    readers = [await house.join(f"r{n}", tls=tls, receive_buffer=4096) for n in range(20)]
+async def test_a_large_message_is_not_copied_for_everyone(harness: Harness, tls):
+    await harness.start()
+    readers = [await harness.log_in(f"r{n}", tls=tls, receive_buffer=4096) for n in range(20)]
     for reader in readers:
-        await reader.say(Subscribe(1, [Subscription("a", 1)]))
-        await reader.hear()
-    publisher = await house.join("pub")
+        await reader.send(Subscribe(1, [Subscription("a", 1)]))
+        await reader.receive()
+    publisher = await harness.log_in("pub")
     tracemalloc.start()
     try:
         message = Publish("a", bytes(8 * MIB), 1, packet_id=1)
-        await publisher.say(message, Publish("a", b"and a small one"))
-        assert isinstance(await publisher.hear(), Puback)
+        await publisher.send(message, Publish("a", b"and a small one"))
+        assert isinstance(await publisher.receive(), Puback)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert 8 * MIB <= house.network.output < 15 * MIB
+    assert 8 * MIB <= harness.scheduler.output < 15 * MIB
     assert most < 60 * MIB  # our own end, the stream's buffer and the chunks, joined
     for reader in readers[1:]:
         reader.hang_up()
-    heard = await readers[0].hear()
+    heard = await readers[0].receive()
     assert isinstance(heard, Publish) and len(heard.payload) == 8 * MIB
-    heard = await readers[0].hear()
+    heard = await readers[0].receive()
     assert isinstance(heard, Publish) and heard.payload == b"and a small one"
 
 
-async def test_publishers_are_slowed_while_memory_is_short(small_house: House, caplog):
+async def test_publishers_are_slowed_while_memory_is_short(small_house: Harness, caplog):
     """Nobody is cut off, and a publisher that is slowed still gets its answers."""
-    house = small_house
-    await house.start()
-    publisher = await house.join("pub")
-    accounting = house.broker.accounting
+    harness = small_house
+    await harness.start()
+    publisher = await harness.log_in("pub")
+    accounting = harness.broker.accounting
     loop = asyncio.get_running_loop()
 
     async def publish(count: int, size: int) -> float:
         began = loop.time()
         for number in range(count):
-            await publisher.say(Publish("a", bytes(size), 1, packet_id=1 + number))
-            assert isinstance(await publisher.hear(), Puback)
+            await publisher.send(Publish("a", bytes(size), 1, packet_id=1 + number))
+            assert isinstance(await publisher.receive(), Puback)
         return loop.time() - began
 
     await publish(10, 20_000)
     accounting.queued_bytes += 7 * MIB
     try:
         assert await publish(10, 20_000) > 9 * wire.SHORT_OF_MEMORY_PAUSE
-        assert await publish(5 * network.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
+        assert await publish(5 * scheduler.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
         assert "is slowed" in caplog.text and "broker.limits.memory" in caplog.text
-        reader = await house.join("reader")
+        reader = await harness.log_in("reader")
         began = loop.time()
         for _ in range(50):
-            await reader.say(Pingreq())
-            await reader.hear()
+            await reader.send(Pingreq())
+            await reader.receive()
         assert loop.time() - began < 25 * wire.SHORT_OF_MEMORY_PAUSE
     finally:
         accounting.queued_bytes -= 7 * MIB
 
 
-async def test_who_stays_slow_is_told_in_the_log(house: House, monkeypatch, caplog):
+async def test_who_stays_slow_is_told_in_the_log(harness: Harness, monkeypatch, caplog):
     monkeypatch.setattr(wire, "SLOW_AFTER", 0.05)
-    await house.start()
-    deaf = await house.join("deaf", receive_buffer=4096)
-    await deaf.say(Subscribe(1, [Subscription("a")]))
-    await deaf.hear()
-    publisher = await house.join("pub")
+    await harness.start()
+    deaf = await harness.log_in("deaf", receive_buffer=4096)
+    await deaf.send(Subscribe(1, [Subscription("a")]))
+    await deaf.receive()
+    publisher = await harness.log_in("pub")
     for _ in range(10):
-        await publisher.say(Publish("a", bytes(MIB)))
+        await publisher.send(Publish("a", bytes(MIB)))
     await until(lambda: "client 'deaf' (anonymous)" in caplog.text)
     assert "does not read" in caplog.text
     deaf.hang_up()

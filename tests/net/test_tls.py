@@ -26,8 +26,8 @@ from appliance import certs
 from appliance.broker.faults import Faults
 from appliance.net import tls
 from appliance.net.callbacks import Entries
+from appliance.net.layers import Schedulable, UpperLayer
 from appliance.net.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
-from appliance.net.turns import Charged, Turn
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -36,7 +36,7 @@ MIB = 1 << 20
 ALERT = 0x15  # the record's type (RFC 8446, section 5.1)
 
 
-class Turns:
+class LayerScheduler:
     """Whose turn it is: in the next round of the loop, and there is nobody else."""
 
     def __init__(self) -> None:
@@ -44,13 +44,13 @@ class Turns:
         self.cost = 0
         self.busy = False
 
-    def count(self, cost: int, charged: Charged) -> None:
+    def count_cost(self, cost: int, charged: UpperLayer) -> None:
         self.cost += cost
 
-    def has_to_wait(self, charged: Charged, *, is_little: bool) -> bool:
-        return self.busy and not is_little
+    def must_wait(self, charged: UpperLayer, *, is_small: bool) -> bool:
+        return self.busy and not is_small
 
-    def queue_turn(self, member: Turn) -> None:
+    def queue_turn(self, member: Schedulable) -> None:
         asyncio.get_running_loop().call_soon(member.take_turn)
 
 
@@ -59,9 +59,9 @@ async def own(
     context: ssl.SSLContext,
     protocol: asyncio.Protocol,
     timeout: float,
-    turns: Turns | None = None,
+    scheduler: LayerScheduler | None = None,
 ) -> None:
-    await tls.accept(connection, context, protocol, timeout, turns or Turns())
+    await tls.accept(connection, context, protocol, timeout, scheduler or LayerScheduler())
 
 
 async def asyncios(
@@ -118,16 +118,16 @@ class Served(asyncio.Protocol):
         self.lost = asyncio.Event()
         self.on_data = on_data or (lambda served, data: None)
 
-    def set_apart(self, size):
+    def count_buffered(self, size):
         self.set_aside = size
 
-    def is_not_read(self):
+    def input_paused(self):
         pass
 
-    def is_read(self):
+    def input_resumed(self):
         pass
 
-    def has_part(self, part):
+    def partial_record(self, part):
         pass
 
     def connection_made(self, transport):
@@ -164,7 +164,7 @@ def echo(served: Served, data: bytes) -> None:
     served.transport.write(data)
 
 
-class Caller:
+class Peer:
     """The client's end: TLS in memory, so that a test has each byte on the wire in its hand."""
 
     def __init__(self, sock: socket.socket, context: ssl.SSLContext) -> None:
@@ -214,12 +214,12 @@ class Caller:
             self.tls.unwrap()
         return self._outgoing.read()
 
-    async def say(self, data: bytes) -> None:
+    async def send(self, data: bytes) -> None:
         view = memoryview(data)
         for start in range(0, len(view), RECORD_SIZE):
             await self.put(self.seal(view[start : start + RECORD_SIZE]))  # type: ignore[arg-type]
 
-    async def hear(self, size: int, *, rude: bool = False) -> bytes:
+    async def receive(self, size: int, *, rude: bool = False) -> bytes:
         """So many bytes of data, fewer when it ends before them, with close_notify or `rude`."""
         data = bytearray()
         while len(data) < size:
@@ -240,11 +240,11 @@ class Caller:
                 data += part
         return bytes(data)
 
-    async def hear_the_end(self) -> bytes:
+    async def receive_rest(self) -> bytes:
         """Everything up to close_notify."""
-        return await self.hear(1 << 62)
+        return await self.receive(1 << 62)
 
-    async def hear_raw_end(self) -> bytes:
+    async def receive_raw_rest(self) -> bytes:
         """The bytes up to the end of the TCP connection."""
         raw = b""
         with contextlib.suppress(ConnectionError):
@@ -258,7 +258,7 @@ class Caller:
         self.sock.close()
 
 
-class House:
+class Harness:
     """A listening socket; the connections made to it end with the test."""
 
     def __init__(self, server: ssl.SSLContext, client: ssl.SSLContext) -> None:
@@ -269,7 +269,7 @@ class House:
         self._stack.callback(self._listening.close)
         self.all: list[Served] = []
 
-    async def dial(self, receive_buffer: int = 0) -> tuple[Caller, socket.socket]:
+    async def dial(self, receive_buffer: int = 0) -> tuple[Peer, socket.socket]:
         """A TCP connection: the client's end, and the server's, accepted."""
         loop = asyncio.get_running_loop()
         sock = socket.socket()
@@ -282,24 +282,24 @@ class House:
         accepted, _ = await loop.sock_accept(self._listening)
         accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._stack.callback(accepted.close)
-        return Caller(sock, self.client), accepted
+        return Peer(sock, self.client), accepted
 
-    async def join(
+    async def log_in(
         self,
         on_data: Callable[[Served, bytes], object] | None = None,
         *,
         behind: bytes = b"",
         receive_buffer: int = 0,
         accept: Any = own,
-    ) -> tuple[Caller, Served]:
+    ) -> tuple[Peer, Served]:
         """A connection after its handshake."""
-        caller, accepted = await self.dial(receive_buffer)
+        peer, accepted = await self.dial(receive_buffer)
         served = Served(on_data)
         self.all.append(served)
-        shaking = asyncio.ensure_future(caller.shake_hands(behind))
+        shaking = asyncio.ensure_future(peer.shake_hands(behind))
         await accept(accepted, self.server, served, PATIENCE)
         await shaking
-        return caller, served
+        return peer, served
 
     async def close(self) -> None:
         for served in self.all:
@@ -310,13 +310,13 @@ class House:
 
 
 @pytest.fixture
-async def house(server: ssl.SSLContext, client: ssl.SSLContext) -> AsyncIterator[House]:
-    house = House(server, client)
-    yield house
-    await house.close()
+async def harness(server: ssl.SSLContext, client: ssl.SSLContext) -> AsyncIterator[Harness]:
+    harness = Harness(server, client)
+    yield harness
+    await harness.close()
 
 
-async def turns(count: int = 5) -> None:
+async def scheduler(count: int = 5) -> None:
     """Let the loop have seen what is there."""
     for _ in range(count):
         await asyncio.sleep(0)
@@ -330,23 +330,23 @@ def noise(size: int, seed: int = 1) -> bytes:
 
 
 @pytest.mark.parametrize("size", [1, RECORD_SIZE, RECORD_SIZE + 1, tls.PIECE + 1, 3 * MIB + 7])
-async def test_what_is_said_comes_back(house: House, size):
-    caller, served = await house.join(echo)
+async def test_what_is_said_comes_back(harness: Harness, size):
+    peer, served = await harness.log_in(echo)
     data = noise(size)
-    speaking = asyncio.ensure_future(caller.say(data))
-    assert await caller.hear(size) == data
+    speaking = asyncio.ensure_future(peer.send(data))
+    assert await peer.receive(size) == data
     await speaking
     assert served.data == data
     served.transport.close()
-    assert await caller.hear_the_end() == b""
-    caller.sock.close()
+    assert await peer.receive_rest() == b""
+    peer.sock.close()
     await served.ended()
     assert served.error is None
     assert [word for word in served.heard if word in {"made", "eof", "lost"}] == ["made", "lost"]
 
 
-async def test_all_kinds_of_bytes_are_written(house: House):
-    caller, served = await house.join()
+async def test_all_kinds_of_bytes_are_written(harness: Harness):
+    peer, served = await harness.log_in()
     kept = bytearray(b"bytearray,")
     served.transport.write(b"")
     served.transport.write(kept)
@@ -357,57 +357,57 @@ async def test_all_kinds_of_bytes_are_written(house: House):
     served.transport.write(large)
     expected = b"bytearray,memoryview,lines of both" + bytes(large)
     large[:] = bytes(100_000)
-    assert await caller.hear(len(expected)) == expected
+    assert await peer.receive(len(expected)) == expected
 
 
 @pytest.mark.parametrize("size", [1, 5 * RECORD_SIZE])
-async def test_data_right_behind_the_handshake(house: House, size):
+async def test_data_right_behind_the_handshake(harness: Harness, size):
     """It is in the same chunk as the last message of the handshake."""
     behind = noise(size)
-    _, served = await house.join(behind=behind)
+    _, served = await harness.log_in(behind=behind)
     await until(lambda: len(served.data) == len(behind))
     assert served.data == behind
 
 
-async def test_a_chunk_of_many_records_is_handed_on_as_one(house: House):
+async def test_a_chunk_of_many_records_is_handed_on_as_one(harness: Harness):
     """Who is written to because of it is then written to once."""
-    caller, served = await house.join()
-    await caller.put(b"".join(caller.seal(b"message %d" % n) for n in range(50)))
+    peer, served = await harness.log_in()
+    await peer.put(b"".join(peer.seal(b"message %d" % n) for n in range(50)))
     await until(lambda: served.data.endswith(b"message 49"))
     assert served.chunks == 1
 
 
-async def test_many_records_in_one_chunk_take_turns(house: House):
+async def test_many_records_in_one_chunk_take_turns(harness: Harness):
     """Some of them at a time, whatever they hold, and what ends the connection behind them all."""
-    turns = Turns()
+    scheduler = LayerScheduler()
     served = Served()
-    caller, accepted = await house.dial()
-    house.all.append(served)
-    shaking = asyncio.ensure_future(caller.shake_hands())
-    await own(accepted, house.server, served, PATIENCE, turns)
+    peer, accepted = await harness.dial()
+    harness.all.append(served)
+    shaking = asyncio.ensure_future(peer.shake_hands())
+    await own(accepted, harness.server, served, PATIENCE, scheduler)
     await shaking
     text = noise(5000)
-    await caller.put(b"".join(caller.seal(text[n : n + 1]) for n in range(len(text))))
-    caller.sock.shutdown(socket.SHUT_WR)
+    await peer.put(b"".join(peer.seal(text[n : n + 1]) for n in range(len(text))))
+    peer.sock.shutdown(socket.SHUT_WR)
     await served.ended()
     assert bytes(served.data) == text
     assert served.chunks >= len(text) / RECORDS_A_TURN
-    assert turns.cost >= len(text)
+    assert scheduler.cost >= len(text)
 
 
-async def test_while_others_have_to_be_served_a_chunk_waits(house: House):
-    turns = Turns()
+async def test_while_others_have_to_be_served_a_chunk_waits(harness: Harness):
+    scheduler = LayerScheduler()
     served = Served()
-    caller, accepted = await house.dial()
-    house.all.append(served)
-    shaking = asyncio.ensure_future(caller.shake_hands())
-    await own(accepted, house.server, served, PATIENCE, turns)
+    peer, accepted = await harness.dial()
+    harness.all.append(served)
+    shaking = asyncio.ensure_future(peer.shake_hands())
+    await own(accepted, harness.server, served, PATIENCE, scheduler)
     await shaking
-    queued: list[Turn] = []
-    turns.busy, turns.queue_turn = True, queued.append  # type: ignore[method-assign]
-    await caller.put(caller.seal(b"little"))
+    queued: list[Schedulable] = []
+    scheduler.busy, scheduler.queue_turn = True, queued.append  # type: ignore[method-assign]
+    await peer.put(peer.seal(b"little"))
     await until(lambda: served.data == b"little")
-    await caller.put(caller.seal(bytes(8000)) * 1)
+    await peer.put(peer.seal(bytes(8000)) * 1)
     await until(lambda: queued)
     assert served.data == b"little"
     assert served.set_aside > 8000
@@ -423,14 +423,14 @@ async def test_while_others_have_to_be_served_a_chunk_waits(house: House):
     assert served.set_aside == 0
 
 
-async def test_what_the_protocol_can_ask(house: House):
-    caller, served = await house.join()
+async def test_what_the_protocol_can_ask(harness: Harness):
+    peer, served = await harness.log_in()
     ask = served.transport.get_extra_info
-    assert ask("ssl_object").version() == house.client.maximum_version.name.replace("v1_", "v1.")
-    assert ask("sslcontext") is house.server
+    assert ask("ssl_object").version() == harness.client.maximum_version.name.replace("v1_", "v1.")
+    assert ask("sslcontext") is harness.server
     assert ask("cipher") == ask("ssl_object").cipher()
     assert ask("compression") is None and ask("peercert") is None
-    assert ask("peername") == caller.sock.getsockname()
+    assert ask("peername") == peer.sock.getsockname()
     assert ask("socket").fileno() >= 0
     assert ask("nothing", "default") == "default"
     assert not served.transport.can_write_eof()
@@ -440,7 +440,7 @@ async def test_what_the_protocol_can_ask(house: House):
     served.transport.set_protocol(other)
     assert served.transport.get_protocol() is other
     other.heard.append("made")
-    await caller.say(b"for the other")
+    await peer.send(b"for the other")
     await until(lambda: other.data)
     assert not served.data
     served.transport.set_protocol(served)
@@ -449,9 +449,9 @@ async def test_what_the_protocol_can_ask(house: House):
 # --- slow readers ------------------------------------------------------------------------------
 
 
-async def test_a_large_transfer_to_a_slow_reader_is_bounded(house: House):
+async def test_a_large_transfer_to_a_slow_reader_is_bounded(harness: Harness):
     """Whoever heeds pause_writing holds no more than the limit and what it wrote in one go."""
-    caller, served = await house.join(receive_buffer=8192)
+    peer, served = await harness.log_in(receive_buffer=8192)
     served.transport.set_write_buffer_limits(high=256 * 1024)
     piece, pieces, most = noise(64 * 1024), 200, 0
 
@@ -467,26 +467,26 @@ async def test_a_large_transfer_to_a_slow_reader_is_bounded(house: House):
     await until(lambda: served.heard[-1] == "pause")
     digest = hashlib.sha256()
     size = 0
-    while data := await caller.hear(100_000):
+    while data := await peer.receive(100_000):
         digest.update(data)
         size += len(data)
     await writing
     assert size == pieces * len(piece)
     assert digest.digest() == hashlib.sha256(piece * pieces).digest()
-    assert served.heard.count("pause") == served.heard.count("resume") > 1
+    assert served.heard.count_cost("pause") == served.heard.count_cost("resume") > 1
     assert 0 < most < 256 * 1024 + 2 * len(piece)
 
 
-async def test_who_does_not_want_to_read_is_not_sent_more(house: House):
+async def test_who_does_not_want_to_read_is_not_sent_more(harness: Harness):
     """A pause holds from one chunk to the next, and the sender is held up by the network."""
 
     def pause(served: Served, data: bytes) -> None:
         served.transport.pause_reading()
 
-    caller, served = await house.join(pause)
+    peer, served = await harness.log_in(pause)
     data = noise(12 * MIB)
-    sealed = caller.seal(data)
-    speaking = asyncio.ensure_future(caller.put(sealed))
+    sealed = peer.seal(data)
+    speaking = asyncio.ensure_future(peer.put(sealed))
     await until(lambda: served.data)
     assert not served.transport.is_reading()
     size = len(served.data)
@@ -503,32 +503,32 @@ async def test_who_does_not_want_to_read_is_not_sent_more(house: House):
     assert served.data == data
 
 
-async def test_a_connection_keeps_nothing_of_the_largest_message(house: House):
+async def test_a_connection_keeps_nothing_of_the_largest_message(harness: Harness):
     """OpenSSL's buffers never shrink, so they must not have grown."""
-    clients = [await house.join() for _ in range(30)]
+    clients = [await harness.log_in() for _ in range(30)]
     large = noise(MIB)
 
-    async def exchange(caller: Caller, served: Served) -> None:
+    async def exchange(peer: Peer, served: Served) -> None:
         served.transport.write(large)
-        assert await caller.hear(MIB) == large
-        await caller.put(caller.seal(large))
+        assert await peer.receive(MIB) == large
+        await peer.put(peer.seal(large))
         await until(lambda: len(served.data) == MIB)
         served.data.clear()
 
     await exchange(*clients[0])  # what is kept once for all
     before = psutil.Process().memory_info().rss
-    for caller, served in clients:
-        await exchange(caller, served)
+    for peer, served in clients:
+        await exchange(peer, served)
     # It would be more than 1 MiB each for what is written, and 300 KiB, a chunk, for what is read.
     assert psutil.Process().memory_info().rss - before < len(clients) * 200 * 1024
 
 
-async def test_who_makes_openssl_answer_must_read_the_answers(house: House):
+async def test_who_makes_openssl_answer_must_read_the_answers(harness: Harness):
     """An answer that OpenSSL gives by itself, here an alert, does not pile up."""
-    caller, served = await house.join(receive_buffer=8192)
+    peer, served = await harness.log_in(receive_buffer=8192)
     served.transport.write(noise(8 * MIB))
     await until(lambda: served.heard[-1] == "pause")
-    await caller.put(b"\x17\x03\x03\x00\x20" + bytes(32))
+    await peer.put(b"\x17\x03\x03\x00\x20" + bytes(32))
     await served.ended()
     assert not served.data
 
@@ -536,155 +536,155 @@ async def test_who_makes_openssl_answer_must_read_the_answers(house: House):
 # --- the handshake -----------------------------------------------------------------------------
 
 
-async def refused(house: House, accepted: socket.socket, timeout: float = PATIENCE) -> Any:
+async def refused(harness: Harness, accepted: socket.socket, timeout: float = PATIENCE) -> Any:
     """What `accept` raises; the protocol must not have heard of the connection."""
     served = Served()
     with pytest.raises((OSError, asyncio.TimeoutError)) as caught:
-        await own(accepted, house.server, served, timeout)
+        await own(accepted, harness.server, served, timeout)
     accepted.close()
     assert not served.heard
     return caught.value
 
 
 @pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n", b"\x10\x0c\0\4MQTT", bytes(70000)])
-async def test_what_is_not_tls_is_refused(house: House, garbage):
-    caller, accepted = await house.dial()
-    await caller.put(garbage)
-    error = await refused(house, accepted)
+async def test_what_is_not_tls_is_refused(harness: Harness, garbage):
+    peer, accepted = await harness.dial()
+    await peer.put(garbage)
+    error = await refused(harness, accepted)
     assert isinstance(error, ssl.SSLError) and error.reason
-    await caller.hear_raw_end()
+    await peer.receive_raw_rest()
 
 
-async def test_the_reason_of_a_failed_handshake_is_told(house: House, server, directory):
+async def test_the_reason_of_a_failed_handshake_is_told(harness: Harness, server, directory):
     """To the client with an alert, and to the caller of `accept`."""
-    house.server = certs.server_context(
+    harness.server = certs.server_context(
         directory / "server.crt", directory / "server.key", directory / "ca.crt", "required"
     )
-    caller, accepted = await house.dial()
-    shaking = asyncio.ensure_future(caller.shake_hands())
-    error = await refused(house, accepted)
+    peer, accepted = await harness.dial()
+    shaking = asyncio.ensure_future(peer.shake_hands())
+    error = await refused(harness, accepted)
     assert error.reason == "PEER_DID_NOT_RETURN_A_CERTIFICATE"
     with pytest.raises(ssl.SSLError, match=r"(?i)certificate.required|handshake.failure"):
         await shaking
-        await caller.hear(1)
+        await peer.receive(1)
 
 
-async def test_a_client_that_does_not_trust_the_certificate(house: House):
-    house.client = ssl.create_default_context()
-    caller, accepted = await house.dial()
+async def test_a_client_that_does_not_trust_the_certificate(harness: Harness):
+    harness.client = ssl.create_default_context()
+    peer, accepted = await harness.dial()
 
     async def try_it() -> None:
         with contextlib.suppress(ssl.SSLCertVerificationError):
-            await caller.shake_hands()
-        await caller.put(caller._outgoing.read())
+            await peer.shake_hands()
+        await peer.put(peer._outgoing.read())
 
     shaking = asyncio.ensure_future(try_it())
-    error = await refused(house, accepted)
+    error = await refused(harness, accepted)
     assert "UNKNOWN_CA" in error.reason
     await shaking
 
 
-async def test_an_old_version_is_refused(house: House):
+async def test_an_old_version_is_refused(harness: Harness):
     with pytest.warns(DeprecationWarning):
-        house.client.minimum_version = ssl.TLSVersion.TLSv1
-        house.client.maximum_version = ssl.TLSVersion.TLSv1_1
-    house.client.set_ciphers("ALL:@SECLEVEL=0")
-    caller, accepted = await house.dial()
-    await caller.put(caller.step())
-    error = await refused(house, accepted)
+        harness.client.minimum_version = ssl.TLSVersion.TLSv1
+        harness.client.maximum_version = ssl.TLSVersion.TLSv1_1
+    harness.client.set_ciphers("ALL:@SECLEVEL=0")
+    peer, accepted = await harness.dial()
+    await peer.put(peer.step())
+    error = await refused(harness, accepted)
     assert error.reason == "UNSUPPORTED_PROTOCOL"
-    assert (await caller.hear_raw_end())[0] == ALERT
+    assert (await peer.receive_raw_rest())[0] == ALERT
 
 
 @pytest.mark.parametrize("reset", [False, True], ids=["closed", "reset"])
 @pytest.mark.parametrize("part", [0.0, 0.01, 0.5, 1.0])
-async def test_a_handshake_that_is_cut_off(house: House, part, reset):
-    caller, accepted = await house.dial()
-    hello = caller.step()
+async def test_a_handshake_that_is_cut_off(harness: Harness, part, reset):
+    peer, accepted = await harness.dial()
+    hello = peer.step()
     served = Served()
-    accepting = asyncio.ensure_future(own(accepted, house.server, served, PATIENCE))
-    await caller.put(hello[: int(part * len(hello))])
-    await turns()
+    accepting = asyncio.ensure_future(own(accepted, harness.server, served, PATIENCE))
+    await peer.put(hello[: int(part * len(hello))])
+    await scheduler()
     if reset:
-        caller.reset()
+        peer.reset()
     else:
-        caller.sock.close()
+        peer.sock.close()
     with pytest.raises(ConnectionError):
         await accepting
     assert not served.heard
 
 
 @pytest.mark.parametrize("part", [0.0, 0.5, 1.0])
-async def test_a_handshake_that_never_ends(house: House, part):
-    caller, accepted = await house.dial()
-    hello = caller.step()
-    await caller.put(hello[: int(part * len(hello))])
-    error = await refused(house, accepted, 0.05)
+async def test_a_handshake_that_never_ends(harness: Harness, part):
+    peer, accepted = await harness.dial()
+    hello = peer.step()
+    await peer.put(hello[: int(part * len(hello))])
+    error = await refused(harness, accepted, 0.05)
     assert isinstance(error, asyncio.TimeoutError) and str(error) == "no handshake within 0.05 s"
-    await caller.hear_raw_end()
+    await peer.receive_raw_rest()
 
 
-async def test_accepting_can_be_cancelled(house: House):
-    caller, accepted = await house.dial()
+async def test_accepting_can_be_cancelled(harness: Harness):
+    peer, accepted = await harness.dial()
     served = Served()
-    accepting = asyncio.ensure_future(own(accepted, house.server, served, PATIENCE))
-    await caller.put(caller.step())
-    await caller.get()
+    accepting = asyncio.ensure_future(own(accepted, harness.server, served, PATIENCE))
+    await peer.put(peer.step())
+    await peer.get()
     accepting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await accepting
     accepted.close()
-    await caller.hear_raw_end()
+    await peer.receive_raw_rest()
     assert not served.heard
 
 
 # --- the end -----------------------------------------------------------------------------------
 
 
-async def test_the_client_says_goodbye(house: House):
+async def test_the_client_says_goodbye(harness: Harness):
     """close_notify is answered with close_notify; what was said before it counts."""
-    caller, served = await house.join(echo)
-    await caller.put(caller.seal(b"last words") + caller.seal_end() + b"not TLS any more")
+    peer, served = await harness.log_in(echo)
+    await peer.put(peer.seal(b"last words") + peer.seal_end() + b"not TLS any more")
     await served.ended()
     assert served.heard == ["made", "data", "eof", "lost"]
     assert served.data == b"last words" and served.error is None
-    await caller.hear_the_end()
-    assert await caller.hear_raw_end() == b""
+    await peer.receive_rest()
+    assert await peer.receive_raw_rest() == b""
 
 
-async def test_who_has_paused_reading_hears_of_the_goodbye_later(house: House):
+async def test_who_has_paused_reading_hears_of_the_goodbye_later(harness: Harness):
     """As over TCP: what was said before it may take time to answer, a login for one."""
-    caller, served = await house.join(lambda served, data: served.transport.pause_reading())
-    await caller.put(caller.seal(b"last words") + caller.seal_end())
+    peer, served = await harness.log_in(lambda served, data: served.transport.pause_reading())
+    await peer.put(peer.seal(b"last words") + peer.seal_end())
     await until(lambda: served.data)
-    await turns(20)
+    await scheduler(20)
     assert served.heard == ["made", "data"] and not served.transport.is_closing()
     served.transport.write(b"heard")
     served.transport.resume_reading()
     await served.ended()
     assert served.heard == ["made", "data", "eof", "lost"] and served.error is None
-    assert await caller.hear_the_end() == b"heard"
+    assert await peer.receive_rest() == b"heard"
 
 
 @pytest.mark.parametrize("part", [0.0, 0.5])
-async def test_a_connection_that_is_closed_without_goodbye(house: House, part):
+async def test_a_connection_that_is_closed_without_goodbye(harness: Harness, part):
     """At the end of a record or in its middle: whole records count, and are still answered."""
-    caller, served = await house.join(echo)
-    whole, record = caller.seal(b"whole"), caller.seal(b"half a record")
-    await caller.put(whole + record[: int(part * len(record))])
-    caller.sock.shutdown(socket.SHUT_WR)
-    assert await caller.hear_the_end() == b"whole"
+    peer, served = await harness.log_in(echo)
+    whole, record = peer.seal(b"whole"), peer.seal(b"half a record")
+    await peer.put(whole + record[: int(part * len(record))])
+    peer.sock.shutdown(socket.SHUT_WR)
+    assert await peer.receive_rest() == b"whole"
     await served.ended()
     assert served.heard == ["made", "data", "eof", "lost"]
     assert served.error is None
 
 
-async def test_a_connection_that_is_reset(house: House):
-    caller, served = await house.join()
-    whole, record = caller.seal(b"whole"), caller.seal(b"half a record")
-    await caller.put(whole + record[:10])
+async def test_a_connection_that_is_reset(harness: Harness):
+    peer, served = await harness.log_in()
+    whole, record = peer.seal(b"whole"), peer.seal(b"half a record")
+    await peer.put(whole + record[:10])
     await until(lambda: served.data)
-    caller.reset()
+    peer.reset()
     await served.ended()
     assert served.heard == ["made", "data", "lost"]
     assert isinstance(served.error, ConnectionError)
@@ -695,27 +695,27 @@ async def test_a_connection_that_is_reset(house: House):
 
 @pytest.mark.parametrize("kind", ["garbage", "flipped"])
 @pytest.mark.parametrize("apart", [False, True], ids=["at once", "apart"])
-async def test_a_broken_record_ends_the_connection(house: House, kind, apart):
+async def test_a_broken_record_ends_the_connection(harness: Harness, kind, apart):
     """With an alert, and after what came before it."""
-    caller, served = await house.join()
-    good, record = caller.seal(b"good"), caller.seal(b"bad")
+    peer, served = await harness.log_in()
+    good, record = peer.seal(b"good"), peer.seal(b"bad")
     bad = b"GET / HTTP/1.1\r\n" if kind == "garbage" else record[:-1] + bytes([record[-1] ^ 1])
     if apart:
-        await caller.put(good)
+        await peer.put(good)
         await until(lambda: served.data)
-        await caller.put(bad)
+        await peer.put(bad)
     else:
-        await caller.put(good + bad)
+        await peer.put(good + bad)
     await served.ended()
     assert served.heard == ["made", "data", "lost"]
     assert served.data == b"good"
     assert isinstance(served.error, ssl.SSLError)
     with pytest.raises(ssl.SSLError, match=r"(?i)alert"):
-        await caller.hear_the_end()
+        await peer.receive_rest()
 
 
-async def test_a_close_writes_out_what_waits(house: House):
-    caller, served = await house.join(receive_buffer=8192)
+async def test_a_close_writes_out_what_waits(harness: Harness):
+    peer, served = await harness.log_in(receive_buffer=8192)
     data = noise(4 * MIB)
     served.transport.write(data)
     assert served.transport.get_write_buffer_size() > 0
@@ -724,26 +724,26 @@ async def test_a_close_writes_out_what_waits(house: House):
     served.transport.write(b"too late")
     served.transport.close()
     served.transport.resume_reading()
-    assert await caller.hear_the_end() == data
+    assert await peer.receive_rest() == data
     await served.ended()
     assert served.error is None
 
 
 @pytest.mark.parametrize("half", [False, True], ids=["open", "half"])
-async def test_who_does_not_read_the_last_bytes_is_cut_off(house: House, monkeypatch, half):
+async def test_who_does_not_read_the_last_bytes_is_cut_off(harness: Harness, monkeypatch, half):
     """Whether it was closed here or is at the end of its sending: it may not stay for ever."""
     monkeypatch.setattr(tls, "CLOSE_TIMEOUT", 0.1)
-    caller, served = await house.join(receive_buffer=8192)
+    peer, served = await harness.log_in(receive_buffer=8192)
     served.transport.write(bytes(4 * MIB))
     if half:
-        caller.sock.shutdown(socket.SHUT_WR)
+        peer.sock.shutdown(socket.SHUT_WR)
     else:
         served.transport.close()
     await served.ended()
 
 
-async def test_an_abort_drops_what_waits(house: House):
-    caller, served = await house.join(receive_buffer=8192)
+async def test_an_abort_drops_what_waits(harness: Harness):
+    peer, served = await harness.log_in(receive_buffer=8192)
     served.transport.write(bytes(4 * MIB))
     served.transport.abort()
     served.transport.abort()
@@ -751,25 +751,25 @@ async def test_an_abort_drops_what_waits(house: House):
     await served.ended()
     served.transport.abort()
     served.transport.close()
-    assert served.heard.count("lost") == 1
+    assert served.heard.count_cost("lost") == 1
     with pytest.raises((EOFError, ConnectionError)):
-        await caller.hear_the_end()
+        await peer.receive_rest()
 
 
 @pytest.mark.parametrize("end", ["close", "abort"])
-async def test_the_protocol_ends_it_while_it_is_told_something(house: House, end):
+async def test_the_protocol_ends_it_while_it_is_told_something(harness: Harness, end):
     """Nothing more is handed on, not even the end that is in the same chunk."""
-    caller, served = await house.join(lambda served, data: getattr(served.transport, end)())
-    await caller.put(caller.seal(b"quit") + caller.seal_end())
+    peer, served = await harness.log_in(lambda served, data: getattr(served.transport, end)())
+    await peer.put(peer.seal(b"quit") + peer.seal_end())
     await until(lambda: served.data)
-    caller.sock.close()
+    peer.sock.close()
     await served.ended()
     assert served.data == b"quit"
     assert [word for word in served.heard if word not in {"made", "data"}] == ["lost"]
 
 
-async def test_a_failing_write_ends_its_own_connection_only(house: House, monkeypatch):
-    _, served = await house.join()
+async def test_a_failing_write_ends_its_own_connection_only(harness: Harness, monkeypatch):
+    _, served = await harness.log_in()
 
     class Broken:
         def write(self, data):
@@ -785,7 +785,7 @@ ENDS = ["hung up", "never", "not TLS", "cancelled", "goodbye", "eof", "reset", "
 
 
 @pytest.mark.parametrize("end", [*ENDS, "closed", "closed unread", "aborted"])
-async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypatch, end):
+async def test_the_memory_of_a_connection_is_free_at_once(harness: Harness, monkeypatch, end):
     """However it ends, not only when garbage is looked for, which may never find it."""
     both_ends: list[weakref.ref[object]] = []
 
@@ -795,13 +795,13 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
             both_ends.append(weakref.ref(self))
 
     monkeypatch.setattr(tls, "TlsTransport", Watched)
-    caller, accepted = await house.dial(receive_buffer=8192)
+    peer, accepted = await harness.dial(receive_buffer=8192)
 
     async def serve(timeout: float) -> None:
         served = Served()
         both_ends.append(weakref.ref(served))
         with contextlib.suppress(OSError, asyncio.TimeoutError):
-            await own(accepted, house.server, served, timeout)
+            await own(accepted, harness.server, served, timeout)
             if end.startswith("closed"):
                 served.transport.write(bytes(4 * MIB if end == "closed unread" else 10))
                 served.transport.close()
@@ -813,22 +813,22 @@ async def test_the_memory_of_a_connection_is_free_at_once(house: House, monkeypa
     gc.disable()
     try:
         serving = asyncio.ensure_future(serve(0.05 if end == "never" else PATIENCE))
-        await turns()
+        await scheduler()
         if end == "not TLS":
-            await caller.put(b"GET / HTTP/1.1\r\n\r\n")
+            await peer.put(b"GET / HTTP/1.1\r\n\r\n")
         elif end == "cancelled":
             serving.cancel()
         elif end != "hung up" and end != "never":
-            await caller.shake_hands()
+            await peer.shake_hands()
         if end == "goodbye":
-            await caller.put(caller.seal_end())
+            await peer.put(peer.seal_end())
         elif end == "eof":
-            caller.sock.shutdown(socket.SHUT_WR)
+            peer.sock.shutdown(socket.SHUT_WR)
         elif end == "broken":
-            await caller.put(b"\x17\x03\x03\x00\x20" + bytes(32))
+            await peer.put(b"\x17\x03\x03\x00\x20" + bytes(32))
         elif end in {"hung up", "reset", "closed unread"}:
-            await turns()
-            caller.reset()
+            await scheduler()
+            peer.reset()
         with contextlib.suppress(asyncio.CancelledError):
             await serving
         del serving
@@ -908,27 +908,27 @@ def test_the_same_as_asyncios_own_transport(server, client, sizes, cuts, end):
     """The same records in the same chunks: the same data and answers."""
 
     async def converse(accept: Any) -> tuple[bytes, bytes]:
-        house = House(server, client)
-        caller, served = await house.join(echo, accept=accept)
-        sealed = b"".join(caller.seal(noise(size, n)) for n, size in enumerate(sizes) if size)
+        harness = Harness(server, client)
+        peer, served = await harness.log_in(echo, accept=accept)
+        sealed = b"".join(peer.seal(noise(size, n)) for n, size in enumerate(sizes) if size)
         if end == "cut":
             sealed = sealed[:-3]
         if end == "notify":
-            sealed += caller.seal_end()
+            sealed += peer.seal_end()
 
         async def speak() -> None:
             for chunk in chunks_of(sealed, cuts):
-                await caller.put(chunk)
-                await turns(2)
+                await peer.put(chunk)
+                await scheduler(2)
             if end != "notify":
-                caller.sock.shutdown(socket.SHUT_WR)
+                peer.sock.shutdown(socket.SHUT_WR)
 
         speaking = asyncio.ensure_future(speak())
-        answer = await caller.hear(MIB, rude=True)  # asyncio is, to those who are
-        await caller.hear_raw_end()
+        answer = await peer.receive(MIB, rude=True)  # asyncio is, to those who are
+        await peer.receive_raw_rest()
         await speaking
         await served.ended()
-        await house.close()
+        await harness.close()
         if accept is own:  # asyncio's transport tells less, depending on its version
             told = [word for word in served.heard if word in {"made", "eof", "lost"}]
             assert told == ["made", "eof", "lost"] and served.error is None
@@ -973,20 +973,20 @@ async def test_any_split_of_the_bytes_says_the_same(server, client, sizes, cuts,
     seen = []
     for split in (False, True):
         served, network = Served(), Network()
-        transport = TlsTransport(served, server, Turns())
+        transport = TlsTransport(served, server, LayerScheduler())
         transport.connection_made(network)  # type: ignore[arg-type]
         with socket.socket() as unused:
-            caller = Caller(unused, client)
-        while hello := caller.step():
+            peer = Peer(unused, client)
+        while hello := peer.step():
             for chunk in chunks_of(hello, hello_cuts) if split else [hello]:
                 transport.data_received(chunk)
-            caller._incoming.write(bytes(network.sent))
+            peer._incoming.write(bytes(network.sent))
             network.sent.clear()
         assert served.heard == ["made"]
         transport.write(b"")
         assert not network.sent
-        records = [caller.seal(noise(size, n)) for n, size in enumerate(sizes) if size]
-        sealed = bytearray(b"".join(records) + caller.seal_end())
+        records = [peer.seal(noise(size, n)) for n, size in enumerate(sizes) if size]
+        sealed = bytearray(b"".join(records) + peer.seal_end())
         if flip is not None:
             sealed[int(flip * len(sealed))] ^= 1
         for chunk in chunks_of(bytes(sealed), cuts if split else []):

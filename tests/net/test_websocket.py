@@ -17,7 +17,7 @@ from typing import Any, cast
 import paho.mqtt.client as paho
 import pytest
 import uvloop
-from house import Caller, House, Watches, abort, make_contexts
+from harness import Harness, Peer, PublishObserver, abort, make_contexts
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from waiting import PATIENCE, until
 from websockets.asyncio.client import ClientConnection, connect
@@ -69,11 +69,11 @@ def contexts(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture
-async def house(contexts) -> AsyncIterator[House]:
-    house = House(*contexts, Limits(packet_size=4 * MIB))
-    house.broker.tick(asyncio.get_running_loop().time())
-    yield house
-    await house.close()
+async def harness(contexts) -> AsyncIterator[Harness]:
+    harness = Harness(*contexts, Limits(packet_size=4 * MIB))
+    harness.broker.tick(asyncio.get_running_loop().time())
+    yield harness
+    await harness.close()
 
 
 def take_packet(received: bytes) -> tuple[Packet | None, bytes]:
@@ -88,18 +88,18 @@ def take_packet(received: bytes) -> tuple[Packet | None, bytes]:
     return packet, received[body + length :]
 
 
-class Talker:
+class WebSocketPeer:
     """A client that speaks through the `websockets` library."""
 
     def __init__(self, connection: ClientConnection) -> None:
         self.connection = connection
         self._unread = b""
 
-    async def say(self, *packets: Packet | bytes) -> None:
+    async def send(self, *packets: Packet | bytes) -> None:
         data = b"".join(p if isinstance(p, bytes) else p.encode(5) for p in packets)
         await asyncio.wait_for(self.connection.send(data), PATIENCE)
 
-    async def hear(self) -> Packet:
+    async def receive(self) -> Packet:
         return await asyncio.wait_for(self._hear(), PATIENCE)
 
     async def _hear(self) -> Packet:
@@ -112,27 +112,31 @@ class Talker:
             self._unread += message
 
 
-async def talk(house: House, tls: bool = False, path: str = "/mqtt", **options: Any) -> Talker:
+async def talk(
+    harness: Harness, tls: bool = False, path: str = "/mqtt", **options: Any
+) -> WebSocketPeer:
     """A WebSocket connection to one of the listeners."""
-    scheme, port = ("wss", house.ports[3][1]) if tls else ("ws", house.ports[2][1])
+    scheme, port = ("wss", harness.ports[3][1]) if tls else ("ws", harness.ports[2][1])
     options.setdefault("subprotocols", ["mqtt"])
     connection = await connect(
         f"{scheme}://localhost:{port}{path}",
-        ssl=house.client_context if tls else None,
+        ssl=harness.client_context if tls else None,
         max_size=None,
         **options,
     )
-    talker = Talker(connection)
-    house.callers.append(talker)  # type: ignore[arg-type]
-    talker.hang_up = functools.partial(abort, connection.transport)  # type: ignore[attr-defined]
-    return talker
+    ws_peer = WebSocketPeer(connection)
+    harness.peers.append(ws_peer)  # type: ignore[arg-type]
+    ws_peer.hang_up = functools.partial(abort, connection.transport)  # type: ignore[attr-defined]
+    return ws_peer
 
 
-async def join(house: House, client_id: str, tls: bool = False, **options: Any) -> Talker:
-    talker = await talk(house, tls)
-    await talker.say(Connect(client_id, **options))
-    assert isinstance(await talker.hear(), Connack)
-    return talker
+async def join(
+    harness: Harness, client_id: str, tls: bool = False, **options: Any
+) -> WebSocketPeer:
+    ws_peer = await talk(harness, tls)
+    await ws_peer.send(Connect(client_id, **options))
+    assert isinstance(await ws_peer.receive(), Connack)
+    return ws_peer
 
 
 REQUEST = (
@@ -142,28 +146,28 @@ REQUEST = (
 )
 
 
-async def shake_hands(house: House, tls: bool = False) -> Caller:
+async def shake_hands(harness: Harness, tls: bool = False) -> Peer:
     """A connection that is upgraded, for frames by hand."""
-    house.ports[0:2] = house.ports[2:4]
-    caller = await house.dial(tls)
-    await caller.say(REQUEST)
-    head = await asyncio.wait_for(caller.reader.readuntil(b"\r\n\r\n"), PATIENCE)
+    harness.ports[0:2] = harness.ports[2:4]
+    peer = await harness.dial(tls)
+    await peer.send(REQUEST)
+    head = await asyncio.wait_for(peer.reader.readuntil(b"\r\n\r\n"), PATIENCE)
     assert head.startswith(b"HTTP/1.1 101 ")
-    return caller
+    return peer
 
 
 def frame(data: bytes, opcode: Opcode = Opcode.BINARY, *, fin: bool = True) -> bytes:
     return Frame(opcode, data, fin).serialize(mask=True)
 
 
-async def hear_frame(caller: Caller) -> tuple[int, bytes]:
+async def receive_frame(peer: Peer) -> tuple[int, bytes]:
     """The next frame: its first byte and its payload."""
 
     async def read() -> tuple[int, bytes]:
-        first, length = await caller.reader.readexactly(2)
+        first, length = await peer.reader.readexactly(2)
         if length > 125:
-            length = int.from_bytes(await caller.reader.readexactly(2 if length == 126 else 8))
-        return first, await caller.reader.readexactly(length)
+            length = int.from_bytes(await peer.reader.readexactly(2 if length == 126 else 8))
+        return first, await peer.reader.readexactly(length)
 
     return await asyncio.wait_for(read(), PATIENCE)
 
@@ -177,21 +181,21 @@ both = pytest.mark.parametrize("tls", [False, True], ids=["ws", "wss"])
 
 
 @both
-async def test_messages_between_websocket_and_tcp(house: House, tls):
-    await house.start()
-    talker, caller = await join(house, "web", tls), await house.join("tcp")
-    for client in (talker, caller):
-        await client.say(Subscribe(1, [Subscription("a", 2)]))
-        assert await client.hear() == Suback(1, [2])
+async def test_messages_between_websocket_and_tcp(harness: Harness, tls):
+    await harness.start()
+    ws_peer, peer = await join(harness, "web", tls), await harness.log_in("tcp")
+    for client in (ws_peer, peer):
+        await client.send(Subscribe(1, [Subscription("a", 2)]))
+        assert await client.receive() == Suback(1, [2])
     for size in (0, 1, 125, 126, 65_535, 65_536, 3_000_000):
-        for client in (talker, caller):
-            await client.say(Publish("a", bytes(size), 1, packet_id=7))
-            heard = [await talker.hear(), await caller.hear(), await client.hear()]
+        for client in (ws_peer, peer):
+            await client.send(Publish("a", bytes(size), 1, packet_id=7))
+            heard = [await ws_peer.receive(), await peer.receive(), await client.receive()]
             sizes = [len(packet.payload) for packet in heard if isinstance(packet, Publish)]
             assert sizes == [size, size]
             assert Puback(7) in heard
-            for receiver in (talker, caller):
-                await receiver.say(*(Puback(n) for n in range(1, 40)))
+            for receiver in (ws_peer, peer):
+                await receiver.send(*(Puback(n) for n in range(1, 40)))
 
 
 @pytest.mark.parametrize(
@@ -204,38 +208,38 @@ async def test_messages_between_websocket_and_tcp(house: House, tls):
         (["chat", "mqtt"], "mqtt"),
     ],
 )
-async def test_the_subprotocol_is_the_clients_choice(house: House, offered, chosen):
-    await house.start()
-    talker = await talk(house, subprotocols=offered)
-    assert talker.connection.subprotocol == chosen
-    assert talker.connection.response is not None
-    assert "Sec-WebSocket-Extensions" not in talker.connection.response.headers
+async def test_the_subprotocol_is_the_clients_choice(harness: Harness, offered, chosen):
+    await harness.start()
+    ws_peer = await talk(harness, subprotocols=offered)
+    assert ws_peer.connection.subprotocol == chosen
+    assert ws_peer.connection.response is not None
+    assert "Sec-WebSocket-Extensions" not in ws_peer.connection.response.headers
 
 
-async def _refusal(house: House, **options: Any) -> Response:
+async def _refusal(harness: Harness, **options: Any) -> Response:
     with pytest.raises(InvalidStatus) as refused:
-        await talk(house, **options)
+        await talk(harness, **options)
     return refused.value.response
 
 
 @pytest.mark.parametrize("offered", [None, ["chat"], ["MQTT"]])
-async def test_without_a_subprotocol(house: House, offered, caplog):  # [MQTT-6.0.0-3]
-    await house.start()
-    response = await _refusal(house, subprotocols=offered)
+async def test_without_a_subprotocol(harness: Harness, offered, caplog):  # [MQTT-6.0.0-3]
+    await harness.start()
+    response = await _refusal(harness, subprotocols=offered)
     assert response.status_code == 400
     assert b"offer the subprotocol mqtt or mqttv3.1" in (response.body or b"")
     assert "no WebSocket connection: offer the subprotocol" in caplog.text
-    await until(lambda: not house.network.open)
+    await until(lambda: not harness.scheduler.connections)
 
 
-async def test_paths(house: House, caplog):
-    await house.start()
+async def test_paths(harness: Harness, caplog):
+    await harness.start()
     for path in ("/", "/mqtt/", "/other?x=/mqtt"):
-        response = await _refusal(house, path=path)
+        response = await _refusal(harness, path=path)
         assert response.status_code == 404
         assert b"MQTT over WebSocket is at /mqtt" in (response.body or b"")
     assert "'/': nothing is here" in caplog.text
-    await talk(house, path="/mqtt?token=1")
+    await talk(harness, path="/mqtt?token=1")
 
 
 @pytest.mark.parametrize(
@@ -272,42 +276,42 @@ async def test_paths(house: House, caplog):
         (REQUEST.replace(b"Sec-WebSocket-Protocol", b"\xff"), b"400 ", b"invalid HTTP header"),
     ],
 )
-async def test_what_is_no_upgrade(house: House, request_, status, body, caplog):
-    await house.start()
-    house.ports[0] = house.ports[2]
-    caller = await house.dial()
-    await caller.say(request_)
-    answer = await caller.hear_the_end()
+async def test_what_is_no_upgrade(harness: Harness, request_, status, body, caplog):
+    await harness.start()
+    harness.ports[0] = harness.ports[2]
+    peer = await harness.dial()
+    await peer.send(request_)
+    answer = await peer.receive_rest()
     assert answer.startswith(b"HTTP/1.1 " + status)
     assert body in answer
     assert "no WebSocket connection: " in caplog.text
-    await until(lambda: not house.network.open)
+    await until(lambda: not harness.scheduler.connections)
 
 
 @pytest.mark.parametrize("said", [Connect("lost").encode(), b"\x16\x03\x01\x02\0\x01\0\x01\xfc"])
-async def test_what_is_no_http_is_closed_at_once(house: House, said, caplog):
-    await house.start()
-    house.ports[0] = house.ports[2]
-    caller = await house.dial()
-    await caller.say(said)
-    assert await caller.hear_the_end() == b""
+async def test_what_is_no_http_is_closed_at_once(harness: Harness, said, caplog):
+    await harness.start()
+    harness.ports[0] = harness.ports[2]
+    peer = await harness.dial()
+    await peer.send(said)
+    assert await peer.receive_rest() == b""
     assert "what it sent is not HTTP" in caplog.text
 
 
 @both
-async def test_the_time_to_connect_begins_before_http(house: House, tls, caplog):
-    await house.start(connect_timeout=0.3)
-    house.ports[0:2] = house.ports[2:4]
-    silent, dripping = await house.dial(tls), await house.dial(tls)
-    upgraded = await shake_hands(house, tls)
+async def test_the_time_to_connect_begins_before_http(harness: Harness, tls, caplog):
+    await harness.start(connect_timeout=0.3)
+    harness.ports[0:2] = harness.ports[2:4]
+    silent, dripping = await harness.dial(tls), await harness.dial(tls)
+    upgraded = await shake_hands(harness, tls)
     with contextlib.suppress(ConnectionError):
         for byte in itertools.cycle(REQUEST[:20]):
-            await dripping.say(bytes((byte,)))
+            await dripping.send(bytes((byte,)))
             await asyncio.sleep(0.02)
-            if not house.network.open:
+            if not harness.scheduler.connections:
                 break
-    for caller in (silent, dripping, upgraded):
-        assert await caller.hear_the_end() == b""
+    for peer in (silent, dripping, upgraded):
+        assert await peer.receive_rest() == b""
     assert caplog.text.count("no complete CONNECT within 0.3 s") == 3
 
 
@@ -324,11 +328,11 @@ def _scattered(rng: random.Random, data: bytes, largest: int) -> Iterable[bytes]
 
 @pytest.mark.parametrize("seed", range(3))
 @both
-async def test_packets_are_split_and_joined_at_will(house: House, tls, seed):  # [MQTT-6.0.0-2]
+async def test_packets_are_split_and_joined_at_will(harness: Harness, tls, seed):  # [MQTT-6.0.0-2]
     """Packets over frames, frames over segments, messages in fragments, pings in between."""
     rng = random.Random(seed)
-    await house.start()
-    caller = await shake_hands(house, tls)
+    await harness.start()
+    peer = await shake_hands(harness, tls)
     sizes = [rng.choice([0, 1, 50, 200, 5000, 70_000]) for _ in range(40)]
     packets: list[Packet] = [Connect("split"), Subscribe(1, [Subscription("#")])]
     packets += [Publish(f"a/{n}", bytes(size)) for n, size in enumerate(sizes)]
@@ -345,10 +349,10 @@ async def test_packets_are_split_and_joined_at_will(house: House, tls, seed):  #
     if largest < 50:
         frames.append(frame(data[5000:], opcode))
     for segment in _scattered(rng, b"".join(frames), rng.choice([50, 3000, 200_000])):
-        await caller.say(segment)
+        await peer.send(segment)
     unread, heard = b"", []
     while len(heard) < len(sizes) + 2:
-        first, payload = await hear_frame(caller)
+        first, payload = await receive_frame(peer)
         if first == PONG:
             assert payload == b"?"
             continue
@@ -363,22 +367,22 @@ async def test_packets_are_split_and_joined_at_will(house: House, tls, seed):  #
     assert topics == [(f"a/{n}", size) for n, size in enumerate(sizes)]
 
 
-async def test_a_text_frame_ends_the_connection(house: House, caplog):  # [MQTT-6.0.0-1]
+async def test_a_text_frame_ends_the_connection(harness: Harness, caplog):  # [MQTT-6.0.0-1]
     """What came before it is done; what comes behind it is not."""
-    await house.start()
-    watcher = await house.join("watcher")
-    await watcher.say(Subscribe(1, [Subscription("#")]))
-    await watcher.hear()
-    caller = await shake_hands(house)
+    await harness.start()
+    watcher = await harness.log_in("watcher")
+    await watcher.send(Subscribe(1, [Subscription("#")]))
+    await watcher.receive()
+    peer = await shake_hands(harness)
     text = frame(Publish("c", b"").encode(5), Opcode.TEXT)
-    await caller.say(frame(Connect("text", will=Will("w", b"gone")).encode(5)))
-    assert (await hear_frame(caller))[0] == BINARY
+    await peer.send(frame(Connect("text", will=Will("w", b"gone")).encode(5)))
+    assert (await receive_frame(peer))[0] == BINARY
     before, behind = frame(Publish("a", b"").encode(5)), frame(Publish("b", b"").encode(5))
-    await caller.say(before + text + behind)
-    first, payload = await hear_frame(caller)
+    await peer.send(before + text + behind)
+    first, payload = await receive_frame(peer)
     assert (first, payload[:2]) == (CLOSE, (1003).to_bytes(2, "big"))
-    assert await caller.hear_the_end() == b""
-    heard = [await watcher.hear() for _ in range(2)]
+    assert await peer.receive_rest() == b""
+    heard = [await watcher.receive() for _ in range(2)]
     assert [packet.topic for packet in heard if isinstance(packet, Publish)] == ["a", "w"]
     assert "not the WebSocket protocol: a text frame" in caplog.text
 
@@ -398,199 +402,199 @@ async def test_a_text_frame_ends_the_connection(house: House, caplog):  # [MQTT-
         pytest.param(b"\x82\xff" + (1 << 62).to_bytes(8, "big") + bytes(4), 1009, id="too long"),
     ],
 )
-async def test_wrong_frames_end_the_connection(house: House, data, code, caplog):
-    await house.start()
-    caller = await shake_hands(house)
-    await caller.say(frame(Connect("wrong").encode(5)))
-    assert (await hear_frame(caller))[0] == BINARY
-    await caller.say(data)
-    first, payload = await hear_frame(caller)
+async def test_wrong_frames_end_the_connection(harness: Harness, data, code, caplog):
+    await harness.start()
+    peer = await shake_hands(harness)
+    await peer.send(frame(Connect("wrong").encode(5)))
+    assert (await receive_frame(peer))[0] == BINARY
+    await peer.send(data)
+    first, payload = await receive_frame(peer)
     assert (first, int.from_bytes(payload[:2], "big")) == (CLOSE, code)
-    assert await caller.hear_the_end() == b""
+    assert await peer.receive_rest() == b""
     assert "not the WebSocket protocol: " in caplog.text
-    await until(lambda: not house.broker.clients)
+    await until(lambda: not harness.broker.clients)
 
 
-async def test_the_size_of_a_frame(house: House):
+async def test_the_size_of_a_frame(harness: Harness):
     """A stranger's is bounded by what a CONNECT may take, a client's by the largest packet."""
-    await house.start()
-    caller = await shake_hands(house)
-    await caller.say(b"\x82\xff" + (MAXIMUM_CONTROL + 1).to_bytes(8, "big") + bytes(4))
-    first, payload = await hear_frame(caller)
+    await harness.start()
+    peer = await shake_hands(harness)
+    await peer.send(b"\x82\xff" + (MAXIMUM_CONTROL + 1).to_bytes(8, "big") + bytes(4))
+    first, payload = await receive_frame(peer)
     assert (first, payload[:2]) == (CLOSE, (1009).to_bytes(2, "big"))
-    talker = await join(house, "large")
+    ws_peer = await join(harness, "large")
     # Fragments are no part of a whole here: together they may be larger than a packet.
     message = Publish("a", bytes(MIB)).encode(5)
-    await talker.connection.send(itertools.chain([message] * 6, [Pingreq().encode(5)]))
-    assert isinstance(await talker.hear(), Pingresp)
-    assert house.broker.counters.publish_received == 6
-    await talker.say(message * 3, Pingreq())
-    assert isinstance(await talker.hear(), Pingresp)
+    await ws_peer.connection.send(itertools.chain([message] * 6, [Pingreq().encode(5)]))
+    assert isinstance(await ws_peer.receive(), Pingresp)
+    assert harness.broker.counters.publish_received == 6
+    await ws_peer.send(message * 3, Pingreq())
+    assert isinstance(await ws_peer.receive(), Pingresp)
     with pytest.raises(ConnectionClosed) as closed:
-        await talker.connection.send(message * 5)
-        await talker.hear()
+        await ws_peer.connection.send(message * 5)
+        await ws_peer.receive()
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
 
 
-async def test_an_announced_length_takes_no_memory(house: House):
-    await house.start()
-    talkers = [await join(house, f"c{n}") for n in range(10)]
+async def test_an_announced_length_takes_no_memory(harness: Harness):
+    await harness.start()
+    talkers = [await join(harness, f"c{n}") for n in range(10)]
     tracemalloc.start()
     try:
-        for talker in talkers:
-            talker.connection.transport.write(
+        for ws_peer in talkers:
+            ws_peer.connection.transport.write(
                 b"\x82\xff" + (4 * MIB).to_bytes(8, "big") + bytes(4 + 100)
             )
         await asyncio.sleep(0.1)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(house.network.open) == 10
+    assert len(harness.scheduler.connections) == 10
     assert most < 4 * MIB
 
 
 async def test_frames_that_are_not_complete_are_counted(contexts):
     """They take memory; when there is no more of it, a connection is closed."""
-    house = House(*contexts, Limits(packet_size=4 * MIB, memory=8 * MIB))
-    await house.start()
-    accounting = house.broker.accounting
+    harness = Harness(*contexts, Limits(packet_size=4 * MIB, memory=8 * MIB))
+    await harness.start()
+    accounting = harness.broker.accounting
     begun = b"\x82\xff" + (4 * MIB).to_bytes(8, "big") + bytes(4)
     try:
-        talkers = [await join(house, f"c{n}") for n in range(4)]
+        talkers = [await join(harness, f"c{n}") for n in range(4)]
         before = accounting.queued_bytes
         talkers[0].connection.transport.write(begun + bytes(3 * MIB))
         await until(lambda: accounting.queued_bytes >= before + 3 * MIB)
         talkers[0].connection.transport.write(bytes(MIB))
         await until(lambda: accounting.queued_bytes < before + MIB)
-        for talker in talkers[1:]:
-            talker.connection.transport.write(begun + bytes(4 * MIB - 1))
-        await until(lambda: len(house.network.open) < 3)
+        for ws_peer in talkers[1:]:
+            ws_peer.connection.transport.write(begun + bytes(4 * MIB - 1))
+        await until(lambda: len(harness.scheduler.connections) < 3)
         assert accounting.queued_bytes <= 8 * MIB
     finally:
-        await house.close()
+        await harness.close()
 
 
-async def test_pings_are_answered(house: House):
-    await house.start()
-    talker = await join(house, "ping")
-    await asyncio.wait_for(await talker.connection.ping(b"hello"), PATIENCE)
-    caller = await shake_hands(house)
-    await caller.say(frame(b"1", Opcode.PING) + frame(b"", Opcode.PONG) + frame(b"2", Opcode.PING))
-    assert await hear_frame(caller) == (PONG, b"1")
-    assert await hear_frame(caller) == (PONG, b"2")
+async def test_pings_are_answered(harness: Harness):
+    await harness.start()
+    ws_peer = await join(harness, "ping")
+    await asyncio.wait_for(await ws_peer.connection.ping(b"hello"), PATIENCE)
+    peer = await shake_hands(harness)
+    await peer.send(frame(b"1", Opcode.PING) + frame(b"", Opcode.PONG) + frame(b"2", Opcode.PING))
+    assert await receive_frame(peer) == (PONG, b"1")
+    assert await receive_frame(peer) == (PONG, b"2")
 
 
-async def test_who_pings_and_does_not_read_is_bounded(house: House):
-    await house.start()
-    house.ports[0] = house.ports[2]
-    caller = await house.dial(receive_buffer=4096)
-    await caller.say(REQUEST)
-    await caller.say(frame(Connect("ping").encode(5)))
-    await until(lambda: house.broker.clients)
-    protocol = house.protocol("ping")
+async def test_who_pings_and_does_not_read_is_bounded(harness: Harness):
+    await harness.start()
+    harness.ports[0] = harness.ports[2]
+    peer = await harness.dial(receive_buffer=4096)
+    await peer.send(REQUEST)
+    await peer.send(frame(Connect("ping").encode(5)))
+    await until(lambda: harness.broker.clients)
+    protocol = harness.protocol("ping")
     pings = frame(bytes(125), Opcode.PING) * 2000
     for _ in range(40):
-        await caller.say(pings)
-    await caller.say(frame(b"last", Opcode.PING) + frame(Pingreq().encode(5)))
+        await peer.send(pings)
+    await peer.send(frame(b"last", Opcode.PING) + frame(Pingreq().encode(5)))
     assert protocol._output_size() < MIB
-    await asyncio.wait_for(caller.reader.readuntil(b"\r\n\r\n"), PATIENCE)
+    await asyncio.wait_for(peer.reader.readuntil(b"\r\n\r\n"), PATIENCE)
     heard = [(0, b"")]
     while heard[-1] != (BINARY, Pingresp().encode(5)):
-        heard.append(await hear_frame(caller))
+        heard.append(await receive_frame(peer))
     assert (PONG, b"last") in heard
 
 
 @both
-async def test_a_slow_reader_is_bounded(house: House, tls):
-    await house.start()
-    house.ports[0:2] = house.ports[2:4]
-    slow = await house.dial(tls, receive_buffer=4096)
+async def test_a_slow_reader_is_bounded(harness: Harness, tls):
+    await harness.start()
+    harness.ports[0:2] = harness.ports[2:4]
+    slow = await harness.dial(tls, receive_buffer=4096)
     packets = Connect("slow").encode(5) + Subscribe(1, [Subscription("a")]).encode(5)
-    await slow.say(REQUEST + frame(packets))
-    await until(lambda: house.broker.subscription_count)
-    quick = await join(house, "quick", tls)
-    await quick.say(Subscribe(1, [Subscription("a")]))
-    await quick.hear()
-    publisher = await join(house, "pub", tls)
-    protocol = house.protocol("slow")
+    await slow.send(REQUEST + frame(packets))
+    await until(lambda: harness.broker.subscription_count)
+    quick = await join(harness, "quick", tls)
+    await quick.send(Subscribe(1, [Subscription("a")]))
+    await quick.receive()
+    publisher = await join(harness, "pub", tls)
+    protocol = harness.protocol("slow")
     for n in range(50):
-        await publisher.say(Publish("a", b"%02d" % n + bytes(MIB)), Pingreq())
-        assert isinstance(await publisher.hear(), Pingresp)
-        heard = await quick.hear()
+        await publisher.send(Publish("a", b"%02d" % n + bytes(MIB)), Pingreq())
+        assert isinstance(await publisher.receive(), Pingresp)
+        heard = await quick.receive()
         assert isinstance(heard, Publish) and heard.payload[:2] == b"%02d" % n
         assert protocol._output_size() < 4 * MIB
 
 
-async def test_a_flood_of_empty_frames_leaves_others_their_turn(house: House):
-    await house.start()
-    caller = await shake_hands(house)
-    await caller.say(frame(Connect("flood").encode(5)))
-    await hear_frame(caller)
-    other = await join(house, "other")
-    caller.writer.write(frame(b"") * 400_000 + frame(Pingreq().encode(5)))
-    end = asyncio.ensure_future(hear_frame(caller))
+async def test_a_flood_of_empty_frames_leaves_others_their_turn(harness: Harness):
+    await harness.start()
+    peer = await shake_hands(harness)
+    await peer.send(frame(Connect("flood").encode(5)))
+    await receive_frame(peer)
+    other = await join(harness, "other")
+    peer.writer.write(frame(b"") * 400_000 + frame(Pingreq().encode(5)))
+    end = asyncio.ensure_future(receive_frame(peer))
     answers = 0
     while not end.done():
-        await other.say(Pingreq())
-        assert isinstance(await other.hear(), Pingresp)
+        await other.send(Pingreq())
+        assert isinstance(await other.receive(), Pingresp)
         answers += 1
     assert (await end)[0] == BINARY
     assert answers > 20
 
 
-async def test_little_chunks_of_many_frames_take_turns(house: House):
+async def test_little_chunks_of_many_frames_take_turns(harness: Harness):
     """All in one round of the loop; what waits is counted for its user, and others do not wait."""
-    await house.start()
-    crowd = [await join(house, f"web-{n}", username="mallory") for n in range(30)]
-    await join(house, "alice", username="alice")
-    ends = {name: house.protocol(name) for name in ("alice", *(f"web-{n}" for n in range(30)))}
+    await harness.start()
+    crowd = [await join(harness, f"web-{n}", username="mallory") for n in range(30)]
+    await join(harness, "alice", username="alice")
+    ends = {name: harness.protocol(name) for name in ("alice", *(f"web-{n}" for n in range(30)))}
     alice: Any = ends.pop("alice")._transport
-    accounting = house.broker.accounting
+    accounting = harness.broker.accounting
     account = ends["web-0"].account
-    await until(lambda: not house.network.is_busy())
+    await until(lambda: not harness.scheduler.is_busy())
     before, held, begun = accounting.queued_bytes, account.bytes, accounting.counters.cost
     chunk = frame(b"", Opcode.BINARY, fin=False) + frame(b"", Opcode.CONT, fin=False) * 339
     for end in ends.values():
         cast(Any, end._transport).data_received(chunk)
     cost = accounting.counters.cost - begun
     assert cost < 3 * 340 * FRAME_COST + COST_PER_ROUND, cost
-    waiting = sum(bool(cast(Any, end._transport)._held) for end in ends.values())
+    waiting = sum(bool(cast(Any, end._transport)._backlog) for end in ends.values())
     assert waiting >= 20
     assert accounting.queued_bytes - before >= waiting * len(chunk)
     assert account.bytes - held >= waiting * len(chunk)
     received = accounting.counters.messages_received
     alice.data_received(frame(Pingreq().encode(5)))
     assert accounting.counters.messages_received == received + 1
-    await until(lambda: not any(cast(Any, end._transport)._held for end in ends.values()))
+    await until(lambda: not any(cast(Any, end._transport)._backlog for end in ends.values()))
     await until(lambda: accounting.queued_bytes == before and account.bytes == held)
-    assert len(crowd) == len(house.network.open) - 1
+    assert len(crowd) == len(harness.scheduler.connections) - 1
 
 
-async def test_what_waits_below_a_lost_connection_is_given_back(house: House):
-    await house.start()
-    caller = await shake_hands(house, tls=True)
-    await caller.say(frame(Connect("web", username="mallory").encode()))
-    await hear_frame(caller)
-    end = house.protocol("web")
-    before = house.broker.accounting.queued_bytes
+async def test_what_waits_below_a_lost_connection_is_given_back(harness: Harness):
+    await harness.start()
+    peer = await shake_hands(harness, tls=True)
+    await peer.send(frame(Connect("web", username="mallory").encode()))
+    await receive_frame(peer)
+    end = harness.protocol("web")
+    before = harness.broker.accounting.queued_bytes
     cast(Any, end._transport).pause_reading()
     cast(Any, end._transport).data_received(frame(bytes(3000)))
     end.abort()
-    assert house.broker.accounting.queued_bytes >= before + 3000
-    await until(lambda: house.broker.accounting.queued_bytes == 0)
+    assert harness.broker.accounting.queued_bytes >= before + 3000
+    await until(lambda: harness.broker.accounting.queued_bytes == 0)
 
 
-async def test_packets_behind_connect_wait_for_the_login(house: House):
-    house.gate.clear()
-    await house.start()
-    talker = await talk(house)
-    await talker.say(Connect("quick"), Subscribe(1, [Subscription("a")]))
+async def test_packets_behind_connect_wait_for_the_login(harness: Harness):
+    harness.gate.clear()
+    await harness.start()
+    ws_peer = await talk(harness)
+    await ws_peer.send(Connect("quick"), Subscribe(1, [Subscription("a")]))
     for _ in range(10):
-        await talker.say(Publish("a", bytes(10_000)))
-    await until(lambda: house.network.tasks)
-    assert not house.broker.sessions
-    house.gate.set()
-    kinds = [type(await talker.hear()) for _ in range(12)]
+        await ws_peer.send(Publish("a", bytes(10_000)))
+    await until(lambda: harness.scheduler.tasks)
+    assert not harness.broker.sessions
+    harness.gate.set()
+    kinds = [type(await ws_peer.receive()) for _ in range(12)]
     assert kinds == [Connack, Suback] + [Publish] * 10
 
 
@@ -598,92 +602,92 @@ async def test_packets_behind_connect_wait_for_the_login(house: House):
 
 
 @both
-async def test_the_last_packet_comes_before_the_close_frame(house: House, tls):
-    await house.start()
-    talker = await join(house, "same", tls)
-    await house.join("same")
-    assert await talker.hear() == Disconnect(ReasonCode.SESSION_TAKEN_OVER)
+async def test_the_last_packet_comes_before_the_close_frame(harness: Harness, tls):
+    await harness.start()
+    ws_peer = await join(harness, "same", tls)
+    await harness.log_in("same")
+    assert await ws_peer.receive() == Disconnect(ReasonCode.SESSION_TAKEN_OVER)
     with pytest.raises(ConnectionClosed) as closed:
-        await talker.hear()
+        await ws_peer.receive()
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 1000
     assert closed.value.rcvd_then_sent
 
 
 @both
-async def test_a_client_that_closes(house: House, tls):
+async def test_a_client_that_closes(harness: Harness, tls):
     """With DISCONNECT its will is not sent, without it is."""
-    await house.start()
-    watcher = await house.join("watcher")
-    await watcher.say(Subscribe(1, [Subscription("w/#")]))
-    await watcher.hear()
+    await harness.start()
+    watcher = await harness.log_in("watcher")
+    await watcher.send(Subscribe(1, [Subscription("w/#")]))
+    await watcher.receive()
     for client_id, last in (("polite", [Disconnect()]), ("rude", [])):
-        talker = await join(house, client_id, tls, will=Will(f"w/{client_id}", b"gone"))
-        await talker.say(*last, b"")
-        await asyncio.wait_for(talker.connection.close(), PATIENCE)
-        assert talker.connection.close_code == 1000
-    heard = await watcher.hear()
+        ws_peer = await join(harness, client_id, tls, will=Will(f"w/{client_id}", b"gone"))
+        await ws_peer.send(*last, b"")
+        await asyncio.wait_for(ws_peer.connection.close(), PATIENCE)
+        assert ws_peer.connection.close_code == 1000
+    heard = await watcher.receive()
     assert isinstance(heard, Publish) and heard.topic == "w/rude"
-    await until(lambda: len(house.network.open) == 1)
+    await until(lambda: len(harness.scheduler.connections) == 1)
 
 
-async def test_what_was_said_before_the_close_frame_is_done(house: House):
-    await house.start()
-    caller = await shake_hands(house)
-    await caller.say(frame(Connect("brief", will=Will("w", b"gone")).encode(5)))
-    await hear_frame(caller)
+async def test_what_was_said_before_the_close_frame_is_done(harness: Harness):
+    await harness.start()
+    peer = await shake_hands(harness)
+    await peer.send(frame(Connect("brief", will=Will("w", b"gone")).encode(5)))
+    await receive_frame(peer)
     data = Publish("a", bytes(100)).encode(5) * 2000 + Disconnect().encode(5)
-    await caller.say(frame(data) + frame(b"", Opcode.CLOSE))
-    assert await hear_frame(caller) == (CLOSE, b"")
-    await until(lambda: not house.network.open)
-    assert house.broker.counters.publish_received == 2000
-    assert not house.broker.sessions
+    await peer.send(frame(data) + frame(b"", Opcode.CLOSE))
+    assert await receive_frame(peer) == (CLOSE, b"")
+    await until(lambda: not harness.scheduler.connections)
+    assert harness.broker.counters.publish_received == 2000
+    assert not harness.broker.sessions
 
 
 @pytest.mark.parametrize("ends", [True, False], ids=["with DISCONNECT", "with its will"])
-async def test_what_was_said_before_the_login_and_the_close_frame_is_done(house: House, ends):
+async def test_what_was_said_before_the_login_and_the_close_frame_is_done(harness: Harness, ends):
     """As over TCP: that it is gone already keeps a client neither out nor from being heard."""
-    house.gate.clear()
-    await house.start()
-    watcher = await shake_hands(house)
-    caller = await shake_hands(house)
+    harness.gate.clear()
+    await harness.start()
+    watcher = await shake_hands(harness)
+    peer = await shake_hands(harness)
     data = Connect("brief", will=Will("w", b"gone")).encode(5)
     data += Publish("a", b"kept", retain=True).encode(5) * 3
     data += Disconnect().encode(5) if ends else b""
-    await caller.say(frame(data) + frame(b"", Opcode.CLOSE))
-    await until(lambda: house.network.tasks)
-    assert len(house.network.open) == 2 and not house.broker.sessions
-    house.gate.set()
-    await until(lambda: len(house.network.open) == 1)
-    assert house.broker.counters.publish_received == 3
-    assert house.broker.counters.connects == 1 and not house.broker.sessions
-    await watcher.say(frame(Connect("watcher").encode(5)))
-    assert (await hear_frame(watcher))[0] == BINARY
+    await peer.send(frame(data) + frame(b"", Opcode.CLOSE))
+    await until(lambda: harness.scheduler.tasks)
+    assert len(harness.scheduler.connections) == 2 and not harness.broker.sessions
+    harness.gate.set()
+    await until(lambda: len(harness.scheduler.connections) == 1)
+    assert harness.broker.counters.publish_received == 3
+    assert harness.broker.counters.connects == 1 and not harness.broker.sessions
+    await watcher.send(frame(Connect("watcher").encode(5)))
+    assert (await receive_frame(watcher))[0] == BINARY
 
 
-async def test_who_closes_before_the_login_is_not_waited_for_longer_than_others(house: House):
-    house.gate.clear()
-    await house.start(connect_timeout=0.3)
-    caller = await shake_hands(house)
-    await caller.say(frame(Connect("brief").encode(5)) + frame(b"", Opcode.CLOSE))
-    await until(lambda: not house.network.open)
-    house.gate.set()
-    assert house.broker.counters.connects == 0
+async def test_who_closes_before_the_login_is_not_waited_for_longer_than_others(harness: Harness):
+    harness.gate.clear()
+    await harness.start(connect_timeout=0.3)
+    peer = await shake_hands(harness)
+    await peer.send(frame(Connect("brief").encode(5)) + frame(b"", Opcode.CLOSE))
+    await until(lambda: not harness.scheduler.connections)
+    harness.gate.set()
+    assert harness.broker.counters.connects == 0
 
 
-async def test_stop_with_open_clients(house: House):
-    await house.start()
-    talkers = [await join(house, f"c{n}", tls=n == 1) for n in range(2)]
-    await asyncio.wait_for(house.listeners.stop(), PATIENCE)
-    for talker in talkers:
-        assert await talker.hear() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
+async def test_stop_with_open_clients(harness: Harness):
+    await harness.start()
+    talkers = [await join(harness, f"c{n}", tls=n == 1) for n in range(2)]
+    await asyncio.wait_for(harness.listeners.stop(), PATIENCE)
+    for ws_peer in talkers:
+        assert await ws_peer.receive() == Disconnect(ReasonCode.SERVER_SHUTTING_DOWN)
         with pytest.raises(ConnectionClosed):
-            await talker.hear()
+            await ws_peer.receive()
 
 
 # --- paho ----------------------------------------------------------------------------------------
 
 
-def _exchange_with_paho(house: House, tls: bool, version: MQTTProtocolVersion) -> list[bytes]:
+def _exchange_with_paho(harness: Harness, tls: bool, version: MQTTProtocolVersion) -> list[bytes]:
     """Publish to itself with QoS 0 to 2, and return what came back."""
     client = paho.Client(
         CallbackAPIVersion.VERSION2, f"paho-{version}", protocol=version, transport="websockets"
@@ -700,8 +704,8 @@ def _exchange_with_paho(house: House, tls: bool, version: MQTTProtocolVersion) -
     client.on_subscribe = lambda *_: subscribed.set()
     client.on_message = on_message
     if tls:
-        client.tls_set_context(house.client_context)
-    client.connect("localhost", house.ports[2 + tls][1])
+        client.tls_set_context(harness.client_context)
+    client.connect("localhost", harness.ports[2 + tls][1])
     client.loop_start()
     try:
         assert subscribed.wait(PATIENCE)
@@ -717,36 +721,36 @@ def _exchange_with_paho(house: House, tls: bool, version: MQTTProtocolVersion) -
 
 @pytest.mark.parametrize("version", [MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5])
 @both
-async def test_paho(house: House, tls, version):
-    await house.start()
-    received = await asyncio.to_thread(_exchange_with_paho, house, tls, version)
+async def test_paho(harness: Harness, tls, version):
+    await harness.start()
+    received = await asyncio.to_thread(_exchange_with_paho, harness, tls, version)
     numbers = sorted(int(payload.rstrip(b"\0")) for payload in received)
     assert numbers == list(range(30))
-    await until(lambda: not house.network.open)
+    await until(lambda: not harness.scheduler.connections)
 
 
 # --- how old what comes is -----------------------------------------------------------------------
 
 
-async def open_by_hand(house: House, tls: bool = False) -> Caller:
+async def open_by_hand(harness: Harness, tls: bool = False) -> Peer:
     """A client that has logged in, for frames by hand."""
-    await house.start()
-    caller = await shake_hands(house, tls)
-    await caller.say(frame(Connect("a").encode(5)))
-    assert (await hear_frame(caller))[0] == BINARY
-    return caller
+    await harness.start()
+    peer = await shake_hands(harness, tls)
+    await peer.send(frame(Connect("a").encode(5)))
+    assert (await receive_frame(peer))[0] == BINARY
+    return peer
 
 
 @pytest.mark.parametrize(("tls", "in_frames"), [(False, True), (True, True), (True, False)])
-async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls, in_frames):
+async def test_a_queue_that_waits_in_here_does_not_become_new(harness: Harness, tls, in_frames):
     """Of what was sent at once most waits above the socket, and that is not seen at the socket."""
     packet = Publish("x", b"go").encode(5)
     if in_frames:
-        caller, packet = await open_by_hand(house, tls), frame(packet)
+        peer, packet = await open_by_hand(harness, tls), frame(packet)
     else:
-        await house.start()
-        caller = await house.join("a", tls=tls)
-    wire = house.protocol("a")
+        await harness.start()
+        peer = await harness.log_in("a", tls=tls)
+    wire = harness.protocol("a")
     held: list[float] = []
 
     def published(_: Message) -> None:
@@ -754,12 +758,12 @@ async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls,
         if len(held) == 1:
             wire._rest(0.5)  # as when it publishes too fast
 
-    Watches(house, published)
+    PublishObserver(harness, published)
     if in_frames:
-        caller.writer.write(packet * 400)
+        peer.writer.write(packet * 400)
     else:
         for _ in range(1000):
-            caller.writer.write(packet)  # a record each
+            peer.writer.write(packet)  # a record each
     await until(lambda: len(held) == (400 if in_frames else 1000))
     late = [seconds for seconds in held if seconds > 0.4]
     assert late and held[-len(late) :] == late  # and none behind them is taken for new
@@ -768,17 +772,17 @@ async def test_a_queue_that_waits_in_here_does_not_become_new(house: House, tls,
 class Busy:
     """Somebody who has much to do, for so many turns: each takes a round's cost."""
 
-    def __init__(self, house: House, turns: int) -> None:
-        self.house = house
+    def __init__(self, harness: Harness, turns: int) -> None:
+        self.harness = harness
         self.left = turns
-        house.network.queue_turn(self)
+        harness.scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
         time.sleep(0.006)
-        self.house.broker.counters.cost += COST_PER_ROUND + 1
+        self.harness.broker.counters.cost += COST_PER_ROUND + 1
         self.left -= 1
         if self.left > 0:
-            self.house.network.queue_turn(self)
+            self.harness.scheduler.queue_turn(self)
 
     def fault(self, entry: str, error: Exception) -> None:
         raise error
@@ -786,34 +790,34 @@ class Busy:
 
 @pytest.mark.parametrize("size", [2, 17_000])
 @pytest.mark.parametrize("busy", [False, True])
-async def test_a_frame_in_two_segments_is_as_old_as_the_first(house: House, busy, size):
+async def test_a_frame_in_two_segments_is_as_old_as_the_first(harness: Harness, busy, size):
     """Not as the last look at the clock, which may be a second ago; also when it has to wait."""
-    caller = await open_by_hand(house)
-    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+    peer = await open_by_hand(harness)
+    wire, loop = harness.protocol("a"), asyncio.get_running_loop()
     ages: list[float] = []
-    Watches(house, lambda message: ages.append(message.age))
+    PublishObserver(harness, lambda message: ages.append(message.age))
     command = frame(Publish("x", bytes(size)).encode(5))
     begun = loop.time()
-    house.broker.accounting.now = begun - 60
-    await caller.say(command[: len(command) // 2])
-    await until(lambda: wire._frame)
+    harness.broker.accounting.now = begun - 60
+    await peer.send(command[: len(command) // 2])
+    await until(lambda: wire._frame_size)
     noticed = loop.time()
     await asyncio.sleep(0.3)
     least = loop.time() - noticed
     if busy:
-        Busy(house, 20)
-    await caller.say(command[len(command) // 2 :])
+        Busy(harness, 20)
+    await peer.send(command[len(command) // 2 :])
     await until(lambda: ages)
     assert least <= ages[0] <= loop.time() - begun
 
 
 @pytest.mark.parametrize("in_frames", [False, True])
-async def test_a_record_in_two_segments_is_as_old_as_the_first(house: House, in_frames):
-    await house.start()
+async def test_a_record_in_two_segments_is_as_old_as_the_first(harness: Harness, in_frames):
+    await harness.start()
     loop = asyncio.get_running_loop()
-    reader, writer = await asyncio.open_connection(*house.ports[3 if in_frames else 1][:2])
+    reader, writer = await asyncio.open_connection(*harness.ports[3 if in_frames else 1][:2])
     coming, going = ssl.MemoryBIO(), ssl.MemoryBIO()
-    sealed = house.client_context.wrap_bio(coming, going, server_hostname="localhost")
+    sealed = harness.client_context.wrap_bio(coming, going, server_hostname="localhost")
     while True:
         try:
             sealed.do_handshake()
@@ -826,10 +830,10 @@ async def test_a_record_in_two_segments_is_as_old_as_the_first(house: House, in_
     connect = Connect("a").encode(5)
     sealed.write(frame(connect) if in_frames else connect)
     writer.write(going.read())
-    await until(lambda: any(wire._client.session for wire in house.network.open))
-    wire = house.protocol("a")
+    await until(lambda: any(wire._client.session for wire in harness.scheduler.connections))
+    wire = harness.protocol("a")
     ages: list[float] = []
-    Watches(house, lambda message: ages.append(message.age))
+    PublishObserver(harness, lambda message: ages.append(message.age))
     command = Publish("x", bytes(200)).encode(5)
     command = frame(command) if in_frames else command
     begun = loop.time()
@@ -852,14 +856,14 @@ async def test_a_record_in_two_segments_is_as_old_as_the_first(house: House, in_
 
 
 @pytest.mark.parametrize(("tls", "in_frames"), [(False, True), (True, True), (True, False)])
-async def test_what_waits_for_a_turn_below_is_held(house: House, tls, in_frames):
+async def test_what_waits_for_a_turn_below_is_held(harness: Harness, tls, in_frames):
     packet = Publish("x", bytes(5000)).encode(5)
     if in_frames:
-        caller, packet = await open_by_hand(house, tls), frame(packet)
+        peer, packet = await open_by_hand(harness, tls), frame(packet)
     else:
-        await house.start()
-        caller = await house.join("a", tls=tls)
-    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+        await harness.start()
+        peer = await harness.log_in("a", tls=tls)
+    wire, loop = harness.protocol("a"), asyncio.get_running_loop()
     held: list[float] = []
     waited: list[float] = []
 
@@ -867,35 +871,35 @@ async def test_what_waits_for_a_turn_below_is_held(house: House, tls, in_frames)
         held.append(wire.peer_status().held)
         waited.append(loop.time() - begun)
 
-    Watches(house, published)
+    PublishObserver(harness, published)
     for _ in range(60):
-        Busy(house, 1)
+        Busy(harness, 1)
     begun = loop.time()
-    caller.writer.write(packet)
+    peer.writer.write(packet)
     await until(lambda: held)
     assert waited[0] / 2 < held[0] <= waited[0] + 0.1
     await until(lambda: not wire._client.inflow.is_behind)
     begun = loop.time()
-    caller.writer.write(packet)
+    peer.writer.write(packet)
     await until(lambda: len(held) == 2)
     assert held[1] < 0.1
 
 
 @pytest.mark.parametrize("behind", [0, 5])
-async def test_a_ping_in_two_segments_makes_nothing_old(house: House, behind):
-    caller = await open_by_hand(house)
-    wire, loop = house.protocol("a"), asyncio.get_running_loop()
+async def test_a_ping_in_two_segments_makes_nothing_old(harness: Harness, behind):
+    peer = await open_by_hand(harness)
+    wire, loop = harness.protocol("a"), asyncio.get_running_loop()
     ages: list[float] = []
-    Watches(house, lambda message: ages.append(message.age))
+    PublishObserver(harness, lambda message: ages.append(message.age))
     ping = frame(b"abcd", Opcode.PING)
-    await caller.say(ping[:3])
-    await until(lambda: wire._frame)
+    await peer.send(ping[:3])
+    await until(lambda: wire._frame_size)
     await asyncio.sleep(0.5)
     begun = loop.time()
     command = frame(Publish("x", b"go").encode(5))
-    await caller.say(ping[3:] + command[:behind])
-    assert await hear_frame(caller) == (PONG, b"abcd")
+    await peer.send(ping[3:] + command[:behind])
+    assert await receive_frame(peer) == (PONG, b"abcd")
     assert behind or not wire._client.inflow.unfinished
-    await caller.say(command[behind:])
+    await peer.send(command[behind:])
     await until(lambda: ages)
     assert ages[0] <= loop.time() - begun

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from house import House, make_contexts
+from harness import Harness, make_contexts
 from waiting import until
 
 from appliance.broker.ports import InsideLink
@@ -19,44 +19,44 @@ from appliance.ops.watchdog import CLOCK_PATIENCE, Pulse
 class Time:
     """The loop's clock, moved on by hand."""
 
-    def __init__(self, house: House) -> None:
-        self.house = house
+    def __init__(self, harness: Harness) -> None:
+        self.harness = harness
         self.now = asyncio.get_running_loop().time()
 
     def pass_by(self, seconds: float, *, tick: bool = True) -> None:
         self.now += seconds
         if tick:
-            self.house.broker.tick(self.now)
+            self.harness.broker.tick(self.now)
 
     def __call__(self) -> float:
         return self.now
 
 
 @pytest.fixture
-async def house(tmp_path: Path) -> AsyncIterator[House]:
-    house = House(*make_contexts(tmp_path / "certs"))
-    await house.start()
-    yield house
-    if "_appliance" in house.broker.sessions:
-        house.broker.detach(house.broker.sessions["_appliance"])
-    await house.close()
+async def harness(tmp_path: Path) -> AsyncIterator[Harness]:
+    harness = Harness(*make_contexts(tmp_path / "certs"))
+    await harness.start()
+    yield harness
+    if "_appliance" in harness.broker.sessions:
+        harness.broker.detach(harness.broker.sessions["_appliance"])
+    await harness.close()
 
 
 @pytest.fixture
-async def clock(house: House) -> Time:
-    clock = Time(house)
+async def clock(harness: Harness) -> Time:
+    clock = Time(harness)
     clock.pass_by(0)
     return clock
 
 
 @pytest.fixture
-async def inside(house: House) -> Session:
-    return house.broker.attach("_appliance", InsideLink())
+async def inside(harness: Harness) -> Session:
+    return harness.broker.attach("_appliance", InsideLink())
 
 
 @pytest.fixture
-async def pulse(house: House, clock: Time, inside: Session) -> Pulse:
-    return Pulse(house.broker, house.network, inside, clock)
+async def pulse(harness: Harness, clock: Time, inside: Session) -> Pulse:
+    return Pulse(harness.broker, harness.scheduler, inside, clock)
 
 
 async def lives(pulse: Pulse) -> bool:
@@ -73,30 +73,30 @@ async def test_it_is_there_when_nothing_happens(pulse: Pulse, clock: Time):
         assert await lives(pulse)
 
 
-async def test_and_under_load(house: House, pulse: Pulse, clock: Time):
+async def test_and_under_load(harness: Harness, pulse: Pulse, clock: Time):
     """Large messages take turn after turn; it has its own in between."""
-    callers = [await house.join(f"c{n}") for n in range(10)]
+    peers = [await harness.log_in(f"c{n}") for n in range(10)]
     pulse.is_there()
-    for caller in callers:
-        caller.writer.write(Publish("x", bytes(3_000_000)).encode(5))
-    await until(lambda: house.network._turns, "somebody's turn")
+    for peer in peers:
+        peer.writer.write(Publish("x", bytes(3_000_000)).encode(5))
+    await until(lambda: harness.scheduler._turns, "somebody's turn")
     clock.pass_by(1)
     await until(lambda: pulse._came_through, "the message to go through")
     assert pulse.is_there()
 
 
-async def test_not_when_no_turn_comes(house: House, pulse: Pulse, clock: Time, caplog):
+async def test_not_when_no_turn_comes(harness: Harness, pulse: Pulse, clock: Time, caplog):
     pulse.is_there()
     assert await lives(pulse)
-    house.network._schedule_turns = lambda: None  # type: ignore[method-assign]
+    harness.scheduler._schedule_turns = lambda: None  # type: ignore[method-assign]
     assert await lives(pulse)  # the last one went through before that
     for _ in range(3):
         clock.pass_by(1)
         assert not await lives(pulse)
     told = [record for record in caplog.records if "no sign of life" in record.message]
     assert len(told) == 1 and "no message has gone through a turn" in told[0].message
-    del house.network._schedule_turns
-    house.network._schedule_turns()
+    del harness.scheduler._schedule_turns
+    harness.scheduler._schedule_turns()
     clock.pass_by(1)
     assert await lives(pulse)
 
@@ -112,13 +112,13 @@ async def test_not_when_the_clock_stands_still(pulse: Pulse, clock: Time, caplog
 
 
 async def test_a_turn_that_fails_is_no_sign_of_life(
-    house: House, pulse: Pulse, clock: Time, monkeypatch: pytest.MonkeyPatch, escaped
+    harness: Harness, pulse: Pulse, clock: Time, monkeypatch: pytest.MonkeyPatch, escaped
 ):
     pulse.is_there()
     assert await lives(pulse)
     with monkeypatch.context() as broken:
-        broken.setattr(house.broker, "publish", None)
+        broken.setattr(harness.broker, "publish", None)
         assert not await lives(pulse) or not await lives(pulse)
-    assert house.broker.faults.by_entry["connection.turn"] >= 1
+    assert harness.broker.faults.by_entry["connection.turn"] >= 1
     assert await lives(pulse) or await lives(pulse)
     escaped.clear()

@@ -41,7 +41,7 @@ class AllAllowed:
         return Decision(True, "everything is")
 
 
-class House:
+class Harness:
     """A broker with four listeners: plain and with TLS, and both of these for WebSocket."""
 
     def __init__(
@@ -53,8 +53,8 @@ class House:
         self.gate = asyncio.Event()  # logins wait for it
         self.gate.set()
         self.refused: set[str] = set()
-        self.callers: list[Caller] = []
-        self.strangers: list[socket.socket] = []
+        self.peers: list[Peer] = []
+        self.raw_sockets: list[socket.socket] = []
         self.listeners = self.make()
 
     def make(
@@ -69,8 +69,8 @@ class House:
         return self.listeners
 
     @property
-    def network(self) -> Scheduler:
-        return self.listeners.network
+    def scheduler(self) -> Scheduler:
+        return self.listeners.scheduler
 
     async def _ask(
         self,
@@ -97,7 +97,7 @@ class House:
             ]
         )
 
-    async def dial(self, tls: bool = False, receive_buffer: int = 0) -> Caller:
+    async def dial(self, tls: bool = False, receive_buffer: int = 0) -> Peer:
         """A connection to one of the listeners."""
         sock = socket.socket()
         if receive_buffer:
@@ -109,54 +109,54 @@ class House:
             ssl=self.client_context if tls else None,
             server_hostname="localhost" if tls else None,
         )
-        caller = Caller(reader, writer)
-        self.callers.append(caller)
-        return caller
+        peer = Peer(reader, writer)
+        self.peers.append(peer)
+        return peer
 
-    async def join(self, client_id: str, *, tls: bool = False, receive_buffer: int = 0) -> Caller:
+    async def log_in(self, client_id: str, *, tls: bool = False, receive_buffer: int = 0) -> Peer:
         """A client that has logged in."""
-        caller = await self.dial(tls, receive_buffer)
-        await caller.say(Connect(client_id))
-        assert isinstance(await caller.hear(), Connack)
-        return caller
+        peer = await self.dial(tls, receive_buffer)
+        await peer.send(Connect(client_id))
+        assert isinstance(await peer.receive(), Connack)
+        return peer
 
     async def close(self) -> None:
         """The end of a test: nobody is there any more, and nothing is left of them."""
-        for caller in self.callers:
-            caller.hang_up()
-        for stranger in self.strangers:
-            stranger.close()
+        for peer in self.peers:
+            peer.hang_up()
+        for raw_socket in self.raw_sockets:
+            raw_socket.close()
         await self.listeners.stop()
-        assert not self.network.open
+        assert not self.scheduler.connections
         assert not self.broker.clients
         assert self.broker.accounting.queued_bytes == 0
-        assert self.network.output == 0
-        check_network(self.network)
+        assert self.scheduler.output == 0
+        check_scheduler(self.scheduler)
 
     def protocol(self, client_id: str) -> ClientConnection:
         """The server's end of a client's connection."""
-        for protocol in self.network.open:
+        for protocol in self.scheduler.connections:
             session = protocol._client.session
             if session is not None and session.client_id == client_id:
                 return protocol
         raise AssertionError(f"{client_id} is not connected")
 
 
-def check_network(network: Scheduler) -> None:
+def check_scheduler(scheduler: Scheduler) -> None:
     """`check_accounts`, with what the connections hold of what came in and of what goes out."""
-    strangers = network.broker.accounting.accounts.strangers
-    accounts = {strangers} | {protocol.account for protocol in network.open}
-    accounts |= {session.account for session in network.broker.sessions.values()}
+    strangers = scheduler.broker.accounting.accounts.strangers
+    accounts = {strangers} | {protocol.account for protocol in scheduler.connections}
+    accounts |= {session.account for session in scheduler.broker.sessions.values()}
     wires = {account: account.output for account in accounts}
-    total = network.output
-    for protocol in network.open:
-        held = protocol._held_size + protocol._frame + protocol._below
+    total = scheduler.output
+    for protocol in scheduler.connections:
+        held = protocol._backlog_size + protocol._frame_size + protocol._below_size
         total += held
         wires[protocol.account] += held
         if protocol.account is strangers:
             wires[strangers] += protocol._client._held
     assert strangers.bytes == wires[strangers]
-    check_accounts(network.broker, wires=total, wires_of=wires)
+    check_accounts(scheduler.broker, wires=total, wires_of=wires)
 
 
 def abort(transport: asyncio.WriteTransport) -> None:
@@ -165,18 +165,18 @@ def abort(transport: asyncio.WriteTransport) -> None:
         transport.abort()
 
 
-class Caller:
+class Peer:
     """A client's end of a connection."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
         self.writer = writer
 
-    async def say(self, *packets: Packet | bytes) -> None:
+    async def send(self, *packets: Packet | bytes) -> None:
         self.writer.write(b"".join(p if isinstance(p, bytes) else p.encode(5) for p in packets))
         await asyncio.wait_for(self.writer.drain(), PATIENCE)
 
-    async def hear(self) -> Packet:
+    async def receive(self) -> Packet:
         """The next packet; IncompleteReadError or ConnectionError when there is none."""
         return await asyncio.wait_for(self._hear(), PATIENCE)
 
@@ -187,7 +187,7 @@ class Caller:
         length, _ = decode_varint(header, 1)
         return decode_packet(header[0], await self.reader.readexactly(length), 5)
 
-    async def hear_the_end(self) -> bytes:
+    async def receive_rest(self) -> bytes:
         """What comes until the connection ends."""
         with contextlib.suppress(ConnectionError):
             return await asyncio.wait_for(self.reader.read(-1), PATIENCE)
@@ -197,11 +197,11 @@ class Caller:
         abort(self.writer.transport)
 
 
-class Watches:
+class PublishObserver:
     """Does something with each message that comes."""
 
-    def __init__(self, house: House, published: Callable[[Message], None]) -> None:
-        house.broker.observer = self  # type: ignore[assignment]
+    def __init__(self, harness: Harness, published: Callable[[Message], None]) -> None:
+        harness.broker.observer = self  # type: ignore[assignment]
         self._published = published
 
     def published(self, session: Session, message: Message) -> None:
