@@ -125,8 +125,8 @@ async def test_a_packet_is_as_old_as_its_first_byte(harness, in_a_frame):
     packet, behind = (Publish("x", payload).encode(5) for payload in (b"late", b"new"))
     begun = time.monotonic()
     if in_a_frame:  # which is kept until it has come
-        harness.protocol("a").keep(9)
-        harness.protocol("a").keep(10)
+        harness.protocol("a").count_partial_frame(9)
+        harness.protocol("a").count_partial_frame(10)
         await asyncio.sleep(0.5)
         parts = [packet + behind, behind]
     else:
@@ -136,7 +136,7 @@ async def test_a_packet_is_as_old_as_its_first_byte(harness, in_a_frame):
         await asyncio.sleep(0.25)
         if in_a_frame:
             await until(lambda: heard)
-            harness.protocol("a").keep(0)
+            harness.protocol("a").count_partial_frame(0)
     took = time.monotonic() - begun
     await until(lambda: len(heard) >= 3)
     assert heard[0][0] == b"late" and 0.3 < heard[0][1] <= took

@@ -537,10 +537,10 @@ async def test_the_reason_reaches_who_is_still_sending(harness: Harness, tls):
     await until(lambda: not harness.scheduler._lingering)
 
 
-async def test_a_farewell_is_bounded(harness: Harness, monkeypatch):
+async def test_a_lingering_close_is_bounded(harness: Harness, monkeypatch):
     """Who neither closes its end nor stops sending is not listened to for long."""
     monkeypatch.setattr(lingering, "TIMEOUT", 0.2)
-    monkeypatch.setattr(scheduler, "FAREWELLS", 2)
+    monkeypatch.setattr(scheduler, "LINGERING_CLOSES", 2)
     await harness.start()
     peers = [await harness.log_in(f"c{n}") for n in range(4)]
     for peer in peers:
@@ -840,10 +840,10 @@ class Neighbour:
 
 def come(addresses: listeners._AddressLimits, host: str, now: float) -> Neighbour | None:
     """A connection that has not logged in; None when it is refused."""
-    if addresses.come(host, now):
+    if addresses.reserve(host, now):
         return None
     member = Neighbour(host)
-    addresses.came(member)
+    addresses.add_guest(member)
     return member
 
 
@@ -878,7 +878,7 @@ def test_each_user_is_counted_for_itself():
             else:
                 addresses.ended(member)
     for member in members:
-        addresses.leaves(member)
+        addresses.closing(member)
     assert addresses.oldest_guest() is members[0]
     for member in members:
         addresses.ended(member)

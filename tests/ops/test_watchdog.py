@@ -79,7 +79,7 @@ async def test_and_under_load(harness: Harness, pulse: Pulse, clock: Time):
     pulse.is_there()
     for peer in peers:
         peer.writer.write(Publish("x", bytes(3_000_000)).encode(5))
-    await until(lambda: harness.scheduler._turns, "somebody's turn")
+    await until(lambda: harness.scheduler._turn_queue, "somebody's turn")
     clock.pass_by(1)
     await until(lambda: pulse._came_through, "the message to go through")
     assert pulse.is_there()
