@@ -49,7 +49,8 @@ from appliance.ros.calls.dispatcher import (
 )
 from appliance.ros.calls.fair_cache import FairCache
 from appliance.ros.calls.goals import ALL, CANCEL
-from appliance.ros.calls.requests import Key, Requests
+from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.service_clients import Key
 from appliance.ros.calls.services import to_request
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import BusError, RosNode

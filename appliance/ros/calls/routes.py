@@ -168,8 +168,13 @@ class CallBridge:
         """Follow what has come and gone on the graph."""
         routes = self._routes
         looks = [self._services.look, self._actions.topics.poll_graph, self._parameters.look]
-        if routes.services or routes.actions or routes.parameters or self._requests.has_clients:
-            looks.insert(0, self._requests.look)
+        if (
+            routes.services
+            or routes.actions
+            or routes.parameters
+            or self._requests.clients.has_clients
+        ):
+            looks.insert(0, self._requests.clients.poll_graph)
         for look in looks:
             try:
                 look()
@@ -178,7 +183,7 @@ class CallBridge:
 
     def lost(self) -> None:
         """The bus is gone, and with it all that was set up."""
-        self._requests.lost()
+        self._requests.clients.on_bus_lost()
         self._services.lost()
         self._actions.topics.on_bus_lost()
         self._parameters.lost()

@@ -36,7 +36,8 @@ from appliance.ros.calls.dispatcher import (
     CallEndpoint,
     CallError,
 )
-from appliance.ros.calls.requests import Key, Requests
+from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.service_clients import Key
 from appliance.ros.node import BusError, Respond, RosNode, RosService
 from appliance.ros.patterns import assign, compile_pattern, refusals
 from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError

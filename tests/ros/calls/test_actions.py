@@ -12,7 +12,7 @@ pytest.importorskip("test_msgs.action")
 from call_harness import AllTypes, CallHarness, action, call_routes
 
 from appliance.ros.calls import actions as module
-from appliance.ros.calls import requests
+from appliance.ros.calls import service_clients
 from appliance.ros.calls.goals import STATUS, id_of
 from appliance.ros.node import Durability, FakeNode, QosProfile
 from appliance.ros.payload.converter import Converters
@@ -296,7 +296,7 @@ async def test_a_goal_that_begins_after_its_cancelling_is_cancelled_then(harness
 
 
 async def test_the_server_of_a_goal_vanishes_after_the_last_route(harness, monkeypatch):
-    monkeypatch.setattr(requests, "IDLE_LOOKS", 2)
+    monkeypatch.setattr(service_clients, "IDLE_POLLS", 2)
     walks, client = await begin(harness)
     await client.call(GOAL, {"order": 3})
     await until(lambda: walks.results, "the result is asked for")
