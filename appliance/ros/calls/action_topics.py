@@ -18,7 +18,7 @@ from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
 from appliance.ros.calls import goals
 from appliance.ros.calls.goals import STATUS
-from appliance.ros.calls.services import from_ros
+from appliance.ros.calls.serialization import from_ros
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.metrics import FlowCounters
 from appliance.ros.node import BusError, Durability, QosProfile, RosNode, RosSubscription

@@ -50,8 +50,8 @@ from appliance.ros.calls.dispatcher import (
 from appliance.ros.calls.fair_cache import FairCache
 from appliance.ros.calls.goals import ALL, CANCEL
 from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.serialization import to_request
 from appliance.ros.calls.service_clients import Key
-from appliance.ros.calls.services import to_request
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import BusError, RosNode
 from appliance.ros.patterns import assign, compile_pattern, refusals

@@ -81,7 +81,7 @@ class CallBridge:
         self.dispatcher = CallDispatcher(broker, entries, turns)
         self._requests = Requests(node, entries.loop, post, self._follow)
         self._services = ServiceRoutes(
-            self.dispatcher, self._requests, converters, node, entries, post
+            self.dispatcher, self._requests, converters, node, entries, post, announce
         )
         self._actions = ActionRoutes(
             self.dispatcher, self._requests, converters, node, entries, post, mailbox
@@ -167,13 +167,13 @@ class CallBridge:
     def look(self) -> None:
         """Follow what has come and gone on the graph."""
         routes = self._routes
-        looks = [self._services.look, self._actions.topics.poll_graph, self._parameters.look]
-        if (
-            routes.services
-            or routes.actions
-            or routes.parameters
-            or self._requests.clients.has_clients
-        ):
+        looks = [
+            self._services.servers.poll_graph,
+            self._actions.topics.poll_graph,
+            self._parameters.look,
+        ]
+        has_routes = routes.services or routes.actions or routes.parameters
+        if has_routes or self._requests.clients.has_clients:
             looks.insert(0, self._requests.clients.poll_graph)
         for look in looks:
             try:
@@ -184,6 +184,6 @@ class CallBridge:
     def lost(self) -> None:
         """The bus is gone, and with it all that was set up."""
         self._requests.clients.on_bus_lost()
-        self._services.lost()
+        self._services.servers.on_bus_lost()
         self._actions.topics.on_bus_lost()
         self._parameters.lost()

@@ -1,18 +1,19 @@
-"""Services both ways.
+"""Services both ways, on the loop's thread.
 
-`to: ros`: an MQTT client calls a ROS service, at `r2d2/reset/_call`; see calls.py for its answer.
+`to: ros`: an MQTT client calls a ROS service at `r2d2/reset/_call`; dispatcher.py answers it.
 
 `to: mqtt`: a ROS service that an MQTT client answers. Each request is a message to
 `r2d2/name/_request/{token}`, with `r2d2/name/_response/{token}` as its Response Topic and the token
-as its Correlation Data: a 3.1.1 client takes the token from the topic. The first message there is
-the response; one with the user property `status: error`, or `{"error": …}`, says that there is
-none. ROS has no way to tell its client of a failure: the client gets the route's `on_error`, or
-nothing and runs into its own time limit.
+as its Correlation Data; a 3.1.1 client takes the token from the topic. The first message on the
+Response Topic is the response. The user property `status: error`, or the payload `{"error": …}`,
+makes it a failure. ROS cannot report a failure to its client: the client gets the route's
+`on_error`, or no response and runs into its own time limit.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import re
 import secrets
@@ -37,20 +38,19 @@ from appliance.ros.calls.dispatcher import (
     CallError,
 )
 from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.serialization import from_ros, to_request
 from appliance.ros.calls.service_clients import Key
-from appliance.ros.node import BusError, Respond, RosNode, RosService
+from appliance.ros.calls.service_server import ServiceServer, ServiceServers
+from appliance.ros.node import BusError, Respond, RosNode
 from appliance.ros.patterns import assign, compile_pattern, refusals
-from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
+from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import (
     CONTENT_TYPE,
-    ENCODINGS,
-    RAW,
     VALUE_ENCODINGS,
     named_encoding,
 )
-from appliance.ros.payload.payloads import InputLimits
 from appliance.ros.skipped import Skipped, SkipReason
 
 log = logging.getLogger(__name__)
@@ -65,12 +65,12 @@ Post = Callable[..., None]
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Services, by names and patterns, that go `to` ROS; or one to MQTT (then `type` is needed).
+    """Services, by names and patterns, that MQTT calls (`to` ROS), or one that ROS calls (to MQTT).
 
-    What begins with `!` in `names` is left out. A `{ros}` in `mqtt` stands for the ROS name.
-    `timeout` is in seconds. With a `type`, in which `*` is a part of the name, patterns take only
-    services of that type. `encoding` is for what does not name another. `on_error` is the JSON of
-    the response that a ROS client gets when MQTT gave none.
+    The latter needs a `type`. What begins with `!` in `names` is left out. A `{ros}` in `mqtt`
+    stands for the ROS name. `timeout` is in seconds. With a `type`, in which `*` is a part of the
+    name, patterns take only services of that type. `encoding` is for calls that name none.
+    `on_error` is the JSON of the response that a ROS client gets when MQTT gave none.
     """
 
     names: tuple[str, ...]
@@ -86,41 +86,8 @@ class ServiceSettings:
         return self.mqtt.replace("{ros}", ros)
 
 
-def to_request(
-    converters: Converters,
-    type_name: str,
-    payload: bytes,
-    encoding: EncodingName,
-    limits: InputLimits,
-) -> bytes:
-    """The serialized message of a payload; an empty one has every field's default.
-
-    Raises CallError: bad_request, which names the field; too_large, unknown_type.
-    """
-    try:
-        converter = converters.get(type_name)
-        if not payload:
-            return converter.from_dict({})
-        described = ENCODINGS[encoding]
-        limits.check(payload, described)
-        return described.decoder(converter, limits.items)(payload)
-    except TooLargeError as error:
-        raise CallError("too_large", str(error)) from None
-    except ConversionError as error:
-        raise CallError("bad_request", str(error)) from None
-    except UnknownTypeError as error:
-        raise CallError("unknown_type", str(error)) from None
-
-
-def from_ros(converters: Converters, type_name: str, cdr: bytes, encoding: EncodingName) -> bytes:
-    """The payload of a serialized message. Raises ConversionError, UnknownTypeError."""
-    if encoding in RAW:
-        return cdr
-    return ENCODINGS[encoding].encoder(converters.get(type_name))(cdr)
-
-
 class ServiceRoutes:
-    """The routes of services; for the loop's thread, where it does not say otherwise."""
+    """The routes of services; for the loop's thread, and `servers` for the ROS thread."""
 
     def __init__(
         self,
@@ -130,26 +97,31 @@ class ServiceRoutes:
         node: RosNode,
         entries: Entries,
         post: Post,
+        changed: Callable[[], None],
     ) -> None:
+        """`changed` is called when what `skips` gives has changed."""
         self._dispatcher = dispatcher
         self._requests = requests
         self._converters = converters
         self._node = node
         self._entries = entries
         self._post = post
+        self._changed = changed
+        self.servers = ServiceServers()
         self._counters: dict[ServiceSettings, CallCounters] = {}
-        #: What is offered to MQTT, by the service's name; what to ROS, by the route.
+        #: The services that MQTT clients may call, by name.
         self._endpoints: dict[str, tuple[ServiceSettings, CallEndpoint]] = {}
+        #: The services that ROS nodes may call.
         self._provided: dict[ServiceSettings, ProvidedService] = {}
-        #: Services that patterns speak of and do not take.
+        #: Services on the bus that a pattern names and does not take.
         self._refused: list[Skipped] = []
         #: The type that a service last had.
         self._types: dict[str, str] = {}
-        #: Those of which the log says that they can be called.
+        #: Those that were logged as callable.
         self._callable: set[str] = set()
 
     def replace(self, routes: Sequence[ServiceSettings]) -> None:
-        """Have these routes from now on; one that was there before does not notice."""
+        """Use these routes from now on; one that was there before goes on without a break."""
         self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
         wanted = [route for route in self._counters if route.to == "mqtt"]
         for route, provided in list(self._provided.items()):
@@ -166,11 +138,13 @@ class ServiceRoutes:
                     self._node,
                     self._entries,
                     self._post,
+                    self._changed,
                 )
+        self.servers.replace(provided.server for provided in self._provided.values())
         self.follow()
 
     def follow(self) -> None:
-        """Offer what is on the bus now."""
+        """Register endpoints for the services that are on the bus now."""
         for name, types in self._requests.services.items():
             if self._types.get(name) not in types:
                 self._types[name] = min(types)
@@ -182,7 +156,7 @@ class ServiceRoutes:
         for name, route in wanted.items():
             if name not in self._endpoints:
                 self._add_endpoint(name, route)
-        self._tell()
+        self._log_changes()
         self._types = {
             name: found
             for name, found in self._types.items()
@@ -199,7 +173,7 @@ class ServiceRoutes:
             return _misfit(route, found[name])
 
         wanted = assign(routes, found, lambda route, name: misfit(route, name) is None)
-        # Those of actions belong to bridge.actions.
+        # The services of actions belong to bridge.actions.
         others = {name: types for name, types in found.items() if "/_action/" not in name}
         self._refused = refusals(routes, others, wanted, "service", misfit)
         return wanted
@@ -220,8 +194,8 @@ class ServiceRoutes:
         if name not in self._requests.services:
             log.info("%s: no node offers it yet; it will be called at %s", name, topic)
 
-    def _tell(self) -> None:
-        """Say which can be called, and which can no more: a route alone offers nothing."""
+    def _log_changes(self) -> None:
+        """Log which services can be called, and which no longer: a route alone offers nothing."""
         there = {name for name in self._endpoints if name in self._requests.services}
         for name in sorted(there - self._callable):
             log.info("%s can be called at %s", name, self._endpoints[name][1].topic)
@@ -259,14 +233,14 @@ class ServiceRoutes:
         return Answer(payload, call.encoding, response_type)
 
     def keys(self) -> Iterable[Key]:
-        """The services that a client should be ready for."""
+        """The services that need a client that is ready."""
         for name, (route, _) in self._endpoints.items():
             type_name = self._type(name, route)
             if type_name is not None:
                 yield name, type_name
 
     def status(self) -> list[tuple[ServiceSettings, CallCounters, list[str]]]:
-        """Each route, what it has counted, and the services that it offers now."""
+        """Each route, its counters, and the services that it bridges now."""
         return [
             (
                 route,
@@ -291,7 +265,7 @@ class ServiceRoutes:
         ]
 
     def skips(self) -> list[Skipped]:
-        """The services that routes speak of and cannot be called, or are not offered."""
+        """The services that a route names and that cannot be called, or are not provided."""
         skips = list(self._refused)
         for name, (route, _) in self._endpoints.items():
             type_name = self._type(name, route) or ""
@@ -305,24 +279,13 @@ class ServiceRoutes:
         return skips
 
     def stop(self) -> None:
-        """The bus has been left: nothing is offered any more."""
+        """Remove all services, once the bus has been left."""
         for provided in self._provided.values():
             provided.stop()
         self._provided.clear()
+        self.servers.replace(())
         self._endpoints.clear()
         self._refused.clear()
-
-    # The ROS thread
-
-    def look(self) -> None:
-        """Offer the services that ROS may call, once there is a bus."""
-        for provided in list(self._provided.values()):
-            provided.look()
-
-    def lost(self) -> None:
-        """The bus is gone, and with it the services."""
-        for provided in list(self._provided.values()):
-            provided.lost()
 
 
 def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[SkipReason, str] | None:
@@ -358,7 +321,8 @@ class _PendingRequest:
 
 
 class ProvidedService:
-    """One ROS service that MQTT clients answer."""
+    """One ROS service that MQTT clients answer; for the loop's thread, and `server` for the ROS
+    thread."""
 
     def __init__(
         self,
@@ -369,6 +333,7 @@ class ProvidedService:
         node: RosNode,
         entries: Entries,
         post: Post,
+        changed: Callable[[], None],
     ) -> None:
         assert route.type is not None
         self._route = route
@@ -378,65 +343,43 @@ class ProvidedService:
         self._node = node
         self._entries = entries
         self._post = post
+        self._changed = changed
         (self._ros,) = route.names
         self._base = route.base(self._ros)
         self._request_type = f"{route.type}_Request"
         self._response_type = f"{route.type}_Response"
-        self._asked: dict[str, _PendingRequest] = {}
-        self._report_at = 0.0
-        #: Why ROS does not have it.
+        self._pending: dict[str, _PendingRequest] = {}
+        self._next_log = 0.0
+        #: Why ROS does not have the service.
         self._problem: str | None = None
         self._dispatcher.listen(f"{self._base}/_response/+", self._on_response)
-        # The ROS thread's.
-        self._service: RosService | None = None
-        self._is_tried = False
-        self._is_over = False
+        self.server = ServiceServer(
+            self._ros, route.type, route.encoding, node, converters, self, post
+        )
 
-    # The ROS thread
+    def created(self) -> None:
+        """ROS nodes can call the service now."""
+        log.info("%s is offered, and answered at %s", self._ros, self._base)
 
-    def look(self) -> None:
-        """Offer the service as soon as there is a bus."""
-        if self._is_tried or self._is_over:
-            return
-        self._is_tried = True
-        route = self._route
-        assert route.type is not None
-        try:
-            self._service = self._node.create_service(self._ros, route.type, self._on_request)
-        except (BusError, UnknownTypeError) as error:
-            self._post(log.error, "%s is not offered: %s", self._ros, error)
-            self._counters.last_error = self._problem = str(error)
-            return
-        self._post(log.info, "%s is offered, and answered at %s", self._ros, self._base)
+    def refused(self, problem: str) -> None:
+        """The service could not be created."""
+        log.error("%s is not offered: %s", self._ros, problem)
+        self._counters.last_error = self._problem = problem
+        self._changed()
 
     def skips(self) -> list[Skipped]:
-        """Why it is not offered, where it is not; from any thread."""
+        """Why ROS does not have the service, if that is so."""
         if self._problem is None:
             return []
         return [Skipped(self._ros, "provided", self._route.type or "", "problem", self._problem)]
 
-    def _on_request(self, cdr: bytes, respond: Respond) -> None:
-        try:
-            payload = from_ros(self._converters, self._request_type, cdr, self._route.encoding)
-        except (ConversionError, UnknownTypeError) as error:
-            self._post(self._fail, respond, f"a request cannot be converted: {error}")
-            return
-        self._post(self._ask, payload, respond)
-
-    def _close(self) -> None:
-        self._is_over = True
-        if self._service is not None:
-            self._service.destroy()
-            self._service = None
-
-    # The loop's thread
-
-    def _ask(self, payload: bytes, respond: Respond) -> None:
+    def requested(self, payload: bytes, respond: Respond) -> None:
+        """Publish a request of a ROS node, and await its response on MQTT."""
         route = self._route
         self._counters.calls += 1
-        if len(self._asked) >= self._dispatcher.limits.total:
-            count = len(self._asked)
-            self._fail(respond, f"too_many: {count} requests are under way (bridge.limits.calls)")
+        if len(self._pending) >= self._dispatcher.limits.total:
+            count = len(self._pending)
+            self.fail(respond, f"too_many: {count} requests are under way (bridge.limits.calls)")
             return
         token = secrets.token_hex(8)
         message = Message(
@@ -455,7 +398,7 @@ class ProvidedService:
         timer = self._entries.later(
             "services.timeout", route.timeout, self._give_up, token, late, served=self._ros
         )
-        self._asked[token] = _PendingRequest(respond, timer)
+        self._pending[token] = _PendingRequest(respond, timer)
         self._counters.under_way += 1
         if self._dispatcher.publish(message) is ReasonCode.NO_MATCHING_SUBSCRIBERS:
             self._give_up(
@@ -463,55 +406,55 @@ class ProvidedService:
             )
 
     def _on_response(self, origin: Session, message: Message) -> None:
-        asked = self._forget(message.topic.rpartition("/")[2])
-        if asked is None:
+        pending = self._remove(message.topic.rpartition("/")[2])
+        if pending is None:
             log.debug("%s: a response to nothing under way", self._ros)
             return
         properties = message.properties or {}
-        told = properties.get(Property.USER_PROPERTY)
+        user_properties = properties.get(Property.USER_PROPERTY)
         encoding = named_encoding(properties.get(Property.CONTENT_TYPE)) or self._route.encoding
-        if isinstance(told, list) and ("status", "error") in told:
-            self._fail(asked.respond, f"rejected: {message.payload[:200]!r}")
+        if isinstance(user_properties, list) and ("status", "error") in user_properties:
+            self.fail(pending.respond, f"rejected: {message.payload[:200]!r}")
             return
-        # Their number is that of the requests: each has one response.
-        take = partial(self._take_response, asked.respond, message.payload, encoding)
-        self._dispatcher.conversions.do(origin, len(message.payload), take)
+        # The queue needs no limit for these: each request has one response.
+        convert = partial(self._convert_response, pending.respond, message.payload, encoding)
+        self._dispatcher.conversions.do(origin, len(message.payload), convert)
 
-    def _take_response(self, respond: Respond, payload: bytes, encoding: EncodingName) -> None:
+    def _convert_response(self, respond: Respond, payload: bytes, encoding: EncodingName) -> None:
         limits = self._dispatcher.limits.input
         try:
             cdr = to_request(self._converters, self._response_type, payload, encoding, limits)
         except CallError as error:
-            what = f"bad response: {error}"
+            problem = f"bad response: {error}"
             if error.code == "too_large":
-                what = f"too_large: {error}"
+                problem = f"too_large: {error}"
             elif _is_error(payload, encoding):
-                what = f"rejected: {payload[:200]!r}"
-            self._fail(respond, what)
+                problem = f"rejected: {payload[:200]!r}"
+            self.fail(respond, problem)
             return
         self._counters.answers += 1
         self._respond(respond, cdr)
 
-    def _forget(self, token: str) -> _PendingRequest | None:
-        asked = self._asked.pop(token, None)
-        if asked is not None:
-            asked.timer.cancel()
+    def _remove(self, token: str) -> _PendingRequest | None:
+        pending = self._pending.pop(token, None)
+        if pending is not None:
+            pending.timer.cancel()
             self._counters.under_way -= 1
-        return asked
+        return pending
 
     def _give_up(self, token: str, problem: str) -> None:
-        asked = self._forget(token)
-        if asked is not None:
-            self._fail(asked.respond, problem)
+        pending = self._remove(token)
+        if pending is not None:
+            self.fail(pending.respond, problem)
 
-    def _fail(self, respond: Respond, problem: str) -> None:
-        """Nobody gave a response: ROS gets the one that the route has for that, if any."""
+    def fail(self, respond: Respond, problem: str) -> None:
+        """Answer a request that MQTT gave no response to: with the route's `on_error`, if any."""
         code = problem.partition(":")[0]
         self._counters.errors[code] += 1
         self._counters.last_error = problem
         now = self._entries.time()
-        if now >= self._report_at:
-            self._report_at = now + REPORT_INTERVAL
+        if now >= self._next_log:
+            self._next_log = now + REPORT_INTERVAL
             count = sum(self._counters.errors.values())
             log.warning("a call of %s failed (%d so far): %s", self._ros, count, problem)
         cdr = None
@@ -537,19 +480,12 @@ class ProvidedService:
             log.debug("%s: the bus has gone", self._ros)
 
     def stop(self) -> None:
-        """Offer it no longer; what is under way gets what there is when MQTT gives nothing."""
+        """Remove the service; requests under way are answered with `on_error`, if any."""
         self._dispatcher.ignore(f"{self._base}/_response/+")
-        for token in list(self._asked):
+        for token in list(self._pending):
             self._give_up(token, "stopping: the service is offered no longer")
-        try:
-            self._node.call_soon(self._close)
-        except BusError:
-            self._is_over = True
-
-    def lost(self) -> None:
-        """The bus is gone, and with it the service; on the ROS thread."""
-        self._service = None
-        self._is_tried = False
+        with contextlib.suppress(BusError):  # without a bus there is no service either
+            self._node.call_soon(self.server.close)
 
 
 def _is_error(payload: bytes, encoding: EncodingName) -> bool:
