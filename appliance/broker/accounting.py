@@ -48,10 +48,8 @@ class Accounting:
     quotas: Quotas = field(init=False)
     #: And what a connected client may hold when all the memory is taken by others, in bytes.
     reserve: int = field(init=False)
-    #: Nothing can be kept: the store's last commit failed.
+    #: The store's last commit failed: nothing can be stored.
     failing: bool = False
-    #: And who publishes now can be told so.
-    refusing: bool = False
     #: Whether the rules in force still let a session receive what waits for it under a topic.
     may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
     #: Seconds that the broker, and the computer under load, have left to the clients: a clock that

@@ -570,19 +570,22 @@ class Broker:
             ProtocolError: the topic is not valid.
         """
         route = self.router.route(origin, message.topic_wire)
-        if not self.accounting.refusing:
-            return self.publish_to(route.targets, route, message, origin)
-        # Who cannot be told would take it for kept: so it is, in memory, until the store can.
-        self.accounting.refusing = False
-        try:
-            return self.publish_to(route.targets, route, message, origin)
-        finally:
-            self.accounting.refusing = True
+        return self.publish_to(route.targets, route, message, origin, refusable=False)
 
     def publish_to(
-        self, targets: list[Target], route: Fanout, message: Message, origin: Session
+        self,
+        targets: list[Target],
+        route: Fanout,
+        message: Message,
+        origin: Session,
+        refusable: bool = True,
     ) -> ReasonCode:
-        """`publish`, for who has the message's route already: to these of its targets."""
+        """Deliver the message to these targets of its route, which the caller has looked up.
+
+        A message that is `refusable` came from a client that is told the reason code: while the
+        store fails it is refused if it would have to be stored. Nobody would send another message
+        again; it is queued in memory until the store works again.
+        """
         if not route.allowed:
             self.refuse_publish(origin, route, message)
             return ReasonCode.NOT_AUTHORIZED
@@ -590,34 +593,37 @@ class Broker:
             self.observer.published(origin, message)
         retain = message.retain
         # Without room to keep it who is there still gets it.
-        kept = not retain or self.retained.keep(message, origin.account)
+        kept = not retain or self.retained.keep(message, origin.account, refusable)
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
         taken = full = False
+        store_fails = refusable and self.accounting.failing
         message.publisher = origin
         for session, qos, as_published, subscription_ids in targets:
             if qos > published_qos:
                 qos = published_qos
             try:
-                delivered = session.deliver(message, qos, retain and as_published, subscription_ids)
+                delivered = session.deliver(
+                    message, qos, retain and as_published, subscription_ids, None, refusable
+                )
             except Exception as error:  # it is this receiver who misses it, and nobody else
                 delivered = self._not_delivered(session, error)
             if delivered:
                 taken = True
             elif qos:
-                if self.accounting.refusing and session.persistent:
+                if store_fails and session.persistent:
                     kept = False  # who publishes has to try again, whoever else has got it
                 else:
                     self._log_receiver_full(session, message)
                 full = True
         for share, members in route.shares:
-            chosen = share.choose(members, message)
+            chosen = share.choose(members, message, None, refusable)
             self.counters.cost += 1 + share.looked // CHECKS_PER_COST_UNIT
-            if chosen is not None and self._deliver_shared(chosen, message, share):
+            if chosen is not None and self._deliver_shared(chosen, message, share, refusable):
                 taken = True
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
                 self.counters.publish_dropped += chosen is None
-                if self.accounting.refusing and any(m[1] and m[0].persistent for m in members):
+                if store_fails and any(m[1] and m[0].persistent for m in members):
                     kept = False
                 else:
                     self._log_receiver_full(asked, message)
@@ -631,13 +637,16 @@ class Broker:
         # it, is nothing to tell the publisher.
         return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
 
-    def _deliver_shared(self, target: Target, message: Message, share: Share) -> bool:
+    def _deliver_shared(
+        self, target: Target, message: Message, share: Share, refusable: bool = True
+    ) -> bool:
         """False when a QoS 1 or 2 message was dropped."""
         session, qos, as_published, subscription_ids = target
         qos = min(qos, message.qos)
         retain = message.retain and as_published
         try:
-            return session.deliver(message, qos, retain, subscription_ids, share) or not qos
+            delivered = session.deliver(message, qos, retain, subscription_ids, share, refusable)
+            return delivered or not qos
         except Exception as error:
             return self._not_delivered(session, error)
 
@@ -1068,7 +1077,7 @@ class Broker:
                 self._recover()
         else:
             if not self.accounting.failing:
-                self.accounting.failing = self.accounting.refusing = True
+                self.accounting.failing = True
                 for session in self.sessions.values():
                     session.hold_back()
             for output in waiting:
@@ -1079,7 +1088,7 @@ class Broker:
 
     def _recover(self) -> None:
         """What had to wait for the store can go on."""
-        self.accounting.failing = self.accounting.refusing = False
+        self.accounting.failing = False
         for client in tuple(self.clients):
             try:
                 client.resume()

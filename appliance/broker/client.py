@@ -381,7 +381,7 @@ class Client:
             return ""
         if code == ReasonCode.NOT_AUTHORIZED:
             return route.reason
-        if self._accounting.refusing:
+        if self._accounting.failing:
             return CANNOT_KEEP
         return self.broker.shortage(route, message, session)
 
@@ -620,7 +620,7 @@ class Client:
         code, reason = ReasonCode.SUCCESS, ""
         held = session.received.get(packet_id)
         if (
-            self._accounting.refusing
+            self._accounting.failing
             and route.allowed
             and self.broker.must_store(route, message, session)
         ):

@@ -277,7 +277,7 @@ class Output:
                     self.send(_REFUSALS[first](packet_id, code, in_words(reason)))
                     return
                 packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
-            elif code == ReasonCode.QUOTA_EXCEEDED and self._accounting.refusing:
+            elif code == ReasonCode.QUOTA_EXCEEDED and self._accounting.failing:
                 # 3.1.1 cannot refuse, and what is acknowledged must be kept.
                 raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
         out = self._out

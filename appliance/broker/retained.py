@@ -89,9 +89,12 @@ class Retained:
         for message, owner in messages:
             self._put(message, owner)
 
-    def keep(self, message: Message, owner: Account) -> bool:
-        """Retain the message, or with an empty one none any more; False when there is no room."""
-        if self._accounting.refusing and message.qos:
+    def keep(self, message: Message, owner: Account, refusable: bool = True) -> bool:
+        """Retain the message, or, if it is empty, delete its topic's; False when there is no room.
+
+        While the store fails a `refusable` message of QoS 1 or 2 is not retained either.
+        """
+        if refusable and message.qos and self._accounting.failing:
             return False
         self._accounting.counters.cost += (
             RETAIN_COST + message.topic.count("/") // LEVELS_PER_COST_UNIT

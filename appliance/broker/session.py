@@ -223,8 +223,12 @@ class Session:
         retain: bool,
         subscription_ids: list[int] | None,
         share: Share | None = None,
+        refusable: bool = True,
     ) -> bool:
-        """Send the message, or keep it for later; False when it was dropped, and counted."""
+        """Send the message, or queue it; False when it was dropped, and counted.
+
+        `refusable` is as for `Broker.publish_to`.
+        """
         link = self.link
         if not qos:
             if link is None:
@@ -251,10 +255,14 @@ class Session:
                 return True
             if len(self.queue) < accounting.limits.queue_messages:
                 return self._enqueue(
-                    cast(Delivery, (message, qos, retain, subscription_ids, share))
+                    cast(Delivery, (message, qos, retain, subscription_ids, share)), refusable
                 )
-        if accounting.limits.queue_full == "drop-oldest" and self._drop_oldest_for(message):
-            return self._enqueue(cast(Delivery, (message, qos, retain, subscription_ids, share)))
+        if accounting.limits.queue_full == "drop-oldest" and self._drop_oldest_for(
+            message, refusable
+        ):
+            return self._enqueue(
+                cast(Delivery, (message, qos, retain, subscription_ids, share)), refusable
+            )
         if accounting.limits.queue_full == "disconnect" and link is not None:
             accounting.overflowed.append(self)
         self._is_full(size)
@@ -271,25 +279,29 @@ class Session:
             self.accounting.counters.publish_dropped -= 1
             self._enqueue(delivery, promised=True)
 
-    def has_room(self, message: Message) -> bool:
-        """Whether a QoS 1 or 2 message would be kept."""
+    def has_room(self, message: Message, refusable: bool = True) -> bool:
+        """Whether a QoS 1 or 2 message would be queued; `refusable` as for `deliver`."""
         limits = self.accounting.limits
-        if self.expiry and not self._may_store(message):
+        if self.expiry and not self._may_store(message, refusable):
             return False
         return limits.queue_full == "drop-oldest" or (
             len(self.queue) < limits.queue_messages and self.fits(message.size)
         )
 
-    def _may_store(self, message: Message) -> bool:
+    def _may_store(self, message: Message, refusable: bool) -> bool:
         accounting = self.accounting
-        return not accounting.refusing and accounting.may_store(self.account, message.size)
+        if refusable and accounting.failing:
+            return False
+        return accounting.may_store(self.account, message.size)
 
-    def _enqueue(self, delivery: Delivery, *, promised: bool = False) -> bool:
+    def _enqueue(
+        self, delivery: Delivery, refusable: bool = True, *, promised: bool = False
+    ) -> bool:
         """Let it wait; False when it had to be stored and cannot be, which is counted."""
         message = delivery[0]
         if self.expiry:
-            if not promised and not self._may_store(message):
-                if not self.accounting.refusing:
+            if not promised and not self._may_store(message, refusable):
+                if not (refusable and self.accounting.failing):
                     self._is_full(message.size)
                 self.accounting.counters.publish_dropped += 1
                 return False
@@ -306,12 +318,12 @@ class Session:
         """What is sent from now on depends on what is about to be staged."""
         self.batch = self.accounting.store.batch
 
-    def _drop_oldest_for(self, message: Message) -> bool:
+    def _drop_oldest_for(self, message: Message, refusable: bool) -> bool:
         """Make room at the old end of the queue; False when even then there is none."""
         accounting = self.accounting
         if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
             return False
-        if self.expiry and self.accounting.refusing:
+        if self.expiry and refusable and self.accounting.failing:
             return False
         while self.queue and not (
             len(self.queue) < accounting.limits.queue_messages and self.fits(message.size)

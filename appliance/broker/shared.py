@@ -42,6 +42,7 @@ class Share:
         members: list[Target],
         message: Message,
         may_receive: Callable[[Session, str], bool] | None = None,
+        refusable: bool = True,
     ) -> Target | None:
         """Who of these members gets the message; None when nobody can be given it.
 
@@ -68,7 +69,7 @@ class Share:
                 rank = 3 if session.ready else 2
             if (
                 rank > best_rank
-                and (not qos or session.has_room(message))
+                and (not qos or session.has_room(message, refusable))
                 and (may_receive is None or may_receive(session, message.topic))
             ):
                 best, best_rank, best_index = members[index], rank, index
