@@ -151,8 +151,6 @@ class Broker:
         #: By topic, what parts of the appliance have to say about who publishes to it. What they
         #: say holds until `guards_changed`.
         self.guards = self.router.guards
-        #: What one of them has against the message that was just published, if anything.
-        self.rejection: PublishRejection | None = None
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
         self.audit_log: AuditLog | None = None

@@ -327,7 +327,8 @@ class Client:
             return
         code = self.broker.publish_to(targets, route, message, session)
         if qos:
-            if self.broker.rejection is not None and self._reject_publish(packet_id, message):
+            if message.rejection is not None:
+                self.output.reject_publish(0x40, packet_id, message.rejection)
                 return
             reason = self._reason(code, route, message) if code >= 0x80 else ""
             self.output.acknowledge(0x40, packet_id, code, reason)
@@ -370,7 +371,9 @@ class Client:
                 self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
             code = broker.publish_to(route.targets, route, message, session)
-            if packet.qos and not self._reject_publish(packet_id, message):
+            if packet.qos and message.rejection is not None:
+                self.output.reject_publish(0x40, packet_id, message.rejection)
+            elif packet.qos:
                 reason = self._reason(code, route, message) if code >= 0x80 else ""
                 self.output.acknowledge(0x40, packet_id, code, reason)
 
@@ -384,14 +387,6 @@ class Client:
         if self._accounting.failing:
             return CANNOT_KEEP
         return self.broker.shortage(route, message, session)
-
-    def _reject_publish(self, packet_id: int, message: Message) -> bool:
-        """Acknowledge a message with what a part of the appliance has against it, if anything."""
-        rejection, self.broker.rejection = self.broker.rejection, None
-        if rejection is None or rejection.message is not message:
-            return False
-        self.output.reject_publish(0x40, packet_id, rejection)
-        return True
 
     def _hold(
         self, route: Fanout, size: int, publish: Callable[[Any], None], packet: object

@@ -19,6 +19,7 @@ from appliance.mqtt.codec import (
 )
 
 if TYPE_CHECKING:
+    from appliance.broker.ports import PublishRejection
     from appliance.broker.session import Session
 
 #: What a queued message takes beside its bytes, roughly: the objects around it, in bytes.
@@ -48,6 +49,8 @@ class Message:
 
     `publisher` is the session that publishes it, while it is delivered: links inside the appliance
     read it. It is None before and after, as a message may outlive the session by days.
+    `rejection` is what such a link has set when it could not use the message: its publisher is
+    told, in the acknowledgement.
     """
 
     __slots__ = (
@@ -56,6 +59,7 @@ class Message:
         "properties_wire",
         "publisher",
         "qos",
+        "rejection",
         "retain",
         "size",
         "topic",
@@ -81,6 +85,7 @@ class Message:
         self.retain = retain
         self.expires_at = expires_at
         self.publisher: Session | None = None
+        self.rejection: PublishRejection | None = None
         self.topic_wire = topic_wire or encode_string(topic)
         self.properties_wire = _passed_on(properties) if properties else properties_wire
         #: One encoded header (QoS 0: the whole packet), and the version and first byte that it is

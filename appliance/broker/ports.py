@@ -292,9 +292,8 @@ class Store(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PublishRejection:
-    """What a part of the appliance has against a message, for who has published it."""
+    """Why a part of the appliance could not use a message, as its publisher is told."""
 
-    message: Message
     code: ReasonCode
     reason: str
 

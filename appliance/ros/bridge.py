@@ -23,7 +23,7 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink, PublishRejection
+from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
@@ -406,7 +406,7 @@ class Bridge:
         else:
             why = "was refused: too much of its user waits to be converted"
             receiver.fail(why)
-            self._object(receiver.objection(message, why, ReasonCode.QUOTA_EXCEEDED))
+            receiver.reject(message, why, ReasonCode.QUOTA_EXCEEDED)
 
     def _hand_over(
         self,
@@ -417,15 +417,9 @@ class Bridge:
         number: int,
     ) -> None:
         try:
-            objection = receiver.receive(message, retain, origin, number)
+            receiver.receive(message, retain, origin, number)
         except Exception as error:
-            objection = receiver.fault(message, error)
-        if objection is not None:
-            self._object(objection)
-
-    def _object(self, objection: PublishRejection) -> None:
-        if objection.message.qos == 1:
-            self._broker.rejection = objection
+            receiver.fault(message, error)
 
     def _drain(self) -> None:
         if self._deliver():

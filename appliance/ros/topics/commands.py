@@ -342,7 +342,7 @@ class Commands(ToRos):
                     return self._finish(command)
             self._settle(origin)
             why = "was refused: too much of its user waits to be converted"
-            return self._object(message, why, ReasonCode.QUOTA_EXCEEDED)
+            return self._fail_and_reject(message, why, ReasonCode.QUOTA_EXCEEDED)
         self._queued.setdefault(origin, deque()).append(command)
         turns.do(origin, size, partial(self._have_turn, command))
         return None
@@ -436,7 +436,7 @@ class Commands(ToRos):
         except ValueError as error:
             if self._is_heard_late(message, session):
                 return None
-            return self._object(message, f"was refused: {error}")
+            return self._fail_and_reject(message, f"was refused: {error}")
         if not why:
             return super().inspect(message, session)
         if self._is_heard_late(message, session):
@@ -452,10 +452,10 @@ class Commands(ToRos):
     def _carry_out(
         self, message: Message, cdr: bytes, origin: Session | None, number: int
     ) -> PublishRejection | None:
-        objection = self._publish(cdr, message, origin, number)
-        if objection is None:
+        rejection = self._publish(cdr, message, origin, number)
+        if rejection is None:
             self._commanded(cdr, origin)
-        return objection
+        return rejection
 
     # Old commands: see `StalenessDetector`
 
@@ -502,12 +502,12 @@ class Commands(ToRos):
 
     def _refuse(self, command: _Command, why: str) -> PublishRejection:
         if command.is_wrong:
-            return self._object(command.message, f"was refused: {why}")
+            return self._fail_and_reject(command.message, f"was refused: {why}")
         return self._expire(command.message, why, command.origin)
 
     def _expire(self, message: Message, why: str, origin: Session | None) -> PublishRejection:
         self._count_expired(why, origin)
-        return self.objection(message, f"{'may be' if why == BEGINS else 'is too'} old: {why}")
+        return self.reject(message, f"{'may be' if why == BEGINS else 'is too'} old: {why}")
 
     def _count_expired(self, why: str, origin: Session | None) -> None:
         if why == BEGINS:
@@ -523,7 +523,9 @@ class Commands(ToRos):
         accounting = self._around.broker.accounting
         size = message.size + len(cdr)
         if not accounting.fits(origin.account, size):
-            return self._object(message, "was refused: there is no memory for it to wait in")
+            return self._fail_and_reject(
+                message, "was refused: there is no memory for it to wait in"
+            )
         accounting.take(origin.account, size)
         due = command.at + self._arrivals.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)

@@ -161,16 +161,16 @@ class ToRos(Flow):
         """The message's CDR, or what is wrong with it, which is told."""
         out = self._out
         if out is None:
-            return self._object(message, f"was refused: {self._why_not()}")
+            return self._fail_and_reject(message, f"was refused: {self._why_not()}")
         try:
             return self._read(out[0], message, origin)
         except RuleViolationError as error:
             problem = f"was refused: {error}"
             self.refuse(problem)
-            return self.objection(message, problem)
+            return self.reject(message, problem)
         except ConversionError as error:
             problem = f"cannot be converted: {error}"
-            return self._object(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
+            return self._fail_and_reject(message, problem, ReasonCode.PAYLOAD_FORMAT_INVALID)
 
     def _publish(
         self, cdr: bytes, message: Message, origin: Session | None, number: int
@@ -178,44 +178,45 @@ class ToRos(Flow):
         """Publish on ROS what the message was converted to; returns why that failed."""
         out = self._out
         if out is None:
-            return self._object(message, f"was refused: {self._why_not()}")
+            return self._fail_and_reject(message, f"was refused: {self._why_not()}")
         try:
             if self.echo is not None:
                 self.echo.sent(cdr)
             out[1].publish(cdr)
         except BusError as error:
-            return self._object(message, f"could not be published: {error}")
+            return self._fail_and_reject(message, f"could not be published: {error}")
         finally:  # who says stop is not driven on, also when ROS does not take it
             self._lease.said(cdr, number, origin, self._around.entries.time())
         self.counters.messages += 1
         self.counters.bytes += len(message.payload)
         return None
 
-    def _object(
+    def _fail_and_reject(
         self,
         message: Message,
         problem: str,
         code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
     ) -> PublishRejection:
         self.fail(problem)
-        return self.objection(message, problem, code)
+        return self.reject(message, problem, code)
 
-    def objection(
+    def reject(
         self,
         message: Message,
         problem: str,
         code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
     ) -> PublishRejection:
-        """What the client is told: the code, and why."""
-        return PublishRejection(
-            message, code, f"a message for {self.ros} {problem}"[:REASON_LENGTH]
-        )
+        """What the client is told: the code, and why. For QoS 1 its PUBACK says so."""
+        rejection = PublishRejection(code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
+        if message.qos == 1:
+            message.rejection = rejection
+        return rejection
 
     def fault(self, message: Message, error: Exception) -> PublishRejection:
         """What the client is told when it is the appliance that failed, which is reported."""
         self._around.broker.faults.caught("bridge.receive", error, self)
         self.counters.errors += 1
-        return self.objection(message, "could not be carried: see the log")
+        return self.reject(message, "could not be carried: see the log")
 
     # Who may publish: a Guard of the broker's
 

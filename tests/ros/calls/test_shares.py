@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
+from appliance.broker.message import Message
 from appliance.broker.ports import Identity, Limits
 from appliance.net.callbacks import Entries
 from appliance.ros.bridge import TopicSettings
@@ -336,9 +338,10 @@ async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     await until(lambda: harness.bridge.topics(), "the route")
     alice = harness.client("alice")
     for _ in range(6):
-        alice.send("r2d2/a", {"data": "a" * 5000})
-    objection = harness.broker.rejection
-    assert objection.code == 0x97 and "waits to be converted" in objection.reason
+        message = Message("r2d2/a", json.dumps({"data": "a" * 5000}).encode(), 1)
+        harness.broker.publish(message, alice.session)
+    rejection = message.rejection
+    assert rejection.code == 0x97 and "waits to be converted" in rejection.reason
     await until(lambda: len(peer.received) == 4, "those that had room")
     assert harness.bridge.topics()[0].errors == 2
 
