@@ -30,6 +30,7 @@ from appliance.certs import (
     TlsContexts,
     keep_server_certificate,
 )
+from appliance.certs.settings import tls_contexts
 from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
@@ -39,7 +40,7 @@ from appliance.config import (
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
 from appliance.net.callbacks import Entries, contained_proxy
-from appliance.net.listeners import Listeners
+from appliance.net.listeners import Admission, Listeners
 from appliance.ops.audit import Audit, AuditError
 from appliance.ops.control import Control, ControlError
 from appliance.ops.crash import CrashReports
@@ -142,7 +143,7 @@ class App:
         if is_open_with_secrets(settings):
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
         authenticating, _ = plugin_kinds(broker_settings.plugins)
-        tls = wiring.tls(settings)
+        tls = tls_contexts(broker_settings)
         access = FileAccess(
             *wiring.access_files(settings),
             settings.robot,
@@ -156,8 +157,8 @@ class App:
         self.broker = broker = Broker(
             access,
             store or MemoryStore(),
-            wiring.broker_limits(settings),
-            wiring.features(settings),
+            limits.of_broker(),
+            broker_settings.features(),
         )
         self._entries = Entries(loop, broker.faults)
         if self._crashes is not None:
@@ -202,7 +203,7 @@ class App:
             frame.authenticate,
             # It would pass by plugins that refuse clients.
             access.exchange if not authenticating else lambda method, address: None,
-            wiring.admission(settings),
+            limits.build(Admission),
             tls,
         )
         self._stack.push_async_callback(listeners.stop)

@@ -20,7 +20,7 @@ from appliance.certs import CertificateError, LoadedTls, TlsContexts
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import ConfigError, Settings
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.listeners import Listeners
+from appliance.net.listeners import Admission, Listeners
 from appliance.ops import logs
 from appliance.ops.audit import Audit
 from appliance.ros import settings as ros_settings
@@ -168,8 +168,9 @@ class Reload:
         # From here on nothing fails.
         parts.settings = settings
         changed = [*_differences(before, settings)]
-        parts.broker.use(wiring.broker_limits(settings), wiring.features(settings))
-        parts.listeners.take(doors, wanted, wiring.admission(settings))
+        limits = settings.broker.limits
+        parts.broker.use(limits.of_broker(), settings.broker.features())
+        parts.listeners.take(doors, wanted, limits.build(Admission))
         if parts.tls is not None and read.tls is not None:
             changed += self._take_certificates(parts.tls, read.tls)
         rights = parts.access.adopt(read.rules)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from appliance.certs.contexts import TlsFiles, TlsPolicy
+from appliance.certs.contexts import TlsContexts, TlsFiles, TlsPolicy
 from appliance.config import BrokerSection
 
 
@@ -28,3 +28,15 @@ def tls_policies(broker: BrokerSection) -> dict[str, TlsPolicy]:
         for index, listener in enumerate(broker.listeners)
         if listener.tls
     }
+
+
+def tls_contexts(broker: BrokerSection) -> TlsContexts | None:
+    """The TLS contexts of the listeners, by `listener_name`; None when no listener has TLS.
+
+    Raises:
+        CertificateError: a file is missing or wrong.
+    """
+    policies = tls_policies(broker)
+    if not policies:
+        return None
+    return TlsContexts(tls_files(broker), policies, broker.tls.username_from)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -19,6 +20,7 @@ from pydantic import (
     model_serializer,
 )
 
+from appliance.broker.ports import Features, Limits, UserLimits
 from appliance.config.quantities import (
     Address,
     Bind,
@@ -64,6 +66,11 @@ from appliance.config.values import (
     leaves_out,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+DataclassT = TypeVar("DataclassT", bound="DataclassInstance")
+
 PACKET_SIZE_MAX = 255 << 20
 """Less than the largest Remaining Length that MQTT can say (section 1.5.5: four bytes of 7 bits): a
 packet may grow by some properties on its way from one client to another."""
@@ -85,6 +92,16 @@ MQTT_KEYS = ("fields", "rate", "bytes_per_second", "qos", "retain")
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    def build(self, kind: type[DataclassT], **values: Any) -> DataclassT:
+        """The dataclass that another part takes its settings in.
+
+        `values` are the fields that differ from this section in name or form; every other field is
+        the key of the same name, so that a setting is written down here and there, and not copied
+        in a third place.
+        """
+        named = {each.name for each in fields(kind)} - values.keys()
+        return kind(**{name: getattr(self, name) for name in named}, **values)
 
 
 def _section() -> Any:
@@ -149,34 +166,48 @@ class UserLimitsSection(_Section):
     stored: Annotated[Size, Field(ge=0)] | None = None
 
 
+#: The broker's own defaults.
+_LIMITS = Limits()
+
+
 class LimitsSection(_Section):
     """What one client, and all together, may use. Sizes in bytes, times in seconds."""
 
-    connections: Count = 1000
+    connections: Count = _LIMITS.connections
     connections_per_address: Count = 250
     connection_rate: Count = 100
     failed_logins: Count = 30
-    packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = 16 << 20
-    memory: Annotated[Size, Field(ge=1 << 10)] = 256 << 20
-    queue_messages: Count = 1000
-    queue_bytes: Annotated[Size, Field(ge=1)] = 16 << 20
+    packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = _LIMITS.packet_size
+    memory: Annotated[Size, Field(ge=1 << 10)] = _LIMITS.memory
+    queue_messages: Count = _LIMITS.queue_messages
+    queue_bytes: Annotated[Size, Field(ge=1)] = _LIMITS.queue_bytes
     queue_full: QueueFull = "refuse"
     keep: Keep = "latest"
     publish_rate: Count = 100_000
-    inflight: Annotated[int, Field(ge=1, le=65535)] = 20
-    sessions: Count = 10_000
-    subscriptions: Count = 1000
-    client_id_length: Annotated[Size, Field(ge=23, le=65535)] = 1024
-    topic_length: Annotated[Size, Field(ge=1, le=65535)] = 65535
-    topic_levels: Annotated[int, Field(ge=1, le=32768)] = 201
-    retained_messages: Annotated[int, Field(ge=0)] = 100_000
-    retained_bytes: Annotated[Size, Field(ge=0)] = 64 << 20
+    inflight: Annotated[int, Field(ge=1, le=65535)] = _LIMITS.inflight
+    sessions: Count = _LIMITS.sessions
+    subscriptions: Count = _LIMITS.subscriptions
+    client_id_length: Annotated[Size, Field(ge=23, le=65535)] = _LIMITS.client_id_length
+    topic_length: Annotated[Size, Field(ge=1, le=65535)] = _LIMITS.topic_length
+    topic_levels: Annotated[int, Field(ge=1, le=32768)] = _LIMITS.topic_levels
+    retained_messages: Annotated[int, Field(ge=0)] = _LIMITS.retained_messages
+    retained_bytes: Annotated[Size, Field(ge=0)] = _LIMITS.retained_bytes
     connect_timeout: Annotated[Duration, Field(gt=0)] = 10.0
-    session_expiry: Annotated[Duration, Field(ge=0, lt=0xFFFF_FFFF)] = 7 * 86400.0
-    keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 65535.0
-    topic_alias: Annotated[int, Field(ge=0, le=65535)] = 10
-    user_properties: Annotated[int, Field(ge=0, le=10_000)] = 1000
+    session_expiry: Annotated[Duration, Field(ge=0, lt=0xFFFF_FFFF)] = float(_LIMITS.session_expiry)
+    keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = float(_LIMITS.keep_alive)
+    topic_alias: Annotated[int, Field(ge=0, le=65535)] = _LIMITS.topic_alias
+    user_properties: Annotated[int, Field(ge=0, le=10_000)] = _LIMITS.user_properties
     user: UserLimitsSection = _section()
+
+    def of_broker(self) -> Limits:
+        """Those that the broker enforces; listeners and logins have the others."""
+        return self.build(
+            Limits,
+            keep=0 if self.keep == "latest" else self.keep,
+            session_expiry=round(self.session_expiry),
+            keep_alive=round(self.keep_alive),
+            user=self.user.build(UserLimits),
+        )
 
 
 class PluginAnswersSection(_Section):
@@ -230,6 +261,10 @@ class BrokerSection(_Section):
         dict[str, dict[str, Any]], BeforeValidator(check_plugins), Field(repr=False)
     ] = {}
     plugin_answers: PluginAnswersSection = _section()
+
+    def features(self) -> Features:
+        """What the MQTT standard leaves to the operator."""
+        return self.build(Features, response_information=self.response_information or "")
 
     def lets_in_anonymous(self, listener: Listener) -> bool:
         """Whether clients that give no user name come in by that listener."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 from pathlib import Path
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from appliance import config
-from appliance.app import wiring
-from appliance.broker.ports import UserLimits
+from appliance.broker.ports import Limits, UserLimits
 from appliance.config import Bind, ConfigError, Settings, reading
+from appliance.config.settings import LimitsSection, UserLimitsSection
+from appliance.net.listeners import Admission
 
 REFERENCE = Path(__file__).parents[2] / "appliance.yaml"
 HERE = Path("/srv/robot/appliance.yaml")
@@ -677,12 +679,20 @@ def test_a_file_that_may_not_be_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_limits_of_a_user_reach_the_broker() -> None:
-    assert wiring.broker_limits(loads("robot: r2")).user == UserLimits()
+    assert loads("robot: r2").broker.limits.of_broker().user == UserLimits()
     text = "robot: r2\nbroker: {limits: {user: {connections: 7, memory: 3 MiB, stored: 0 B}}}"
     settings = loads(text)
-    assert wiring.broker_limits(settings).user == UserLimits(
+    assert settings.broker.limits.of_broker().user == UserLimits(
         connections=7, memory=3 << 20, stored=0
     )
     assert loads(yaml.safe_dump(config.describe(settings))).model_dump() == settings.model_dump()
     with pytest.raises(ConfigError, match=r"broker\.limits\.user\.sessions.*at least 1"):
         loads("robot: r2\nbroker: {limits: {user: {sessions: 0}}}")
+
+
+def test_every_limit_has_a_part_that_enforces_it() -> None:
+    """A key that is added to the file alone would have no effect."""
+    taken = {field.name for kind in (Limits, Admission) for field in dataclasses.fields(kind)}
+    # The login throttle takes this one.
+    assert set(LimitsSection.model_fields) == taken | {"failed_logins"}
+    assert set(UserLimitsSection.model_fields) == {f.name for f in dataclasses.fields(UserLimits)}

@@ -27,6 +27,7 @@ from appliance import config
 from appliance.app import wiring
 from appliance.broker.accounts import Accounts
 from appliance.broker.ports import Features, Limits
+from appliance.certs.settings import tls_contexts
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -597,7 +598,7 @@ broker:
     - {bind: "unix:/run/web.sock", protocol: websocket}
 """
     settings = config.loads(text, tmp_path / "appliance.yaml", {})
-    listeners = wiring.listener_settings(settings, wiring.tls(settings))
+    listeners = wiring.listener_settings(settings, tls_contexts(settings.broker))
     tls, plain, web, private, shared = listeners
     assert (plain.host, plain.context, plain.protocol, plain.path) == ("::1", None, "mqtt", None)
     assert tls.context is not None and tls.context().verify_mode == ssl.CERT_OPTIONAL
