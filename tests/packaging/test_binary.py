@@ -30,14 +30,18 @@ from waiting import eventually, until
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
 pytest.importorskip("PyInstaller")
+from robot_client import TURTLE, V5, Client
 from robot_process import Robot
-from test_own_interfaces import DRIVE, VALUE, build_workspace
-from test_robot import TURTLE, V5, Client
-from test_ros2 import Peer, domain, string
+from ros2_harness import Peer, string
+from ros_domain import isolated_domain
+from rover_workspace import DRIVE, VALUE, build_workspace
 
-__all__ = ["domain"]  # a fixture for all tests here
+__all__ = ["isolated_domain"]  # a fixture
 
-pytestmark = pytest.mark.timeout(600)  # it may have to be built
+pytestmark = [
+    pytest.mark.timeout(600),
+    pytest.mark.usefixtures("isolated_domain"),
+]  # it may have to be built
 
 PROJECT = Path(__file__).parent.parent.parent
 MIB = 1 << 20

@@ -164,7 +164,7 @@ class Robot:
 
     async def start(self, *, is_reached):
         """`is_reached`: there is a network before it."""
-        from test_ros2 import Peer
+        from ros2_harness import Peer
 
         await asyncio.to_thread(self.appliance.start)
         self.peer = Peer()

@@ -12,10 +12,9 @@ import pytest
 
 from appliance.host.environment import for_other_programs
 
-pytest.importorskip("rclpy")
-from test_ros2 import domain
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
-__all__ = ["domain"]  # a fixture for all tests here
+pytest.importorskip("rclpy")
 
 #: Seconds until a route follows: the most for half of them, and for all.
 MEDIAN, WORST = 1.0, float(os.environ.get("CHURN_PATIENCE", "5"))

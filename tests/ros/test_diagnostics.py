@@ -14,8 +14,8 @@ from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules
 
 pytest.importorskip("diagnostic_msgs.msg")
-from test_bridge import STRING, TWIST, Client, House, string, to_mqtt, to_ros
-from test_commands import GO, All, AllAllowed, Driver
+from bridge_harness import STRING, TWIST, Client, Harness, string, to_mqtt, to_ros
+from command_harness import GO, All, AllAllowed, Driver
 
 from appliance.ros.diagnostics import TYPE
 from appliance.ros.payload.converter import Converters
@@ -36,8 +36,8 @@ class Installed(All):
         return name not in self.without
 
 
-class ToldHouse(House):
-    """A house with another node that listens to /diagnostics."""
+class DiagnosticsHarness(Harness):
+    """A harness with another node that listens to /diagnostics."""
 
     def __init__(self):
         super().__init__()
@@ -76,11 +76,11 @@ class ToldHouse(House):
 
 
 @pytest.fixture
-async def house():
-    house = ToldHouse()
-    yield house
-    await house.bridge.stop()
-    assert house.node.subscriptions == house.node.own_publishers == []
+async def harness():
+    harness = DiagnosticsHarness()
+    yield harness
+    await harness.bridge.stop()
+    assert harness.node.subscriptions == harness.node.own_publishers == []
 
 
 def level(status):
@@ -88,11 +88,11 @@ def level(status):
     return value if isinstance(value, int) else value[0]
 
 
-async def test_broker_bridge_and_routes(house):
-    house.start(to_mqtt("/a"), to_ros("/b", type=STRING), to_mqtt("/never"))
-    publisher = house.node.add_publisher("/a", STRING)
+async def test_broker_bridge_and_routes(harness):
+    harness.start(to_mqtt("/a"), to_ros("/b", type=STRING), to_mqtt("/never"))
+    publisher = harness.node.add_publisher("/a", STRING)
     publisher.publish(string("x"))
-    told = await house.told()
+    told = await harness.told()
     assert list(told) == ["broker", "bridge", "/a to MQTT", "/b to ROS", "/never to MQTT"]
     assert told["broker"]["values"]["subscriptions"] == "1"
     assert told["bridge"]["message"] == "topics bridged: 2"
@@ -105,62 +105,62 @@ async def test_broker_bridge_and_routes(house):
     )
 
 
-async def test_what_goes_wrong_is_a_warning_while_it_does(house):
-    house.start(to_ros("/b", type=STRING))
-    await house.told()
-    house.client.send("r2d2/b", b"nonsense")
-    told = (await house.told())["/b to ROS"]
+async def test_what_goes_wrong_is_a_warning_while_it_does(harness):
+    harness.start(to_ros("/b", type=STRING))
+    await harness.told()
+    harness.client.send("r2d2/b", b"nonsense")
+    told = (await harness.told())["/b to ROS"]
     assert level(told) == WARN
     assert told["message"] == "messages that could not be carried: 1"
     assert "not JSON" in told["values"]["last error"]
-    told = (await house.told())["/b to ROS"]
+    told = (await harness.told())["/b to ROS"]
     assert (level(told), told["values"]["errors"]) == (OK, "1")
 
 
-async def test_a_route_that_cannot_be_set_up_is_an_error(house):
-    house.start(to_ros("/b", type="no_msgs/msg/Such"))
-    told = (await house.told())["/b to ROS"]
+async def test_a_route_that_cannot_be_set_up_is_an_error(harness):
+    harness.start(to_ros("/b", type="no_msgs/msg/Such"))
+    told = (await harness.told())["/b to ROS"]
     assert level(told) == ERROR
     assert "no_msgs is not installed" in told["message"]
 
 
-async def test_who_commands_and_what_was_refused(house):
-    house.broker.tick(asyncio.get_running_loop().time())
+async def test_who_commands_and_what_was_refused(harness):
+    harness.broker.tick(asyncio.get_running_loop().time())
     rules = CommandRules(exclusive=True, clamp=(("linear.x", -0.3, 0.3),))
-    house.start(to_ros("/cmd_vel", type=TWIST, rules=rules))
+    harness.start(to_ros("/cmd_vel", type=TWIST, rules=rules))
     name = "/cmd_vel to ROS"
-    assert (await house.told())[name]["values"]["commanded by"] == "nobody"
-    one, two = Driver(house.broker, "one"), Driver(house.broker, "two")
+    assert (await harness.told())[name]["values"]["commanded by"] == "nobody"
+    one, two = Driver(harness.broker, "one"), Driver(harness.broker, "two")
     one.drive(GO)
     two.drive(GO)
-    told = (await house.told())[name]
+    told = (await harness.told())[name]
     assert told["values"]["commanded by"] == "one"
     assert told["values"]["refused"] == "1"
     assert told["values"]["clamped"] == "1"
     assert (level(told), told["message"]) == (WARN, "commands refused: 1")
     one.cut()
-    assert (await house.told())[name]["values"]["commanded by"] == "nobody"
+    assert (await harness.told())[name]["values"]["commanded by"] == "nobody"
 
 
-async def test_two_routes_of_one_topic_have_two_names(house):
-    house.start(to_mqtt("/a"), to_mqtt("/a", mqtt="elsewhere"))
-    assert {"/a to MQTT", "/a to MQTT (2)"} <= (await house.told()).keys()
+async def test_two_routes_of_one_topic_have_two_names(harness):
+    harness.start(to_mqtt("/a"), to_mqtt("/a", mqtt="elsewhere"))
+    assert {"/a to MQTT", "/a to MQTT (2)"} <= (await harness.told()).keys()
 
 
-async def test_it_can_be_switched_off(house):
-    house.start(to_mqtt("/a"), interval=0)
-    house.node.spin()
+async def test_it_can_be_switched_off(harness):
+    harness.start(to_mqtt("/a"), interval=0)
+    harness.node.spin()
     await asyncio.sleep(0.05)
-    assert house.listener.received == []
-    assert house.node.own_publishers == []
+    assert harness.listener.received == []
+    assert harness.node.own_publishers == []
 
 
-async def test_without_the_message_type_there_is_one_warning(house, caplog):
-    house.node.types.without.add(TYPE)
+async def test_without_the_message_type_there_is_one_warning(harness, caplog):
+    harness.node.types.without.add(TYPE)
     with caplog.at_level(logging.WARNING):
-        house.start(to_mqtt("/a"))
-        house.node.spin()
-        house.node.spin()
+        harness.start(to_mqtt("/a"))
+        harness.node.spin()
+        harness.node.spin()
         await asyncio.sleep(0.05)
     told = [r.getMessage() for r in caplog.records if "/diagnostics" in r.getMessage()]
     assert told == [
@@ -169,18 +169,18 @@ async def test_without_the_message_type_there_is_one_warning(house, caplog):
     ]
 
 
-async def test_a_transport_that_refuses_and_a_bus_that_is_lost_harm_nothing(house):
-    house.start(to_mqtt("/a"))
-    await house.told()
-    (publisher,) = house.node.own_publishers
+async def test_a_transport_that_refuses_and_a_bus_that_is_lost_harm_nothing(harness):
+    harness.start(to_mqtt("/a"))
+    await harness.told()
+    (publisher,) = harness.node.own_publishers
     publisher.error = "full"
     await asyncio.sleep(0.05)
     publisher.error = None
-    await house.told()
-    house.node.fail("the daemon died")
-    seen = len(house.listener.received)
+    await harness.told()
+    harness.node.fail("the daemon died")
+    seen = len(harness.listener.received)
     await asyncio.sleep(0.05)
-    assert len(house.listener.received) == seen
+    assert len(harness.listener.received) == seen
 
 
 def test_a_stop_before_the_start_is_nothing():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_bridge import LATCHED, STRING, house, string, to_mqtt, to_ros
+from bridge_harness import LATCHED, STRING, string, to_mqtt, to_ros
 from waiting import until
 
 from appliance.broker.message import Message
@@ -11,53 +11,51 @@ from appliance.mqtt.codec import Property
 from appliance.ros.calls.routes import ActionSettings, CallRoutes, ParameterSettings
 from appliance.ros.retained_cleanup import TopicOwners
 
-__all__ = ["house"]
-
 
 def of_route(topic):
     told = {Property.USER_PROPERTY: [("ros-type", STRING)]}
     return Message(topic, b"old", 1, True, told)
 
 
-def topics(house):
-    return sorted(topic for topic, _ in house.broker.retained.find("r2d2/#"))
+def topics(harness):
+    return sorted(topic for topic, _ in harness.broker.retained.find("r2d2/#"))
 
 
-def others(house):
-    return [topic for topic in topics(house) if "/_appliance/" not in topic]
+def others(harness):
+    return [topic for topic in topics(harness) if "/_appliance/" not in topic]
 
 
-async def test_at_the_start_what_an_earlier_run_has_left(house):
-    inside = house.broker.accounting.accounts.inside
-    alice = house.broker.accounting.accounts.of_user("alice")
+async def test_at_the_start_what_an_earlier_run_has_left(harness):
+    inside = harness.broker.accounting.accounts.inside
+    alice = harness.broker.accounting.accounts.of_user("alice")
     for topic in ("r2d2/map", "r2d2/gone", "elsewhere/gone", "r2d2/camera/a", "r2d2/only_commands"):
-        house.broker.retained.keep(of_route(topic), inside)
-    house.broker.retained.keep(of_route("r2d2/alices"), alice)
-    house.broker.retained.keep(Message("r2d2/plugins", b"old", 1, True), inside)
-    house.broker.retained.keep(Message("r2d2/node/_param/gone", b"1", 1, True), inside)
-    house.start(to_mqtt("/map"), to_mqtt("/camera/**"), to_ros("/only_commands", type=STRING))
-    await house.settle()
+        harness.broker.retained.keep(of_route(topic), inside)
+    harness.broker.retained.keep(of_route("r2d2/alices"), alice)
+    harness.broker.retained.keep(Message("r2d2/plugins", b"old", 1, True), inside)
+    harness.broker.retained.keep(Message("r2d2/node/_param/gone", b"1", 1, True), inside)
+    harness.start(to_mqtt("/map"), to_mqtt("/camera/**"), to_ros("/only_commands", type=STRING))
+    await harness.settle()
     # Of nodes that are not there yet it stays, and what others have retained, too.
-    assert others(house) == ["r2d2/alices", "r2d2/camera/a", "r2d2/map", "r2d2/plugins"]
-    assert house.broker.retained.get("elsewhere/gone") is None
+    assert others(harness) == ["r2d2/alices", "r2d2/camera/a", "r2d2/map", "r2d2/plugins"]
+    assert harness.broker.retained.get("elsewhere/gone") is None
 
 
-async def test_at_a_reload(house, caplog):
+async def test_at_a_reload(harness, caplog):
     caplog.set_level("INFO")
-    house.start(to_mqtt("/map"), to_mqtt("/camera/*"))
+    harness.start(to_mqtt("/map"), to_mqtt("/camera/*"))
     for name in ("/map", "/camera/a"):
-        house.node.add_publisher(name, STRING, LATCHED).publish(string("latched"))
-    await until(lambda: others(house) == ["r2d2/camera/a", "r2d2/map"])
-    house.client.received.clear()
-    house.bridge.replace([to_mqtt("/camera/*")])
-    house.bridge.forget_leftovers()
-    house.node.spin()
-    await until(lambda: others(house) == ["r2d2/camera/a"])
-    assert house.client.payloads("r2d2/map") == [b""], "who subscribes is told that it is gone"
+        harness.node.add_publisher(name, STRING, LATCHED).publish(string("latched"))
+    await until(lambda: others(harness) == ["r2d2/camera/a", "r2d2/map"])
+    harness.client.received.clear()
+    harness.bridge.replace([to_mqtt("/camera/*")])
+    harness.bridge.forget_leftovers()
+    harness.node.spin()
+    await until(lambda: others(harness) == ["r2d2/camera/a"])
+    assert harness.client.payloads("r2d2/map") == [b""], "who subscribes is told that it is gone"
     assert "taken back: 1" in caplog.text
-    house.bridge.replace([to_mqtt("/camera/*", retain=False)])
-    house.node.spin()
-    await until(lambda: others(house) == [])
+    harness.bridge.replace([to_mqtt("/camera/*", retain=False)])
+    harness.node.spin()
+    await until(lambda: others(harness) == [])
 
 
 @pytest.mark.parametrize(

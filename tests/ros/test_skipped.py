@@ -39,10 +39,10 @@ class Bus(FakeNode):
 
 
 @pytest.fixture
-async def house():
-    house = CallHarness(Bus(types=AllTypes()))
-    yield house
-    await house.stop()
+async def harness():
+    harness = CallHarness(Bus(types=AllTypes()))
+    yield harness
+    await harness.stop()
 
 
 def topic(ros, to="mqtt", **kw):
@@ -50,24 +50,24 @@ def topic(ros, to="mqtt", **kw):
     return TopicSettings(names[0] if len(names) == 1 else names, to, "r2d2{ros}", **kw)
 
 
-def skipped(house):
+def skipped(harness):
     """Why, by name and direction."""
-    return {(skip.ros, skip.direction): skip.why for skip in house.bridge.skips()}
+    return {(skip.ros, skip.direction): skip.why for skip in harness.bridge.skips()}
 
 
-def told(house):
-    return house.retained("r2d2/_appliance/skipped")
+def told(harness):
+    return harness.retained("r2d2/_appliance/skipped")
 
 
-async def look(house):
-    house.node.spin()
+async def look(harness):
+    harness.node.spin()
     await asyncio.sleep(0)
     await asyncio.sleep(0)
 
 
-async def test_topics(house):
-    node = house.node
-    house.start(
+async def test_topics(harness):
+    node = harness.node
+    harness.start(
         topics=[
             topic("/odom"),
             topic("/cmd", "ros"),
@@ -87,8 +87,8 @@ async def test_topics(house):
         ("/walk/_action/feedback", STRING),
     ):
         node.add_publisher(name, kind)
-    await look(house)
-    assert skipped(house) == {
+    await look(harness)
+    assert skipped(harness) == {
         ("/lidar", "to_mqtt"): "problem",
         ("/odom", "to_mqtt"): "absent",
         ("/cmd", "to_ros"): "absent",
@@ -97,20 +97,20 @@ async def test_topics(house):
         ("/_text", "to_mqtt"): "hidden",
         ("/twist", "to_mqtt"): "other_type",
     }
-    by_name = {skip.ros: skip for skip in house.bridge.skips()}
+    by_name = {skip.ros: skip for skip in harness.bridge.skips()}
     assert by_name["/arm/raw"].reason == "left out by !/arm/raw"
     assert by_name["/arm/raw"].type == TWIST
     assert "acme_msgs is not installed" in by_name["/lidar"].reason
     assert by_name["/twist"].reason == "the route takes std_msgs/msg/*"
-    assert [skip.why for skip in house.bridge.skips()][:3] == ["problem", "absent", "absent"]
+    assert [skip.why for skip in harness.bridge.skips()][:3] == ["problem", "absent", "absent"]
     # They come, and are skipped no longer.
     node.add_publisher("/odom", "nav_msgs/msg/Odometry")
     node.add_subscriber("/cmd", TWIST)
-    await look(house)
-    assert not {("/odom", "to_mqtt"), ("/cmd", "to_ros")} & skipped(house).keys()
-    assert told(house)["count"] == 6  # /cmd is of another type than patterns to MQTT take
-    assert told(house)["by_reason"] == {"problem": 1, "left_out": 1, "hidden": 2, "other_type": 2}
-    assert told(house)["skipped"][0] == {
+    await look(harness)
+    assert not {("/odom", "to_mqtt"), ("/cmd", "to_ros")} & skipped(harness).keys()
+    assert told(harness)["count"] == 6  # /cmd is of another type than patterns to MQTT take
+    assert told(harness)["by_reason"] == {"problem": 1, "left_out": 1, "hidden": 2, "other_type": 2}
+    assert told(harness)["skipped"][0] == {
         "ros": "/lidar",
         "direction": "to_mqtt",
         "type": "acme_msgs/msg/Points",
@@ -120,16 +120,16 @@ async def test_topics(house):
     # Another type on a topic that is bridged.
     node.add_publisher("/text", TWIST)
     for _ in range(6):
-        await look(house)
+        await look(harness)
     # Of two types that fit, one is carried.
     node.add_publisher("/arm/joint", STRING)
     for _ in range(6):
-        await look(house)
-    assert skipped(house)["/arm/joint", "to_mqtt"] == "two_types"
+        await look(harness)
+    assert skipped(harness)["/arm/joint", "to_mqtt"] == "two_types"
     # And other routes.
-    house.bridge.replace([topic("/twist")])
-    await look(house)
-    assert skipped(house) == {}
+    harness.bridge.replace([topic("/twist")])
+    await look(harness)
+    assert skipped(harness) == {}
 
 
 def action_of(name, kind):
@@ -141,9 +141,9 @@ def action_of(name, kind):
     )
 
 
-async def test_what_is_called(house):
-    node = house.node
-    house.start(
+async def test_what_is_called(harness):
+    node = harness.node
+    harness.start(
         service(["/absent", "/arm/*", "!/arm/off", "/odd"]),
         service("/**", type="std_srvs/srv/Set*"),
         service("/ask", to="mqtt", type="acme_srvs/srv/Ask"),
@@ -161,9 +161,9 @@ async def test_what_is_called(house):
         *action_of("/walk_far", "test_msgs/action/Far"),
     ):
         node.add_service(name, kind, lambda request, respond: None)
-    await look(house)
-    await look(house)
-    assert skipped(house) == {
+    await look(harness)
+    await look(harness)
+    assert skipped(harness) == {
         ("/absent", "service"): "absent",
         ("/odd", "service"): "problem",
         ("/arm/off", "service"): "left_out",
@@ -182,22 +182,22 @@ async def test_what_is_called(house):
         pass
 
     node.add_service("/mute/get_parameters", "rcl_interfaces/srv/GetParameters", refuse)
-    await look(house)  # and no list_parameters
+    await look(harness)  # and no list_parameters
     mute = "/mute", "parameters"
-    await until(lambda: skipped(house).get(mute) == "problem", "it cannot be read")
-    house.bridge.calls.replace(call_routes())
-    assert skipped(house) == {}
+    await until(lambda: skipped(harness).get(mute) == "problem", "it cannot be read")
+    harness.bridge.calls.replace(call_routes())
+    assert skipped(harness) == {}
 
 
-async def test_what_is_told_on_mqtt_is_bounded(house):
-    house.start(service("/arm/*"), topics=[topic(["/**", "!/a/**"])])
+async def test_what_is_told_on_mqtt_is_bounded(harness):
+    harness.start(service("/arm/*"), topics=[topic(["/**", "!/a/**"])])
     for number in range(MOST_TOLD + 50):
-        house.node.add_publisher(f"/a/topic_{number}", STRING)
-    await look(house)
-    assert told(house)["count"] == MOST_TOLD + 50
-    assert len(told(house)["skipped"]) == MOST_TOLD
-    await house.bridge.stop()
-    assert told(house)["count"] == 0
+        harness.node.add_publisher(f"/a/topic_{number}", STRING)
+    await look(harness)
+    assert told(harness)["count"] == MOST_TOLD + 50
+    assert len(told(harness)["skipped"]) == MOST_TOLD
+    await harness.bridge.stop()
+    assert told(harness)["count"] == 0
 
 
 def entry(number, why="left_out"):

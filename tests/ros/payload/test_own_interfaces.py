@@ -6,61 +6,19 @@ from __future__ import annotations
 
 import json
 import queue
-import subprocess
 import sys
-from pathlib import Path
 
 import paho.mqtt.client as mqtt
 import pytest
 import yaml
 from waiting import until
 
-from appliance.host.environment import for_other_programs
-
 pytest.importorskip("rclpy")
 from appliance_process import HOST, ROBOT, ApplianceProcess
-from test_ros2 import Peer, domain
+from ros2_harness import Peer
+from rover_workspace import DRIVE, VALUE, build_workspace
 
-__all__ = ["domain"]  # a fixture for all tests here
-
-DEFINITIONS = {
-    "Wheel": "uint8 LEFT=1\nuint8 side\nfloat32[<=4] slip\n",
-    "Drive": """\
-std_msgs/Header header
-string<=16 mode "idle"
-float64[2] speed
-Wheel[] wheels
-uint8[] blob
-""",
-}
-DRIVE = "rover_msgs/msg/Drive"
-
-#: What it takes beside what CDR says of itself: {"mode": "go", "wheels": [{"side": 1}], …}
-VALUE = {
-    "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "base"},
-    "mode": "go",
-    "speed": [0.5, -0.5],
-    "wheels": [{"side": 1, "slip": [0.25]}],
-    "blob": "AAEC",
-}
-
-
-def build_workspace(folder):
-    """Build the package rover_msgs; returns what a workspace's `install` folder is."""
-    source, prefix = folder / "rover_msgs", folder / "install"
-    (source / "msg").mkdir(parents=True)
-    for name, text in DEFINITIONS.items():
-        (source / f"msg/{name}.msg").write_text(text)
-    builder = Path(__file__).parents[1] / "interfaces.py"
-    arguments = [source, prefix, "rover_msgs", "std_msgs", "builtin_interfaces"]
-    built = subprocess.run(
-        [sys.executable, builder, *arguments],
-        env=for_other_programs(),
-        capture_output=True,
-        text=True,
-    )
-    assert built.returncode == 0, built.stdout + built.stderr
-    return prefix
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
 
 @pytest.fixture
@@ -71,8 +29,8 @@ def workspace(tmp_path):
 @pytest.fixture
 def appliance(tmp_path, workspace, monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{workspace}:{sys.prefix}")
-    (tmp_path / "house").mkdir()
-    appliance = ApplianceProcess(tmp_path / "house", acl=f"user alice\ntopic {ROBOT}/#\n")
+    (tmp_path / "home").mkdir()
+    appliance = ApplianceProcess(tmp_path / "home", acl=f"user alice\ntopic {ROBOT}/#\n")
     settings = yaml.safe_load(appliance.config.read_text())
     settings["bridge"] = {
         "topics": [{"ros": "/state", "to": "mqtt"}, {"ros": "/drive", "to": "ros", "type": DRIVE}]

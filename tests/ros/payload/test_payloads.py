@@ -14,8 +14,8 @@ from appliance.ros.payload.fallback import ConversionError
 
 pytest.importorskip("sensor_msgs.msg")
 import zstandard
+from bridge_harness import STRING, TWIST, Harness, both, string, to_mqtt, to_ros
 from encoded import decoded, encoded, from_cbor, to_cbor
-from test_bridge import STRING, TWIST, House, both, string, to_mqtt, to_ros
 
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import (
@@ -36,14 +36,14 @@ JPEG = b"\xff\xd8\xff\xe0" + bytes(range(256))
 
 
 @pytest.fixture
-async def house():
-    house = House()
+async def harness():
+    harness = Harness()
     parts = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     parts += tuple(f"geometry_msgs/msg/{name}" for name in ODOMETRY_PARTS)
     for name in (PICTURE, IMAGE, ODOMETRY, JOINTS, *parts):
-        house.node.types[name] = import_message(name)
-    yield house
-    await house.bridge.stop()
+        harness.node.types[name] = import_message(name)
+    yield harness
+    await harness.bridge.stop()
 
 
 def properties_of(message):
@@ -139,72 +139,72 @@ def test_a_field_that_there_is_not_is_refused_with_what_there_is(path):
         select(load_description(ODOMETRY), [path])
 
 
-async def test_some_fields_of_a_topic(house):
-    house.start(to_mqtt("/odom", fields=("pose.pose.position", "header.stamp")))
-    peer = house.node.add_publisher("/odom", ODOMETRY)
+async def test_some_fields_of_a_topic(harness):
+    harness.start(to_mqtt("/odom", fields=("pose.pose.position", "header.stamp")))
+    peer = harness.node.add_publisher("/odom", ODOMETRY)
     peer.publish(CONVERTERS.get(ODOMETRY).from_json(b'{"child_frame_id": "base"}'))
-    await house.settle()
-    (payload,) = house.client.payloads("r2d2/odom")
+    await harness.settle()
+    (payload,) = harness.client.payloads("r2d2/odom")
     assert json.loads(payload) == {
         "header": {"stamp": {"sec": 0, "nanosec": 0}},
         "pose": {"pose": {"position": {"x": 0, "y": 0, "z": 0}}},
     }
 
 
-async def test_a_wrong_field_leaves_the_topic_unbridged_and_says_why(house):
-    house.start(to_mqtt("/odom", fields=("speed",)))
-    house.node.add_publisher("/odom", ODOMETRY)
-    await house.settle()
-    assert "no 'speed', there are header, child_frame_id" in house.status().last_error
-    assert house.routes() == []
+async def test_a_wrong_field_leaves_the_topic_unbridged_and_says_why(harness):
+    harness.start(to_mqtt("/odom", fields=("speed",)))
+    harness.node.add_publisher("/odom", ODOMETRY)
+    await harness.settle()
+    assert "no 'speed', there are header, child_frame_id" in harness.status().last_error
+    assert harness.routes() == []
 
 
 # pictures
 
 
-async def test_a_picture_goes_as_it_is_with_its_content_type(house):
-    house.start(both("/camera", type=PICTURE, encoding="binary", keep=2))
-    peer = house.node.add_publisher("/camera", PICTURE)
-    other = house.node.add_subscriber("/camera", PICTURE)
+async def test_a_picture_goes_as_it_is_with_its_content_type(harness):
+    harness.start(both("/camera", type=PICTURE, encoding="binary", keep=2))
+    peer = harness.node.add_publisher("/camera", PICTURE)
+    other = harness.node.add_subscriber("/camera", PICTURE)
     peer.publish(CONVERTERS.get(PICTURE).from_dict({"format": "jpeg", "data": JPEG}))
     peer.publish(CONVERTERS.get(PICTURE).from_dict({"format": "??", "data": b"else"}))
-    await house.settle()
-    first, second = [m for m, _ in house.client.received if m.topic == "r2d2/camera"]
+    await harness.settle()
+    first, second = [m for m, _ in harness.client.received if m.topic == "r2d2/camera"]
     assert first.payload == JPEG
     assert first.properties[Property.CONTENT_TYPE] == "image/jpeg"
     assert second.properties[Property.CONTENT_TYPE] == "application/octet-stream"
 
     other.received.clear()
-    house.client.send("r2d2/camera", JPEG)
+    harness.client.send("r2d2/camera", JPEG)
     (cdr,) = other.received
     value = CONVERTERS.get(PICTURE).to_dict(cdr)
     assert value["format"] == "jpeg"
     assert encoded("binary", CONVERTERS.get(PICTURE), cdr) == JPEG
 
 
-async def test_a_raw_image_cannot_be_made_of_its_bytes(house):
-    house.start(to_ros("/image", type=IMAGE, encoding="binary"))
-    await house.settle()
-    assert "nothing would tell encoding, height" in house.status("to_ros").last_error
+async def test_a_raw_image_cannot_be_made_of_its_bytes(harness):
+    harness.start(to_ros("/image", type=IMAGE, encoding="binary"))
+    await harness.settle()
+    assert "nothing would tell encoding, height" in harness.status("to_ros").last_error
 
 
 # zstd
 
 
-async def test_compressed_both_ways(house):
-    house.start(both("/chatter", type=STRING, compression="zstd"))
-    peer = house.node.add_publisher("/chatter", STRING)
-    other = house.node.add_subscriber("/chatter", STRING)
+async def test_compressed_both_ways(harness):
+    harness.start(both("/chatter", type=STRING, compression="zstd"))
+    peer = harness.node.add_publisher("/chatter", STRING)
+    other = harness.node.add_subscriber("/chatter", STRING)
     peer.publish(string("a" * 1000))
-    await house.settle()
-    (message,) = [m for m, _ in house.client.received if m.topic == "r2d2/chatter"]
+    await harness.settle()
+    (message,) = [m for m, _ in harness.client.received if m.topic == "r2d2/chatter"]
     assert len(message.payload) < 100
     assert json.loads(zstandard.decompress(message.payload)) == {"data": "a" * 1000}
     assert properties_of(message)["content-encoding"] == "zstd"
 
     other.received.clear()
-    house.client.send("r2d2/chatter", zstandard.compress(b'{"data": "small"}'))
-    house.client.send("r2d2/chatter", b'{"data": "plain"}')
+    harness.client.send("r2d2/chatter", zstandard.compress(b'{"data": "small"}'))
+    harness.client.send("r2d2/chatter", b'{"data": "plain"}')
     assert other.received == [string("small"), string("plain")]
 
 
@@ -256,15 +256,15 @@ def test_every_encoding_can_be_compressed(encoding):
     ],
 )
 async def test_what_says_to_be_something_else_does_not_reach_ros(
-    house, payload, properties, problem
+    harness, payload, properties, problem
 ):
-    house.start(to_ros("/chatter", type=STRING))
-    peer = house.node.add_subscriber("/chatter", STRING)
-    house.broker.publish(
-        Message("r2d2/chatter", payload, properties=properties), house.client.session
+    harness.start(to_ros("/chatter", type=STRING))
+    peer = harness.node.add_subscriber("/chatter", STRING)
+    harness.broker.publish(
+        Message("r2d2/chatter", payload, properties=properties), harness.client.session
     )
     assert peer.received == []
-    assert problem in house.status("to_ros").last_error
+    assert problem in harness.status("to_ros").last_error
 
 
 # schemas
@@ -312,54 +312,54 @@ def test_a_schema_agrees_with_what_is_taken(type_name, value):
         assert is_valid
 
 
-async def test_schemas_of_what_is_bridged_are_retained(house):
-    house.start(to_ros("/chatter", type=STRING), to_ros("/cmd_vel", type=TWIST))
-    await house.settle()
-    retained = house.broker.retained
+async def test_schemas_of_what_is_bridged_are_retained(harness):
+    harness.start(to_ros("/chatter", type=STRING), to_ros("/cmd_vel", type=TWIST))
+    await harness.settle()
+    retained = harness.broker.retained
     schema = retained.get("r2d2/_appliance/schema/geometry_msgs/Twist")
     assert json.loads(schema.payload)["title"] == TWIST
     assert schema.properties[Property.CONTENT_TYPE] == "application/schema+json"
     assert retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
-    house.bridge.replace([to_ros("/cmd_vel", type=TWIST)])
-    house.node.spin()
-    await house.settle()
+    harness.bridge.replace([to_ros("/cmd_vel", type=TWIST)])
+    harness.node.spin()
+    await harness.settle()
     assert retained.get("r2d2/_appliance/schema/std_msgs/String") is None
     assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
 
 
 @pytest.mark.parametrize("name", ["routes", "skipped"])
-async def test_what_is_told_as_json_says_so(house, name):
-    house.start(to_ros("/chatter", type=STRING))
-    await house.settle()
-    message = house.broker.retained.get(f"r2d2/_appliance/{name}")
+async def test_what_is_told_as_json_says_so(harness, name):
+    harness.start(to_ros("/chatter", type=STRING))
+    await harness.settle()
+    message = harness.broker.retained.get(f"r2d2/_appliance/{name}")
     assert message.properties == {Property.CONTENT_TYPE: "application/json"}
 
 
-async def test_schemas_from_before_a_crash_are_taken_back(house):
+async def test_schemas_from_before_a_crash_are_taken_back(harness):
     topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
-    house.client.send(topic, b"{}", retain=True)
-    house.start(to_ros("/chatter", type=STRING))
-    await house.settle()
-    assert house.broker.retained.get(topic) is None
-    assert house.broker.retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
+    harness.client.send(topic, b"{}", retain=True)
+    harness.start(to_ros("/chatter", type=STRING))
+    await harness.settle()
+    assert harness.broker.retained.get(topic) is None
+    assert harness.broker.retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
 
 
 # the budget
 
 
-async def test_a_budget_of_bytes_is_kept_to(house, monkeypatch):
+async def test_a_budget_of_bytes_is_kept_to(harness, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now[0])
-    house.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
-    peer = house.node.add_publisher("/chatter", STRING)
+    harness.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
+    peer = harness.node.add_publisher("/chatter", STRING)
     text = string("x" * 991)  # a thousand bytes
     for _ in range(500):  # five seconds of 100 Hz
         peer.publish(text)
         now[0] += 0.01
-    await house.settle()
+    await harness.settle()
     # What was saved before the first, and what came in since; one may have been too large.
-    assert 59 <= len(house.client.payloads("r2d2/chatter")) <= 61
-    assert house.status().throttled == 500 - len(house.client.payloads("r2d2/chatter"))
+    assert 59 <= len(harness.client.payloads("r2d2/chatter")) <= 61
+    assert harness.status().throttled == 500 - len(harness.client.payloads("r2d2/chatter"))
 
 
 def test_what_is_too_large_is_not_converted():
@@ -372,13 +372,13 @@ def test_what_is_too_large_is_not_converted():
         unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(100))(small)
 
 
-async def test_what_takes_long_ends_the_turn_of_its_sender(house):
+async def test_what_takes_long_ends_the_turn_of_its_sender(harness):
     """However few bytes it is: others are served in between."""
-    house.start(both("/chatter", type=STRING, compression="zstd"))
-    counters = house.broker.counters
+    harness.start(both("/chatter", type=STRING, compression="zstd"))
+    counters = harness.broker.counters
     before = counters.cost
-    house.client.send("r2d2/chatter", b'{"data": "x"}')
+    harness.client.send("r2d2/chatter", b'{"data": "x"}')
     little = counters.cost - before
     payload = b'{"data": "' + b"x" * 1_000_000 + b'"}'
-    house.client.send("r2d2/chatter", zstandard.compress(payload))
+    harness.client.send("r2d2/chatter", zstandard.compress(payload))
     assert counters.cost - before - little > 200 > little

@@ -14,7 +14,7 @@ import pytest
 from waiting import until
 
 pytest.importorskip("rclpy")
-from test_ros2 import BYTES, STRING, domain, house, peer, route, string
+from ros2_harness import BYTES, STRING, route, string
 
 from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries
@@ -26,9 +26,9 @@ from appliance.ros.payload.definitions import load_description
 from appliance.ros.ros2 import loop_subscription as ros2_loop
 from appliance.ros.ros2 import node as ros2
 
-JOINTS = "sensor_msgs/msg/JointState"
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
-__all__ = ["domain", "house", "peer"]  # fixtures
+JOINTS = "sensor_msgs/msg/JointState"
 
 
 def open_files():
@@ -188,29 +188,29 @@ async def test_two_threads_never_take_at_the_same_time(monkeypatch, taker, peer)
     assert given and set(itertools.accumulate(given)) == {0, 1}
 
 
-async def bridged(house, peer, type_name):
-    house.start(route("/a", "mqtt", "cdr"))
+async def bridged(harness, peer, type_name):
+    harness.start(route("/a", "mqtt", "cdr"))
     await peer.do("advertise", "/a", type_name)
-    await until(house.bridged, "/a")
+    await until(harness.bridged, "/a")
     await peer.do("matched", "/a")
 
 
-async def test_a_burst_of_small_messages_is_carried_whole(house, peer):
-    await bridged(house, peer, STRING)
+async def test_a_burst_of_small_messages_is_carried_whole(harness, peer):
+    await bridged(harness, peer, STRING)
     await peer.do_beside_a_busy_loop("publish", "/a", string("one").hex(), 500, 5000)
-    await until(lambda: len(house.payloads("r2d2/a")) == 500, "all")
-    assert house.bridge.status()[0].dropped == 0
+    await until(lambda: len(harness.payloads("r2d2/a")) == 500, "all")
+    assert harness.bridge.status()[0].dropped == 0
 
 
-async def test_a_burst_of_the_states_of_joints_is_carried_whole(house, peer):
-    await bridged(house, peer, JOINTS)
+async def test_a_burst_of_the_states_of_joints_is_carried_whole(harness, peer):
+    await bridged(harness, peer, JOINTS)
     cdr = compile_converter(load_description(JOINTS)).from_dict({"position": [0.5] * 7})
     await peer.do_beside_a_busy_loop("publish", "/a", cdr.hex(), 90, 5000)
-    await until(lambda: len(house.payloads("r2d2/a")) == 90, "all")
-    assert house.bridge.status()[0].dropped == 0
+    await until(lambda: len(harness.payloads("r2d2/a")) == 90, "all")
+    assert harness.bridge.status()[0].dropped == 0
 
 
-async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, house, peer):
+async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, harness, peer):
     monkeypatch.setattr(ros2_loop, "BEHIND", 0.2)
     ages, stamps = [], [0.0]
 
@@ -222,11 +222,11 @@ async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, house,
 
     monkeypatch.setattr(Bridge, "_publish", lambda self, batch: slow(batch))
     topics = {"latest": "/a", 2000: "/b"}
-    house.start(*(replace(route(ros, "mqtt", "cdr"), keep=keep) for keep, ros in topics.items()))
+    harness.start(*(replace(route(ros, "mqtt", "cdr"), keep=keep) for keep, ros in topics.items()))
     oldest = {}
     for count, (keep, ros) in enumerate(topics.items(), 1):
         await peer.do("advertise", ros, "geometry_msgs/msg/Vector3")
-        await until(lambda count=count: len(house.bridged()) == count, ros)
+        await until(lambda count=count: len(harness.bridged()) == count, ros)
         await peer.do("matched", ros)
         ages.clear()
         await peer.do("publish_times", ros, 2000, 1000)
@@ -234,44 +234,44 @@ async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, house,
         await peer.do("publish_times", ros, 1, 1000)
         await until(lambda last=last: stamps[-1] >= last, "the last message")
         oldest[keep] = max(ages)
-    dropped = [status.dropped for status in house.bridge.status()]
+    dropped = [status.dropped for status in harness.bridge.status()]
     # Two seconds' worth in four and more: the queue grows to its end, on any computer.
     assert oldest["latest"] < oldest[2000] / 2
     assert dropped[0] > 300 and dropped[1] == 0
 
 
-async def test_what_a_busy_loop_misses_is_counted(house, peer):
-    await bridged(house, peer, BYTES)  # which may be pictures: not many of them are held
+async def test_what_a_busy_loop_misses_is_counted(harness, peer):
+    await bridged(harness, peer, BYTES)  # which may be pictures: not many of them are held
     for _ in range(5):
         await peer.do_beside_a_busy_loop("publish_image", "/a", 10, 100, 2000)
     await peer.do("publish_image", "/a", 100, 1, 2000)
-    await until(lambda: any(len(each) > 100 for each in house.payloads("r2d2/a")), "the last")
-    arrived = len(house.payloads("r2d2/a"))
+    await until(lambda: any(len(each) > 100 for each in harness.payloads("r2d2/a")), "the last")
+    arrived = len(harness.payloads("r2d2/a"))
     assert arrived < 400
-    assert house.bridge.status()[0].dropped == 501 - arrived
+    assert harness.bridge.status()[0].dropped == 501 - arrived
 
 
-async def test_subscriptions_come_and_go_while_messages_come(house, peer):
+async def test_subscriptions_come_and_go_while_messages_come(harness, peer):
     routes = [route("/a", "mqtt", "text"), route("/b", "mqtt", "text")]
-    house.start(*routes)
+    harness.start(*routes)
     for topic in ("/a", "/b"):
         await peer.do("advertise", topic, STRING)
-    await until(lambda: len(house.bridged()) == 2, "both")
+    await until(lambda: len(harness.bridged()) == 2, "both")
 
     def names():
-        return {topic for topic in ("/a", "/b") if house.node.count(topic)[1]}
+        return {topic for topic in ("/a", "/b") if harness.node.count(topic)[1]}
 
     files = open_files()
     publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 4000, 2000))
     loops = 0
     while not publishing.done():
-        house.bridge.replace(routes[1:])
+        harness.bridge.replace(routes[1:])
         await until(lambda: "/a" not in names(), "the end of /a")
-        seen = len(house.payloads("r2d2/a"))
+        seen = len(harness.payloads("r2d2/a"))
         await asyncio.sleep(0.05)
-        assert len(house.payloads("r2d2/a")) == seen
-        house.bridge.replace(routes)
-        await until(lambda: len(house.bridged()) == 2, "/a again")
+        assert len(harness.payloads("r2d2/a")) == seen
+        harness.bridge.replace(routes)
+        await until(lambda: len(harness.bridged()) == 2, "/a again")
         loops += 1
     await publishing
     assert loops > 3

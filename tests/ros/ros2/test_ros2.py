@@ -6,105 +6,28 @@ import asyncio
 import contextlib
 import json
 import os
-import select
 import struct
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
+from ros2_harness import BYTES, SET_BOOL, STRING, TF, TWIST, Peer, route, string
 from waiting import PATIENCE, until
 
-from appliance.broker.broker import Broker
 from appliance.broker.faults import Faults
-from appliance.broker.message import Message
 from appliance.host.environment import for_other_programs
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Subscription
 from appliance.net.callbacks import Entries
-from appliance.ros.bridge import Bridge, TopicSettings
+from appliance.ros.bridge import TopicSettings
 from appliance.ros.node import BusError, QosProfile, Reliability
 from appliance.ros.payload.converter import compile_converter
 from appliance.ros.ros2 import fastdds, installation
 from appliance.ros.ros2 import node as ros2
-from appliance.store import MemoryStore
+
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
 pytest.importorskip("rclpy")
-
-DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing connections
-STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
-BYTES = "std_msgs/msg/UInt8MultiArray"
-TF = "tf2_msgs/msg/TFMessage"
-SET_BOOL = "std_srvs/srv/SetBool"
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    for variable in ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
-        monkeypatch.setenv(variable, "")  # so that what a test sets is undone after it
-        monkeypatch.delenv(variable)
-
-
-def string(text):
-    data = text.encode() + b"\0"
-    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
-
-
-class Peer:
-    """peer.py, and what it has received."""
-
-    def __init__(self):
-        self.received = []
-
-    async def start(self, name="peer", **environment):
-        self.process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            str(Path(__file__).parents[1] / "peer.py"),
-            name,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            env=for_other_programs() | environment,
-        )
-        self._answers = asyncio.Queue()
-        self._reader = asyncio.create_task(self._read())
-        await self._answer()
-        return self
-
-    async def _read(self):
-        async for line in self.process.stdout:
-            kind, *rest = json.loads(line)
-            if kind == "received":
-                self.received.append(tuple(rest))
-            else:
-                self._answers.put_nowait(kind)
-        self._answers.put_nowait("ended")
-
-    async def _answer(self):
-        assert await asyncio.wait_for(self._answers.get(), PATIENCE) == "ok"
-
-    async def do(self, *command):
-        self.process.stdin.write(json.dumps(command).encode() + b"\n")
-        await self._answer()
-
-    async def do_beside_a_busy_loop(self, *command):
-        """`do`, while the event loop has other things to do from its begin to its end."""
-        doing = asyncio.create_task(self.do(*command))
-        await asyncio.sleep(0)  # now it is told
-        pipe = self.process._transport.get_pipe_transport(1).get_extra_info("pipe")
-        assert select.select([pipe], [], [], PATIENCE)[0], f"no answer to {command[0]}"
-        await doing
-
-    async def stop(self):
-        self.process.stdin.close()
-        try:
-            await asyncio.wait_for(self.process.wait(), 10)
-        except asyncio.TimeoutError:
-            self.process.kill()
-            await self.process.wait()
-        await self._reader
 
 
 async def test_no_request_ends_the_thread():
@@ -226,68 +149,17 @@ async def test_names_that_only_dds_takes_are_passed_over():
     assert set(topics) == set(services) == {"/fine"}
 
 
-class House:
-    """Broker, bridge and an MQTT client, as in test_bridge.py, on a real node."""
-
-    writable = True
-    epoch = 0
-
-    def __init__(self):
-        self.node = ros2.Ros2Node()
-        self.broker = Broker(self, MemoryStore())
-        self.received = []
-        self.session = self.broker.attach("client", self)
-        self.broker.subscribe(self.session, Subscription("r2d2/#", 1))
-
-    def start(self, *routes):
-        self.bridge = Bridge(self.node, self.broker, routes, asyncio.get_running_loop(), "r2d2")
-        self.bridge.start()
-
-    def publish(self, message, qos, packet_id, dup, retain, subscription_ids):
-        self.received.append((message, qos))
-        if qos:
-            self.session.puback(packet_id)
-
-    def send(self, topic, payload):
-        self.broker.publish(Message(topic, payload), self.session)
-
-    def payloads(self, topic):
-        return [message.payload for message, _ in self.received if message.topic == topic]
-
-    def bridged(self):
-        return [topic for status in self.bridge.status() for topic in status.topics]
-
-
-@pytest.fixture
-async def house():
-    house = House()
-    yield house
-    await house.bridge.stop()
-    assert "ros" not in [thread.name for thread in threading.enumerate()]
-
-
-@pytest.fixture
-async def peer():
-    peer = await Peer().start()
-    yield peer
-    await peer.stop()
-
-
-def route(ros, to, encoding="json", **kw):
-    return TopicSettings(ros, to, "r2d2" + ros, encoding=encoding, **kw)
-
-
-async def test_ros_to_mqtt(house, peer):
-    house.start(route("/chatter", "mqtt"), route("/fast", "mqtt", "cdr"))
+async def test_ros_to_mqtt(harness, peer):
+    harness.start(route("/chatter", "mqtt"), route("/fast", "mqtt", "cdr"))
     await peer.do("advertise", "/chatter", STRING)
     await peer.do("advertise", "/fast", STRING, "best_effort")
     await peer.do("matched", "/chatter")
     await peer.do("matched", "/fast")
     await peer.do("publish", "/chatter", string("hello").hex())
     await peer.do("publish", "/fast", string("raw").hex())
-    await until(lambda: house.payloads("r2d2/fast"), "the message of /fast")
-    await until(lambda: house.payloads("r2d2/chatter"), "the message of /chatter")
-    found = {m.topic: (m, qos) for m, qos in house.received}
+    await until(lambda: harness.payloads("r2d2/fast"), "the message of /fast")
+    await until(lambda: harness.payloads("r2d2/chatter"), "the message of /chatter")
+    found = {m.topic: (m, qos) for m, qos in harness.received}
     message, qos = found["r2d2/chatter"]
     assert (message.payload, qos) == (b'{"data":"hello"}', 1)
     assert message.properties[Property.CONTENT_TYPE] == "application/json"
@@ -298,39 +170,39 @@ async def test_ros_to_mqtt(house, peer):
     assert (message.payload, qos) == (string("raw"), 0)
 
 
-async def test_mqtt_to_ros(house, peer):
-    house.start(route("/cmd_vel", "ros"))
+async def test_mqtt_to_ros(harness, peer):
+    harness.start(route("/cmd_vel", "ros"))
     await peer.do("subscribe", "/cmd_vel", TWIST)
-    await until(house.bridged, "the type of /cmd_vel")
+    await until(harness.bridged, "the type of /cmd_vel")
 
     def arrives():
-        house.send("r2d2/cmd_vel", b'{"linear":{"x":0.5}}')
+        harness.send("r2d2/cmd_vel", b'{"linear":{"x":0.5}}')
         return peer.received
 
     await until(arrives, "a command")
     expected = b"\0\1\0\0" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
     assert peer.received[0] == ("/cmd_vel", expected.hex())
     before = len(peer.received)
-    house.send("r2d2/cmd_vel", b'{"linear":{"x":"fast"}}')
-    house.send("r2d2/cmd_vel", b'{"angular":{"z":1}}')
+    harness.send("r2d2/cmd_vel", b'{"linear":{"x":"fast"}}')
+    harness.send("r2d2/cmd_vel", b'{"angular":{"z":1}}')
     await until(lambda: peer.received[-1][1] != expected.hex(), "the command after the wrong one")
-    assert house.bridge.status()[0].errors == 1
-    assert len(peer.received) <= house.bridge.status()[0].messages
+    assert harness.bridge.status()[0].errors == 1
+    assert len(peer.received) <= harness.bridge.status()[0].messages
     assert len(peer.received) > before
 
 
-async def test_who_subscribes_late_is_given_the_last_command_alone(house, peer):
-    house.start(route("/mode", "ros", "text"))
+async def test_who_subscribes_late_is_given_the_last_command_alone(harness, peer):
+    harness.start(route("/mode", "ros", "text"))
     await peer.do("subscribe", "/mode", STRING, "reliable", "transient_local")
-    await until(house.bridged, "/mode")
+    await until(harness.bridged, "/mode")
     for text in ("one", "two", "three"):
-        house.send("r2d2/mode", text.encode())
+        harness.send("r2d2/mode", text.encode())
     await until(lambda: len(peer.received) == 3, "the commands")
     late = await Peer().start("late")
     try:
         await late.do("subscribe", "/mode", STRING, "reliable", "transient_local")
         await until(lambda: late.received, "the last command")
-        house.send("r2d2/mode", b"four")
+        harness.send("r2d2/mode", b"four")
         await until(lambda: len(late.received) == 2, "another one")
         for (_, cdr), text in zip(late.received, ("three", "four"), strict=True):
             assert cdr.startswith(string(text).hex())
@@ -338,42 +210,42 @@ async def test_who_subscribes_late_is_given_the_last_command_alone(house, peer):
         await late.stop()
 
 
-async def test_both_ways_without_an_echo(house, peer):
-    house.start(route("/chat", "both", "text", keep=100))
+async def test_both_ways_without_an_echo(harness, peer):
+    harness.start(route("/chat", "both", "text", keep=100))
     await peer.do("advertise", "/chat", STRING)
     await peer.do("subscribe", "/chat", STRING)
     await peer.do("matched", "/chat", 2)  # its own subscription, and the bridge's
-    await until(lambda: len(house.bridged()) == 2, "both directions")
+    await until(lambda: len(harness.bridged()) == 2, "both directions")
 
     def arrives():
-        house.send("r2d2/chat", b"probe")
+        harness.send("r2d2/chat", b"probe")
         return peer.received
 
     await until(arrives, "a message from MQTT")
-    sent = house.bridge.status()[0].messages
+    sent = harness.bridge.status()[0].messages
     for number in range(20):
-        house.send("r2d2/chat", b"%d" % number)
+        harness.send("r2d2/chat", b"%d" % number)
     await peer.do("publish", "/chat", string("from ros").hex())
-    await until(lambda: b"from ros" in house.payloads("r2d2/chat"), "the message from ROS")
+    await until(lambda: b"from ros" in harness.payloads("r2d2/chat"), "the message from ROS")
     last = string("19").hex()  # DDS may add padding to it
     await until(lambda: any(cdr.startswith(last) for _, cdr in peer.received), "the last from MQTT")
     # The client has its own messages from the broker, each once; and nothing else from the bridge.
-    assert len(house.payloads("r2d2/chat")) == sent + 20 + 1
-    assert house.bridge.status()[1].messages == 1
+    assert len(harness.payloads("r2d2/chat")) == sent + 20 + 1
+    assert harness.bridge.status()[1].messages == 1
 
 
-async def test_latched_samples_are_retained(house, peer):
+async def test_latched_samples_are_retained(harness, peer):
     await peer.do("advertise", "/map", STRING, "reliable", "transient_local")
     await peer.do("publish", "/map", string("old").hex())
     await peer.do("publish", "/map", string("new").hex())
-    house.start(route("/map", "mqtt", "text"))
-    retained = house.broker.retained
+    harness.start(route("/map", "mqtt", "text"))
+    retained = harness.broker.retained
     await until(lambda: (m := retained.get("r2d2/map")) and m.payload == b"new", "the new map")
-    assert house.received[-1][1] == 1
+    assert harness.received[-1][1] == 1
 
 
 @pytest.mark.parametrize("rate", [None, 1])
-async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, tmp_path, rate):
+async def test_static_transforms_of_all_nodes_are_retained(harness, monkeypatch, tmp_path, rate):
     folder = tmp_path / "share/tf2_msgs/msg"
     folder.mkdir(parents=True)
     (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\n")
@@ -388,7 +260,7 @@ async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, t
         await peer.do("publish", "/tf_static", cdr.hex())
 
     def retained():
-        message = house.broker.retained.get("r2d2/tf_static")
+        message = harness.broker.retained.get("r2d2/tf_static")
         return message and {
             each["child_frame_id"]: each["transform"]["translation"]["x"]
             for each in json.loads(message.payload)["transforms"]
@@ -401,7 +273,7 @@ async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, t
         await publish(peers[0], transform("base", 1.0), transform("wheel", 2.0))
         await publish(peers[1], transform("hand", 5.0))
         await publish(peers[2], transform("lidar", 3.0))
-        house.start(route("/tf_static", "mqtt", rate=rate))
+        harness.start(route("/tf_static", "mqtt", rate=rate))
         everything = {"base": 1.0, "wheel": 2.0, "hand": 5.0, "lidar": 3.0}
         await until(lambda: retained() == everything, "the transforms of all")
         await publish(peers[0], transform("wheel", 4.0))
@@ -411,36 +283,38 @@ async def test_static_transforms_of_all_nodes_are_retained(house, monkeypatch, t
             await peer.stop()
 
 
-async def test_publishers_that_change_are_followed(house, peer):
-    house.start(route("/a", "mqtt", "text"))
+async def test_publishers_that_change_are_followed(harness, peer):
+    harness.start(route("/a", "mqtt", "text"))
     for reliability, qos in (("reliable", 1), ("best_effort", 0), ("reliable", 1)):
         await peer.do("advertise", "/a", STRING, reliability)
         await peer.do("matched", "/a")
 
-        seen = len(house.received)
+        seen = len(harness.received)
         deadline = time.monotonic() + PATIENCE
-        while house.received[seen:] == [] or house.received[-1][1] != qos:
+        while harness.received[seen:] == [] or harness.received[-1][1] != qos:
             assert time.monotonic() < deadline, f"not followed: {reliability}"
             await peer.do("publish", "/a", string(reliability).hex())
             await asyncio.sleep(0.05)
-        assert house.received[-1][0].payload.decode() == reliability
+        assert harness.received[-1][0].payload.decode() == reliability
         await peer.do("vanish", "/a")
 
 
-async def test_pattern(house, peer):
-    house.start(TopicSettings("/camera/**", "mqtt", "r2d2{ros}", encoding="cdr"))
+async def test_pattern(harness, peer):
+    harness.start(TopicSettings("/camera/**", "mqtt", "r2d2{ros}", encoding="cdr"))
     await peer.do("advertise", "/camera/left/image", BYTES, "best_effort")
-    await until(house.bridged, "the camera")
-    assert house.bridged()[0].mqtt == "r2d2/camera/left/image"
+    await until(harness.bridged, "the camera")
+    assert harness.bridged()[0].mqtt == "r2d2/camera/left/image"
     await peer.do("vanish", "/camera/left/image")
-    await until(lambda: not house.bridged(), "the camera's end")
+    await until(lambda: not harness.bridged(), "the camera's end")
 
 
-async def test_images_pass_through_the_larger_shared_memory(house):
+async def test_images_pass_through_the_larger_shared_memory(harness):
     """1 MB, 50 a second, both ways, none lost; and the profile has been taken."""
     before = shared_memory()
-    house.start(route("/image", "mqtt", "cdr", keep=100), route("/back", "ros", "cdr", type=BYTES))
-    await until(lambda: house.bridged(), "the node")
+    harness.start(
+        route("/image", "mqtt", "cdr", keep=100), route("/back", "ros", "cdr", type=BYTES)
+    )
+    await until(lambda: harness.bridged(), "the node")
     assert max(size for name, size in shared_memory().items() if name not in before) > 4 << 20
     profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
     assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent]
@@ -448,14 +322,14 @@ async def test_images_pass_through_the_larger_shared_memory(house):
     try:
         await peer.do("advertise", "/image", BYTES)
         await peer.do("subscribe", "/back", BYTES)
-        await until(lambda: len(house.bridged()) == 2, "/image")
+        await until(lambda: len(harness.bridged()) == 2, "/image")
         await peer.do("matched", "/image")
         await peer.do("publish_image", "/image", 1_000_000, 50, 50)
-        await until(lambda: len(house.payloads("r2d2/image")) == 50, "all images")
-        image = house.payloads("r2d2/image")[0]
+        await until(lambda: len(harness.payloads("r2d2/image")) == 50, "all images")
+        image = harness.payloads("r2d2/image")[0]
         assert len(image) > 1_000_000
         for _ in range(20):
-            house.send("r2d2/back", image)
+            harness.send("r2d2/back", image)
             await asyncio.sleep(0.02)
         await until(lambda: len(peer.received) == 20, "all images on the way back")
     finally:
@@ -714,8 +588,8 @@ def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(tmp_path, m
 # The demo robot
 
 
-async def test_demo_robot_drives_and_stops(house):
-    house.start(
+async def test_demo_robot_drives_and_stops(harness):
+    harness.start(
         route("/odom", "mqtt"),
         route("/battery", "mqtt"),
         route("/scan", "mqtt"),
@@ -728,22 +602,22 @@ async def test_demo_robot_drives_and_stops(house):
     )
     try:
         for name in ("odom", "battery", "scan", "chatter", "robot_description"):
-            await until(lambda name=name: house.payloads(f"r2d2/{name}"), name)
-        assert house.broker.retained.get("r2d2/robot_description").payload.startswith(b"<robot")
-        assert json.loads(house.payloads("r2d2/battery")[-1])["temperature"] is None
-        await until(lambda: len(house.bridged()) == 6, "/cmd_vel")
+            await until(lambda name=name: harness.payloads(f"r2d2/{name}"), name)
+        assert harness.broker.retained.get("r2d2/robot_description").payload.startswith(b"<robot")
+        assert json.loads(harness.payloads("r2d2/battery")[-1])["temperature"] is None
+        await until(lambda: len(harness.bridged()) == 6, "/cmd_vel")
 
         def x():
-            return json.loads(house.payloads("r2d2/odom")[-1])["pose"]["pose"]["position"]["x"]
+            return json.loads(harness.payloads("r2d2/odom")[-1])["pose"]["pose"]["position"]["x"]
 
         def drives():
-            house.send("r2d2/cmd_vel", b'{"linear":{"x":1}}')
+            harness.send("r2d2/cmd_vel", b'{"linear":{"x":1}}')
             return x() > 0.1
 
         await until(drives, "the robot drives")
 
         def speed():
-            return json.loads(house.payloads("r2d2/odom")[-1])["twist"]["twist"]["linear"]["x"]
+            return json.loads(harness.payloads("r2d2/odom")[-1])["twist"]["twist"]["linear"]["x"]
 
         await until(lambda: speed() == 0, "the robot stops by itself")
     finally:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from ros2_harness import STRING, string
 from saboteur import SabotageError, Saboteur
-from test_ros2 import STRING, domain, peer, string
 from waiting import until
 
 from appliance.broker.faults import Faults
@@ -15,7 +15,7 @@ from appliance.ros.mailbox import LARGE
 from appliance.ros.node import QosProfile
 from appliance.ros.ros2 import node as ros2
 
-__all__ = ["domain", "peer"]  # fixtures
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
 TRIGGER = "std_srvs/srv/Trigger"
 

@@ -25,7 +25,7 @@ from appliance.ros.ros2 import node as ros2
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import STRING, House, Peer, domain, route, string
+from ros2_harness import STRING, Harness, Peer, route, string
 
 from appliance.ros.calls.routes import CallRoutes, ServiceSettings
 from appliance.ros.diagnostics import TYPE
@@ -33,7 +33,7 @@ from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
 from appliance.ros.ros2.network_scope import NetworkScope, reach
 
-__all__ = ["domain"]  # a fixture for all tests here
+pytestmark = pytest.mark.usefixtures("isolated_domain")
 
 CLOCK, STAMP = "rosgraph_msgs/msg/Clock", "builtin_interfaces/msg/Time"
 
@@ -50,36 +50,36 @@ async def start():
     houses = []
 
     def start(*routes, diagnostics=0.0, **node):
-        house = House()
-        house.node = ros2.Ros2Node(**node)
+        harness = Harness()
+        harness.node = ros2.Ros2Node(**node)
         loop = asyncio.get_running_loop()
-        house.bridge = Bridge(
-            house.node, house.broker, routes, loop, "r2d2", diagnostics=diagnostics
+        harness.bridge = Bridge(
+            harness.node, harness.broker, routes, loop, "r2d2", diagnostics=diagnostics
         )
-        house.bridge.start()
-        houses.append(house)
-        return house
+        harness.bridge.start()
+        houses.append(harness)
+        return harness
 
     yield start
-    for house in houses:
-        await house.bridge.stop()
+    for harness in houses:
+        await harness.bridge.stop()
 
 
 async def test_messages_come_in_order_and_some_are_timed(start, peer):
-    house = start(route("/a", "mqtt", "text", keep=10_000))
+    harness = start(route("/a", "mqtt", "text", keep=10_000))
     await peer.do("advertise", "/a", STRING)
-    await until(house.bridged, "/a")
+    await until(harness.bridged, "/a")
     await peer.do("matched", "/a")
     total = 400
     for number in range(total // 40):
         burst = [f"{number * 40 + i:08d}" for i in range(40)]
         for text in burst:
             await peer.do("publish", "/a", (b"\0\1\0\0\x09\0\0\0" + text.encode() + b"\0").hex())
-    await until(lambda: len(house.payloads("r2d2/a")) == total, "all messages")
-    assert [int(payload) for payload in house.payloads("r2d2/a")] == list(range(total))
-    latency = house.bridge.status()[0].latency_ms
+    await until(lambda: len(harness.payloads("r2d2/a")) == total, "all messages")
+    assert [int(payload) for payload in harness.payloads("r2d2/a")] == list(range(total))
+    latency = harness.bridge.status()[0].latency_ms
     assert 0 < latency.p50 <= latency.p99 < 1000
-    (topic,) = house.bridge.topics()
+    (topic,) = harness.bridge.topics()
     assert topic.size == 8
 
 
@@ -87,14 +87,14 @@ async def test_what_was_latched_before_is_not_timed(start, peer):
     await peer.do("advertise", "/map", STRING, "reliable", "transient_local")
     await peer.do("publish", "/map", (b"\0\1\0\0\x04\0\0\0old\0").hex())
     await asyncio.sleep(0.2)
-    house = start(route("/map", "mqtt", "text"))
-    await until(lambda: house.payloads("r2d2/map"), "the map")
-    assert house.bridge.status()[0].latency_ms is None
+    harness = start(route("/map", "mqtt", "text"))
+    await until(lambda: harness.payloads("r2d2/map"), "the map")
+    assert harness.bridge.status()[0].latency_ms is None
 
 
 async def test_arguments_name_the_node_and_remap_topics(start, peer):
     arguments = ["-r", "__node:=other", "-r", "__ns:=/base", "-r", "/a:=/elsewhere/a"]
-    house = start(
+    harness = start(
         route("/a", "mqtt", "text"),
         route("/b", "ros", "text", type=STRING),
         arguments=[*arguments, "-r", "/b:=/elsewhere/b"],
@@ -102,14 +102,14 @@ async def test_arguments_name_the_node_and_remap_topics(start, peer):
     )
     await peer.do("advertise", "/elsewhere/a", STRING)
     await peer.do("subscribe", "/elsewhere/b", STRING)
-    await until(lambda: len(house.bridged()) == 2, "both")
-    assert house.node.name == "/base/other"
+    await until(lambda: len(harness.bridged()) == 2, "both")
+    assert harness.node.name == "/base/other"
     await peer.do("matched", "/elsewhere/a")
     await peer.do("publish", "/elsewhere/a", (b"\0\1\0\0\x02\0\0\0x\0").hex())
-    await until(lambda: house.payloads("r2d2/a") == [b"x"], "the message from ROS")
+    await until(lambda: harness.payloads("r2d2/a") == [b"x"], "the message from ROS")
 
     def arrives():
-        house.send("r2d2/b", b"y")
+        harness.send("r2d2/b", b"y")
         return peer.received
 
     await until(arrives, "the message from MQTT")
@@ -117,9 +117,9 @@ async def test_arguments_name_the_node_and_remap_topics(start, peer):
 
 
 async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
-    house = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
-    await until(lambda: house.bridge.problem, "the problem")
-    assert "not a remapping" in house.bridge.problem
+    harness = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
+    await until(lambda: harness.bridge.problem, "the problem")
+    assert "not a remapping" in harness.bridge.problem
 
 
 def test_latency_is_that_of_a_clock_that_was_set_meanwhile(monkeypatch):
@@ -141,8 +141,8 @@ async def test_the_doctor_sees_who_is_there(start, peer):
     by_subject = {finding.subject: finding for finding in found}
     assert by_subject["ROS nodes"].text.startswith("seen: 1 (/peer), with ")
     assert by_subject["ROS"].level == by_subject["ROS network"].level == "ok"
-    house = start()
-    await until(lambda: house.bridge.peers == 1, "the peer")
+    harness = start()
+    await until(lambda: harness.bridge.peers == 1, "the peer")
     running = {"ros": {"state": "joined", "node": "/appliance"}}
     found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
     assert [finding.text.partition(",")[0] for finding in found] == ["seen: 1 (/peer)"]
@@ -155,53 +155,53 @@ async def test_the_doctor_sees_who_is_there(start, peer):
 async def test_a_bus_that_is_late_is_joined_when_it_is_there(start, peer, monkeypatch):
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_of_tomorrow")
-    house = start(route("/a", "mqtt", "text"))
-    await until(lambda: house.bridge.problem, "the problem")
-    assert "rmw_of_tomorrow, which is not installed here" in house.bridge.problem
-    assert house.bridge.state == "waiting"
+    harness = start(route("/a", "mqtt", "text"))
+    await until(lambda: harness.bridge.problem, "the problem")
+    assert "rmw_of_tomorrow, which is not installed here" in harness.bridge.problem
+    assert harness.bridge.state == "waiting"
     monkeypatch.delenv("RMW_IMPLEMENTATION")
-    await until(lambda: house.bridge.state == "joined", "the bus")
+    await until(lambda: harness.bridge.state == "joined", "the bus")
     await peer.do("advertise", "/a", STRING)
     await peer.do("matched", "/a")
     await peer.do("publish", "/a", (b"\0\1\0\0\x02\0\0\0x\0").hex())
-    await until(lambda: house.payloads("r2d2/a") == [b"x"], "the message from ROS")
-    await until(lambda: house.bridge.peers == 1, "the peer")
+    await until(lambda: harness.payloads("r2d2/a") == [b"x"], "the message from ROS")
+    await until(lambda: harness.bridge.peers == 1, "the peer")
 
 
 async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
     """All is set up again: topics both ways, services, what is told on /diagnostics."""
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
-    house = start(
+    harness = start(
         route("/a", "mqtt", "text"), route("/b", "ros", "text", type=STRING), diagnostics=0.1
     )
     offered = ServiceSettings(
         names=("/ask",), mqtt="r2d2{ros}", to="mqtt", type="std_srvs/srv/Trigger"
     )
-    house.bridge.calls.replace(CallRoutes(services=(offered,)))
+    harness.bridge.calls.replace(CallRoutes(services=(offered,)))
     await peer.do("advertise", "/a", STRING)
     await peer.do("subscribe", "/b", STRING)
     await peer.do("subscribe", "/diagnostics", TYPE)
-    await until(lambda: len(house.bridged()) == 2, "both")
+    await until(lambda: len(harness.bridged()) == 2, "both")
     for word in ("before", "after"):
         await peer.do("matched", "/a")
         await peer.do("publish", "/a", string(word).hex())
-        await until(lambda word=word: house.payloads("r2d2/a")[-1:] == [word.encode()], word)
+        await until(lambda word=word: harness.payloads("r2d2/a")[-1:] == [word.encode()], word)
 
         def arrives(word=word):
-            house.send("r2d2/b", word.encode())
+            harness.send("r2d2/b", word.encode())
             return any(topic == "/b" and word.encode().hex() in cdr for topic, cdr in peer.received)
 
         await until(arrives, f"{word} on ROS")
         peer.received.clear()
         await until(lambda: any(topic == "/diagnostics" for topic, _ in peer.received), "health")
         seen = {}
-        house.node.call_soon(lambda seen=seen: seen.update(house.node.services()))
+        harness.node.call_soon(lambda seen=seen: seen.update(harness.node.services()))
         await until(lambda seen=seen: "/ask" in seen, "the service")
         if word == "before":
-            house.node._rclpy.shutdown(context=house.node._context)
-            await until(lambda: house.bridge.state == "lost", "the loss")
-            await until(lambda: house.bridge.state == "joined", "the return")
-            await until(lambda: len(house.bridged()) == 2, "both again")
+            harness.node._rclpy.shutdown(context=harness.node._context)
+            await until(lambda: harness.bridge.state == "lost", "the loss")
+            await until(lambda: harness.bridge.state == "joined", "the return")
+            await until(lambda: len(harness.bridged()) == 2, "both again")
 
 
 async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeypatch):
@@ -209,15 +209,15 @@ async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeyp
     monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
     monkeypatch.setattr(ros2, "reach", lambda: found)
     found = NetworkScope.THIS_COMPUTER
-    house = start(route("/a", "mqtt", "text"))
-    await until(lambda: house.bridge.peers == 1, "the peer")
+    harness = start(route("/a", "mqtt", "text"))
+    await until(lambda: harness.bridge.peers == 1, "the peer")
     await asyncio.sleep(0.5)
-    assert house.bridge.state == "joined"
-    first, found = house.node._context, NetworkScope.NETWORK
-    await until(lambda: house.bridge.state == "lost", "the new start")
-    assert house.bridge.problem == "there was no network yet when it was joined, and is now"
-    await until(lambda: house.bridge.peers == 1, "the peer again")
-    assert house.node._context is not first
+    assert harness.bridge.state == "joined"
+    first, found = harness.node._context, NetworkScope.NETWORK
+    await until(lambda: harness.bridge.state == "lost", "the new start")
+    assert harness.bridge.problem == "there was no network yet when it was joined, and is now"
+    await until(lambda: harness.bridge.peers == 1, "the peer again")
+    assert harness.node._context is not first
 
 
 async def test_a_network_that_comes_while_the_bus_is_joined_is_used(start, peer, monkeypatch):
@@ -256,24 +256,24 @@ def test_how_far_one_can_be_heard(monkeypatch):
     "node", [{"use_sim_time": True}, {"arguments": ["-p", "use_sim_time:=true"]}]
 )
 async def test_time_is_the_simulations(start, peer, node):
-    house = start(route("/t", "ros", type=STAMP), **node)
+    harness = start(route("/t", "ros", type=STAMP), **node)
     await peer.do("advertise", "/clock", CLOCK)
     await peer.do("subscribe", "/t", STAMP)
-    await until(house.bridged, "/t")
+    await until(harness.bridged, "/t")
     await peer.do("matched", "/clock")
-    assert house.node.now() == 0
+    assert harness.node.now() == 0
     clock = b"\0\1\0\0" + (1234).to_bytes(4, "little") + (500).to_bytes(4, "little")
 
     async def has_arrived():
         await peer.do("publish", "/clock", clock.hex())
-        house.send("r2d2/t", b'"now"')
+        harness.send("r2d2/t", b'"now"')
         return any(cdr == clock.hex() for _, cdr in peer.received)
 
     deadline = time.monotonic() + 10
     while not await has_arrived():
         assert time.monotonic() < deadline, peer.received[-1:]
         await asyncio.sleep(0.05)
-    assert house.node.now() == 1234 * 10**9 + 500
+    assert harness.node.now() == 1234 * 10**9 + 500
 
 
 async def test_the_appliance_tells_how_it_is_on_ros_on_mqtt_and_at_its_door(tmp_path, peer):

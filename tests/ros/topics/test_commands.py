@@ -15,12 +15,10 @@ from zstandard import ZstdCompressor
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
-from appliance.broker.client import Client as NetworkClient
 from appliance.broker.message import DelayedMessage, Message
 from appliance.broker.ports import Action, Decision, PeerStatus
 from appliance.mqtt.codec import Property, decode_varint
 from appliance.mqtt.packets import (
-    Connect,
     Disconnect,
     Puback,
     Publish,
@@ -53,190 +51,61 @@ from appliance.ros.topics.staleness import (
 from appliance.store import MemoryStore
 
 pytest.importorskip("geometry_msgs.msg")
-from test_bridge import INT, STRING, TWIST, Client, House
+from bridge_harness import INT, STRING, TWIST, Client, Harness
+from command_harness import (
+    AFTER,
+    FLOAT,
+    GO,
+    STOP,
+    TOPIC,
+    All,
+    AllAllowed,
+    CommandHarness,
+    Driver,
+    twist,
+)
 
-from appliance.ros.payload.definitions import import_message, load_description
-
-FLOAT = "std_msgs/msg/Float32"
-TOPIC = "r2d2/cmd_vel"
-GO = b'{"linear":{"x":0.5}}'
-AFTER = 0.1
-
-
-def twist(x=0.0, z=0.0):
-    return b"\0\1\0\0" + struct.pack("<6d", x, 0, 0, 0, 0, z)
-
-
-STOP = twist()
-
-
-class AllAllowed:
-    epoch = 0
-
-    def decide(self, identity, action, topic):
-        return Decision(True, "everything is")
-
-
-class All(dict):
-    """All types that are installed."""
-
-    def __contains__(self, name):
-        return True
-
-    def __getitem__(self, name):
-        return import_message(name)
-
-
-class Wire:
-    """A network client's connection; what is written to it can be read as packets."""
-
-    address = "192.0.2.1:4000"
-
-    def __init__(self):
-        self.written = b""
-        self.closed = False
-        self.connection = PeerStatus(silence=math.inf)
-        self.probed = False
-        self.withheld = []
-
-    def authenticate(self, connect):
-        pass
-
-    def now(self):
-        return time.monotonic()
-
-    def holds(self, size):
-        """Of a packet that is not whole."""
-
-    def admit(self, account):
-        return ""
-
-    def later(self):
-        pass
-
-    def peer_status(self):
-        return self.connection
-
-    def probe(self):
-        self.probed = True
-
-    def withhold(self, seconds):
-        self.withheld.append(seconds)
-
-    def write(self, chunks):
-        self.written += b"".join(chunks)
-
-    def close(self):
-        self.closed = True
-
-    abort = close
-
-
-class Driver:
-    """A client with a connection, as the network's clients have it."""
-
-    def __init__(self, broker, name, version=5, clean=True, expiry=0, will=None):
-        self.broker = broker
-        self.version = version
-        self.wire = Wire()
-        self.client = NetworkClient(broker, self.wire)
-        properties = {Property.SESSION_EXPIRY_INTERVAL: expiry} if expiry else None
-        self.say(
-            Connect(name, clean_start=clean, will=will, properties=properties, version=version)
-        )
-        self.client.accept("user")
-        broker.flush()
-        self.wire.written = b""
-
-    def say(self, *packets):
-        # As a connection does it, once for all that it has received.
-        self.broker.accounting.now = asyncio.get_running_loop().time()
-        self.client.receive(b"".join(packet.encode(self.version) for packet in packets))
-        self.broker.flush()
-
-    def drive(self, payload=GO, qos=0, **kw):
-        self.say(Publish(TOPIC, payload, qos=qos, packet_id=7 if qos else None, **kw))
-
-    def steer(self, payload=GO, qos=0, properties=None, **kw):
-        """Say when it was made, so that it is known to be new."""
-        said = {**(properties or {}), Property.USER_PROPERTY: [("sent-at", str(time.time()))]}
-        self.drive(payload, qos, properties=said, **kw)
-
-    def leave(self):
-        self.say(Disconnect())
-
-    def cut(self):
-        self.client.lost()
-        self.broker.flush()
-
-    @property
-    def code(self):
-        """The reason code of the PUBACK that came last."""
-        assert self.wire.written[0] == 0x40
-        return self.wire.written[4] if self.wire.written[1] > 2 else 0
-
-
-class CommandHouse(House):
-    def start(self, rules, **kw):
-        settings = TopicSettings(
-            "/cmd_vel",
-            "ros",
-            "r2d2{ros}",
-            kw.pop("type", TWIST),
-            compression=kw.pop("compression", "none"),
-            rules=rules,
-        )
-        bridge = super().start(settings)
-        self.robot = self.node.add_subscriber("/cmd_vel", kw.pop("found", TWIST))
-        return bridge
-
-    def counters(self):
-        return self.status("to_ros")
-
-    @property
-    def commands(self):
-        (flow,) = self.bridge._to_ros.values()
-        return flow
+from appliance.ros.payload.definitions import load_description
 
 
 @pytest.fixture
-async def house():
-    house = CommandHouse()
-    house.broker = Broker(AllAllowed(), MemoryStore())
-    house.client = Client(house.broker)
-    yield house
-    await house.bridge.stop()
-    assert house.broker.departures == []
-    assert house.broker.guards == {}
+async def harness():
+    harness = CommandHarness()
+    harness.broker = Broker(AllAllowed(), MemoryStore())
+    harness.client = Client(harness.broker)
+    yield harness
+    await harness.bridge.stop()
+    assert harness.broker.departures == []
+    assert harness.broker.guards == {}
 
 
 # Old commands
 
 
-async def test_message_expiry(house):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_message_expiry(harness):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
     driver.steer(properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
     driver.steer(properties={Property.MESSAGE_EXPIRY_INTERVAL: 0})
-    assert house.robot.received == [twist(0.5)]
-    assert house.counters().expired == 1
-    assert [topic.expired for topic in house.bridge.topics()] == [1]
+    assert harness.robot.received == [twist(0.5)]
+    assert harness.counters().expired == 1
+    assert [topic.expired for topic in harness.bridge.topics()] == [1]
 
 
-async def test_what_is_sent_again_is_old(house):
-    house.start(CommandRules(expire=0.1))
-    driver = Driver(house.broker, "a")
+async def test_what_is_sent_again_is_old(harness):
+    harness.start(CommandRules(expire=0.1))
+    driver = Driver(harness.broker, "a")
     driver.drive(qos=1, dup=True)
     driver.drive(qos=1, dup=True, properties={Property.CONTENT_TYPE: "application/json"})
-    assert house.robot.received == []
-    assert house.counters().expired == 2
+    assert harness.robot.received == []
+    assert harness.counters().expired == 2
     # And so is what comes right behind it: its client had it in a queue.
     driver.drive(b'{"linear":{"x":9}}', qos=1)
-    assert house.robot.received == []
-    Driver(house.broker, "b").steer(b'{"linear":{"x":1}}')
+    assert harness.robot.received == []
+    Driver(harness.broker, "b").steer(b'{"linear":{"x":1}}')
     await asyncio.sleep(0.11)
     driver.drive(qos=1)
-    await until(lambda: house.robot.received == [twist(1), twist(0.5)])
+    await until(lambda: harness.robot.received == [twist(1), twist(0.5)])
 
 
 class Asks(AllAllowed):
@@ -257,18 +126,18 @@ class Asks(AllAllowed):
         return not self.has_answered
 
 
-def asks(house, action):
-    """The house has a plugin that has to ask about such; gives what answers after some seconds."""
+def asks(harness, action):
+    """Install a plugin that has to ask; returns a function that answers after some seconds."""
     plugin = Asks(action)
-    house.broker.access = plugin
-    house.broker.router.pending_decisions = plugin
+    harness.broker.access = plugin
+    harness.broker.router.asked = plugin
 
     def answer(driver, seconds):
         plugin.has_answered = True
-        house.broker.router.changed()
-        house.broker.accounting.now += seconds
+        harness.broker.router.changed()
+        harness.broker.accounting.now += seconds
         driver.client.send_on()
-        house.broker.flush()
+        harness.broker.flush()
 
     return answer
 
@@ -277,162 +146,162 @@ def asks(house, action):
 @pytest.mark.parametrize(("seconds", "is_old"), [(0.0, False), (1.5, True)])
 @pytest.mark.parametrize("qos", [0, 1, 2])
 async def test_a_command_that_waited_for_a_plugin_is_as_old_as_the_wait(
-    house, expiry, seconds, is_old, qos
+    harness, expiry, seconds, is_old, qos
 ):
-    house.start(CommandRules(expire=0.2))
-    answer = asks(house, Action.PUBLISH)
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(expire=0.2))
+    answer = asks(harness, Action.PUBLISH)
+    driver = Driver(harness.broker, "a")
     properties = {Property.MESSAGE_EXPIRY_INTERVAL: expiry} if expiry else None
     driver.drive(qos=qos, properties=properties)
     answer(driver, seconds)
     if qos == 2:
         driver.say(Pubrel(7))
     if not is_old:
-        await until(lambda: house.robot.received == [twist(0.5)])
+        await until(lambda: harness.robot.received == [twist(0.5)])
     else:
         await asyncio.sleep(0.3)  # which a command that comes alone waits at most
-        assert house.robot.received == []
-        assert house.counters().expired == 1
+        assert harness.robot.received == []
+        assert harness.counters().expired == 1
 
 
-async def test_a_command_behind_what_waited_for_a_plugin_is_as_old_as_the_wait(house):
-    house.start(CommandRules(expire=0.2))
-    answer = asks(house, Action.SUBSCRIBE)
-    driver = Driver(house.broker, "a")
+async def test_a_command_behind_what_waited_for_a_plugin_is_as_old_as_the_wait(harness):
+    harness.start(CommandRules(expire=0.2))
+    answer = asks(harness, Action.SUBSCRIBE)
+    driver = Driver(harness.broker, "a")
     driver.say(Subscribe(1, [Subscription("x", 0)]))
     driver.drive()
     answer(driver, 1.5)
-    assert house.counters().expired == 1
+    assert harness.counters().expired == 1
     await asyncio.sleep(0.3)
     driver.steer(b'{"linear":{"x":1}}')
-    await until(lambda: house.robot.received == [twist(1)])
+    await until(lambda: harness.robot.received == [twist(1)])
 
 
-async def test_a_message_expires_while_it_waits_for_a_plugin(house):
+async def test_a_message_expires_while_it_waits_for_a_plugin(harness):
     """[MQTT-3.3.2-5]: the interval begins when it comes."""
-    house.start(CommandRules())
-    house.client.subscribe("x")
-    answer = asks(house, Action.PUBLISH)
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules())
+    harness.client.subscribe("x")
+    answer = asks(harness, Action.PUBLISH)
+    driver = Driver(harness.broker, "a")
     properties = {Property.MESSAGE_EXPIRY_INTERVAL: 1}
     driver.say(Publish("x", b"", qos=1, packet_id=7, properties=properties))
     answer(driver, 1.5)
-    assert house.client.received == []
+    assert harness.client.received == []
     assert driver.wire.written == Puback(7).encode(5)
 
 
-async def test_a_qos_2_command_that_waited_before_its_pubrec_and_after_it(house):
-    house.start(CommandRules(expire=0.5))
-    answer = asks(house, Action.PUBLISH)
-    driver = Driver(house.broker, "a")
+async def test_a_qos_2_command_that_waited_before_its_pubrec_and_after_it(harness):
+    harness.start(CommandRules(expire=0.5))
+    answer = asks(harness, Action.PUBLISH)
+    driver = Driver(harness.broker, "a")
     driver.drive(qos=2)
     answer(driver, 1.5)
     await asyncio.sleep(0.15)  # which alone is old, too, but not too old
     driver.say(Pubrel(7))
-    assert house.counters().expired == 1
+    assert harness.counters().expired == 1
 
 
-async def test_without_expire_all_is_published(house):
-    house.start(CommandRules(exclusive=True))
-    Driver(house.broker, "a").drive(qos=1, dup=True)
-    assert house.robot.received == [twist(0.5)]
+async def test_without_expire_all_is_published(harness):
+    harness.start(CommandRules(exclusive=True))
+    Driver(harness.broker, "a").drive(qos=1, dup=True)
+    assert harness.robot.received == [twist(0.5)]
 
 
-async def test_a_qos_2_command_is_as_old_as_its_publish(house):
-    house.start(CommandRules(expire=0.15))
-    driver = Driver(house.broker, "a", expiry=100)
+async def test_a_qos_2_command_is_as_old_as_its_publish(harness):
+    harness.start(CommandRules(expire=0.15))
+    driver = Driver(harness.broker, "a", expiry=100)
     driver.drive(qos=2)
     driver.say(Pubrel(7))
-    await until(lambda: house.robot.received == [twist(0.5)])
+    await until(lambda: harness.robot.received == [twist(0.5)])
     driver.drive(b'{"linear":{"x":2}}', qos=2)
     await asyncio.sleep(0.16)
     driver.say(Pubrel(7))
-    assert house.counters().expired == 1
+    assert harness.counters().expired == 1
     await asyncio.sleep(0.16)
     driver.drive(b'{"linear":{"x":3}}', qos=2)
     driver.cut()
-    again = Driver(house.broker, "a", clean=False, expiry=100)
+    again = Driver(harness.broker, "a", clean=False, expiry=100)
     again.say(Pubrel(7))
-    assert house.counters().expired == 2
-    assert len(house.robot.received) == 1
+    assert harness.counters().expired == 2
+    assert len(harness.robot.received) == 1
 
 
-async def test_what_two_clients_had_queued_is_old_of_both(house):
-    house.start(CommandRules(expire=0.5))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_what_two_clients_had_queued_is_old_of_both(harness):
+    harness.start(CommandRules(expire=0.5))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     # At one moment, however long it takes here: a pause would be that of a stream that begins.
-    house.broker.accounting.now = asyncio.get_running_loop().time()
+    harness.broker.accounting.now = asyncio.get_running_loop().time()
     for driver in (a, b):
         driver.client.receive(Publish(TOPIC, GO, qos=1, packet_id=7, dup=True).encode(5))
     for driver in (a, b):
         driver.client.receive(Publish(TOPIC, GO).encode(5))
-    assert house.robot.received == []
-    assert house.counters().expired == 4
+    assert harness.robot.received == []
+    assert harness.counters().expired == 4
     a.cut()
-    Driver(house.broker, "a").drive()
-    await until(lambda: house.robot.received == [twist(0.5)])
+    Driver(harness.broker, "a").drive()
+    await until(lambda: harness.robot.received == [twist(0.5)])
 
 
-async def test_a_will_is_as_old_as_its_connection(house):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a", will=Will(TOPIC, GO))
+async def test_a_will_is_as_old_as_its_connection(harness):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a", will=Will(TOPIC, GO))
     driver.cut()
-    assert house.robot.received == []
-    assert house.counters().expired == 1
+    assert harness.robot.received == []
+    assert harness.counters().expired == 1
 
 
-async def test_retained_commands_only_where_asked_for(house):
-    house.client.send(TOPIC, GO, retain=True)
-    house.start(CommandRules(expire=0.5))
-    house.node.spin()
-    await house.settle()
-    assert house.robot.received == []
-    house.bridge.replace(
+async def test_retained_commands_only_where_asked_for(harness):
+    harness.client.send(TOPIC, GO, retain=True)
+    harness.start(CommandRules(expire=0.5))
+    harness.node.spin()
+    await harness.settle()
+    assert harness.robot.received == []
+    harness.bridge.replace(
         [TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(take_retained=True))]
     )
     for _ in range(3):
-        house.node.spin()
-        await house.settle()
-    assert house.robot.received == [twist(0.5)]
+        harness.node.spin()
+        await harness.settle()
+    assert harness.robot.received == [twist(0.5)]
 
 
-async def test_a_retained_command_of_unknown_age_is_old_where_commands_expire(house):
-    house.client.send(TOPIC, GO, retain=True)
-    house.start(CommandRules(expire=0.5, take_retained=True))
+async def test_a_retained_command_of_unknown_age_is_old_where_commands_expire(harness):
+    harness.client.send(TOPIC, GO, retain=True)
+    harness.start(CommandRules(expire=0.5, take_retained=True))
     for _ in range(3):
-        house.node.spin()
-        await house.settle()
-    assert house.robot.received == []
-    assert house.counters().expired == 1
+        harness.node.spin()
+        await harness.settle()
+    assert harness.robot.received == []
+    assert harness.counters().expired == 1
 
 
-async def test_late_messages_are_as_others_to_other_clients(house):
-    house.start(CommandRules(expire=0.5))
-    house.client.subscribe("r2d2/#")
-    driver = Driver(house.broker, "a")
+async def test_late_messages_are_as_others_to_other_clients(harness):
+    harness.start(CommandRules(expire=0.5))
+    harness.client.subscribe("r2d2/#")
+    driver = Driver(harness.broker, "a")
     properties = {Property.USER_PROPERTY: [("a", "b")]}
     driver.drive(qos=1, dup=True, properties=properties)
-    message, qos = house.client.received[-1]
-    assert isinstance(message, DelayedMessage)
+    message, qos = harness.client.received[-1]
+    assert isinstance(message, Late)
     assert (message.payload, message.properties, qos) == (GO, properties, 1)
 
 
 # One at a time
 
 
-async def test_one_client_at_a_time(house, caplog):
+async def test_one_client_at_a_time(harness, caplog):
     caplog.set_level(logging.INFO)
-    house.start(CommandRules(exclusive=True, lease=0.1))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
-    old = Driver(house.broker, "old", version=4)
+    harness.start(CommandRules(exclusive=True, lease=0.1))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
+    old = Driver(harness.broker, "old", version=4)
     a.drive(qos=1)
     assert a.code == 0
     b.drive(b'{"linear":{"x":9}}', qos=1)
     assert b.code == 0x87
     old.drive(b'{"linear":{"x":9}}')  # 3.1.1 and QoS 0 cannot be told
-    assert house.robot.received == [twist(0.5)]
-    assert house.counters().refused == 2
-    (topic,) = house.bridge.topics()
+    assert harness.robot.received == [twist(0.5)]
+    assert harness.counters().refused == 2
+    (topic,) = harness.bridge.topics()
     assert (topic.messages, topic.refused, topic.errors) == (1, 2, 0)
     assert "client 'a' (user 'user') commands /cmd_vel, and the route is exclusive" in caplog.text
     # For as long as it goes on.
@@ -440,20 +309,20 @@ async def test_one_client_at_a_time(house, caplog):
         await asyncio.sleep(0.05)
         a.drive()
         b.drive(b'{"linear":{"x":9}}')
-    assert set(house.robot.received) == {twist(0.5)}
+    assert set(harness.robot.received) == {twist(0.5)}
     await until(lambda: "was silent for 0.1 s and commands no more" in caplog.text)
     b.wire.written = b""
     b.drive(b'{"linear":{"x":0.2}}', qos=1)
     assert b.code == 0
-    assert house.robot.received[-1] == twist(0.2)
+    assert harness.robot.received[-1] == twist(0.2)
     a.wire.written = b""
     a.drive(qos=1)
     assert a.code == 0x87
 
 
-async def test_a_lease_ends_with_the_connection(house):
-    house.start(CommandRules(exclusive=True, lease=60))
-    a, b = Driver(house.broker, "a", expiry=100), Driver(house.broker, "b")
+async def test_a_lease_ends_with_the_connection(harness):
+    harness.start(CommandRules(exclusive=True, lease=60))
+    a, b = Driver(harness.broker, "a", expiry=100), Driver(harness.broker, "b")
     a.drive()
     b.drive(b"{}", qos=1)
     assert b.code == 0x87
@@ -461,91 +330,93 @@ async def test_a_lease_ends_with_the_connection(house):
     b.wire.written = b""
     b.drive(b"{}", qos=1)
     assert b.code == 0
-    assert house.robot.received == [twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_refused_commands_reach_nobody_else(house):
-    house.start(CommandRules(exclusive=True))
-    house.client.subscribe(TOPIC)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_refused_commands_reach_nobody_else(harness):
+    harness.start(CommandRules(exclusive=True))
+    harness.client.subscribe(TOPIC)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.drive()
     b.drive(b"nobody sees it", qos=1)
-    assert house.client.payloads(TOPIC) == [GO]
+    assert harness.client.payloads(TOPIC) == [GO]
 
 
-async def test_a_qos_2_command_whose_lease_was_lost_meanwhile(house):
-    house.start(CommandRules(exclusive=True))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_qos_2_command_whose_lease_was_lost_meanwhile(harness):
+    harness.start(CommandRules(exclusive=True))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.drive(qos=2)
     b.drive(b'{"linear":{"x":9}}')
     a.say(Pubrel(7))
-    assert house.robot.received == [twist(9)]
+    assert harness.robot.received == [twist(9)]
 
 
-async def test_what_ros_says_on_a_topic_of_both_ways_needs_no_lease(house):
+async def test_what_ros_says_on_a_topic_of_both_ways_needs_no_lease(harness):
     rules = CommandRules(exclusive=True)
-    super(CommandHouse, house).start(TopicSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules))
-    house.client.subscribe(TOPIC)
-    other = house.node.add_publisher("/cmd_vel", TWIST)
-    Driver(house.broker, "a").drive()
+    super(CommandHarness, harness).start(
+        TopicSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules)
+    )
+    harness.client.subscribe(TOPIC)
+    other = harness.node.add_publisher("/cmd_vel", TWIST)
+    Driver(harness.broker, "a").drive()
     other.publish(twist(0.25))
-    await house.settle()
-    assert [p for p in house.client.payloads(TOPIC) if b"0.25" in p]
+    await harness.settle()
+    assert [p for p in harness.client.payloads(TOPIC) if b"0.25" in p]
 
 
 # Silence
 
 
 @pytest.mark.timed
-async def test_the_stop_message_follows_silence_in_time(house, caplog):
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+async def test_the_stop_message_follows_silence_in_time(harness, caplog):
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     for _ in range(5):
         driver.steer()
         last = time.monotonic()
         await asyncio.sleep(AFTER / 2)
-    assert house.robot.received == [twist(0.5)] * 5
-    await until(lambda: house.robot.received[-1] == STOP)
+    assert harness.robot.received == [twist(0.5)] * 5
+    await until(lambda: harness.robot.received[-1] == STOP)
     assert AFTER <= time.monotonic() - last < AFTER + 0.05
     await asyncio.sleep(2 * AFTER)
-    assert len(house.robot.received) == 6  # once
-    assert house.counters().stops == 1
+    assert len(harness.robot.received) == 6  # once
+    assert harness.counters().stops == 1
     assert "fell silent for 0.1 s" in caplog.text
 
 
 @pytest.mark.parametrize("disconnect", [True, False])
-async def test_who_rests_before_it_drives_is_stopped_as_early(house, disconnect):
+async def test_who_rests_before_it_drives_is_stopped_as_early(harness, disconnect):
     """Who holds the lease rests: the timer waits for the lease's end, which is long after."""
     rules = CommandRules(exclusive=True, lease=600, on_silence=OnSilence(AFTER, "{}", disconnect))
-    house.start(rules)
-    driver, flow = Driver(house.broker, "a"), house.commands
-    driver.wire.connection = PeerStatus(silence=0.0)
+    harness.start(rules)
+    driver, flow = Driver(harness.broker, "a"), harness.commands
+    driver.wire.connection = Contact(silence=0.0)
     driver.steer()
     driver.steer(b"{}")
     await until(lambda: flow._timer.when() > flow._heard_at + 500)
     driver.steer()
-    await until(lambda: house.counters().stops == 1)
-    assert house.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
+    await until(lambda: harness.counters().stops == 1)
+    assert harness.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
     assert flow.commanding == "a"
 
 
-async def test_a_lease_that_ends_before_the_silence_is_too_long_is_seen_in_time(house):
+async def test_a_lease_that_ends_before_the_silence_is_too_long_is_seen_in_time(harness):
     """The timer was set for a command that nobody has the lease for: a retained one."""
-    house.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(600)))
-    house.commands._commanded(twist(0.5), None)
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(600)))
+    harness.commands._commanded(twist(0.5), None)
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    assert house.commands.commanding == "a"
-    await until(lambda: house.commands.commanding is None)
+    assert harness.commands.commanding == "a"
+    await until(lambda: harness.commands.commanding is None)
 
 
 @pytest.mark.parametrize("lease", [AFTER / 2, 600])
-async def test_the_timer_is_for_what_is_due_first(house, lease):
+async def test_the_timer_is_for_what_is_due_first(harness, lease):
     rules = CommandRules(exclusive=True, lease=lease, on_silence=OnSilence(AFTER, "{}", False))
-    house.start(rules)
-    driver = Driver(house.broker, "a")
+    harness.start(rules)
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    flow = house.commands
+    flow = harness.commands
     assert flow._timer.when() == flow._heard_at + min(lease, AFTER)
     # Steady driving sets no timer for each command.
     timer = flow._timer
@@ -560,47 +431,47 @@ def impatient(monkeypatch):
     monkeypatch.setattr(commands, "LOOK_AGAIN", 0.02)
 
 
-async def test_who_falls_silent_with_its_connection_is_disconnected(house, impatient):
+async def test_who_falls_silent_with_its_connection_is_disconnected(harness, impatient):
     """The network may have its commands yet, which are old by then."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
     await until(lambda: driver.wire.closed)
     assert driver.wire.probed
     assert driver.wire.written == Disconnect(0x98).encode(5)
     driver.drive()
-    assert house.robot.received == [twist(0.5), STOP]
-    driver = Driver(house.broker, "a")
+    assert harness.robot.received == [twist(0.5), STOP]
+    driver = Driver(harness.broker, "a")
     driver.drive()  # what it had queued, perhaps
-    assert house.counters().expired == 1
+    assert harness.counters().expired == 1
     await asyncio.sleep(AFTER + 0.02)
     driver.drive()
-    await until(lambda: house.robot.received[2:] == [twist(0.5)])
+    await until(lambda: harness.robot.received[2:] == [twist(0.5)])
 
 
 async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_and_stays(
-    house, impatient
+    harness, impatient
 ):
     """A button, Node-RED, the bridge of a mosquitto: they have nothing to say for now."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     for round_ in range(1, 4):
         driver.wire.connection = PeerStatus(silence=math.inf)
         driver.drive()
         await until(lambda: driver.wire.probed)
         driver.wire.probed = False
-        driver.wire.connection = PeerStatus(silence=0.0)
-        await until(lambda: not house.commands._asked)
+        driver.wire.connection = Contact(silence=0.0)
+        await until(lambda: not harness.commands._asked)
         await asyncio.sleep(0.4)
-        assert house.robot.received == [twist(0.5), STOP] * round_
+        assert harness.robot.received == [twist(0.5), STOP] * round_
     assert not driver.wire.closed
-    assert house.counters().expired == 0
+    assert harness.counters().expired == 0
 
 
-async def test_who_answered_before_it_was_asked_is_asked(house, impatient):
+async def test_who_answered_before_it_was_asked_is_asked(harness, impatient):
     """That its computer lived when it fell silent says nothing of now."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     begun = time.monotonic()
 
     class Wire(type(driver.wire)):
@@ -614,10 +485,10 @@ async def test_who_answered_before_it_was_asked_is_asked(house, impatient):
 
 @pytest.mark.parametrize("other_drives_on", [True, False])
 async def test_of_two_who_drive_each_that_falls_silent_is_disconnected(
-    house, impatient, other_drives_on
+    harness, impatient, other_drives_on
 ):
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.steer()
     b.steer()
 
@@ -629,163 +500,163 @@ async def test_of_two_who_drive_each_that_falls_silent_is_disconnected(
     await until(is_over)
     if not other_drives_on:
         await until(lambda: b.wire.closed)
-    expired = house.counters().expired
-    Driver(house.broker, "a").drive()  # what it had queued, perhaps
-    assert house.counters().expired == expired + 1
+    expired = harness.counters().expired
+    Driver(harness.broker, "a").drive()  # what it had queued, perhaps
+    assert harness.counters().expired == expired + 1
 
 
 @pytest.mark.parametrize("stops_itself", [True, False])
-async def test_who_has_stopped_or_may_be_silent_stays(house, stops_itself):
-    house.start(CommandRules(on_silence=OnSilence(AFTER, disconnect=stops_itself)))
-    driver = Driver(house.broker, "a")
+async def test_who_has_stopped_or_may_be_silent_stays(harness, stops_itself):
+    harness.start(CommandRules(on_silence=OnSilence(AFTER, disconnect=stops_itself)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
     if stops_itself:
         driver.steer(b"{}")
     await asyncio.sleep(2 * AFTER)
     assert not driver.wire.closed
-    assert house.robot.received[-1] == STOP
+    assert harness.robot.received[-1] == STOP
 
 
-async def test_a_stop_message_at_another_time_is_one_too(house):
+async def test_a_stop_message_at_another_time_is_one_too(harness):
     stamped = "geometry_msgs/msg/TwistStamped"
-    house.node.types = All()
+    harness.node.types = All()
     rules = CommandRules(on_silence=OnSilence(AFTER, '{"header": {"stamp": "now"}}'))
-    house.start(rules, type=stamped, found=stamped)
-    driver = Driver(house.broker, "a")
+    harness.start(rules, type=stamped, found=stamped)
+    driver = Driver(harness.broker, "a")
     driver.drive(b'{"header":{"stamp":{"sec":5},"frame_id":"base"}}')
-    await until(lambda: house.counters().stops)
+    await until(lambda: harness.counters().stops)
     assert not driver.wire.closed
-    seconds = struct.unpack_from("<i", house.robot.received[-1], 4)[0]
+    seconds = struct.unpack_from("<i", harness.robot.received[-1], 4)[0]
     assert abs(seconds - time.time()) < 5
 
 
 @pytest.mark.parametrize("expiry", [0, 100])
-async def test_the_stop_message_follows_a_lost_connection_at_once(house, expiry):
-    house.start(CommandRules(on_silence=OnSilence(60), expire=1))
-    driver = Driver(house.broker, "a", expiry=expiry, will=Will(TOPIC, GO))
+async def test_the_stop_message_follows_a_lost_connection_at_once(harness, expiry):
+    harness.start(CommandRules(on_silence=OnSilence(60), expire=1))
+    driver = Driver(harness.broker, "a", expiry=expiry, will=Will(TOPIC, GO))
     driver.steer()
     driver.cut()
-    assert house.robot.received == [twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_who_leaves_without_having_driven_stops_nobody(house):
-    house.start(CommandRules(on_silence=OnSilence(60)))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_who_leaves_without_having_driven_stops_nobody(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60)))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     b.steer()
     a.steer()
     b.cut()
-    assert house.robot.received == [twist(0.5)] * 2
+    assert harness.robot.received == [twist(0.5)] * 2
     a.say(Disconnect())
-    assert house.robot.received[-1] == STOP
+    assert harness.robot.received[-1] == STOP
 
 
-async def test_a_lost_lease_stops_as_well(house):
-    house.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(60)))
-    Driver(house.broker, "a").steer()
-    await until(lambda: house.robot.received[-1] == STOP)
+async def test_a_lost_lease_stops_as_well(harness):
+    harness.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(60)))
+    Driver(harness.broker, "a").steer()
+    await until(lambda: harness.robot.received[-1] == STOP)
 
 
-async def test_once_at_the_start(house):
-    house.start(CommandRules(on_silence=OnSilence(60)))
-    house.node.spin()
-    await house.settle()
-    assert house.robot.received == [STOP]
+async def test_once_at_the_start(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60)))
+    harness.node.spin()
+    await harness.settle()
+    assert harness.robot.received == [STOP]
     for _ in range(5):
-        house.node.spin()
-        await house.settle()
-    assert house.robot.received == [STOP]
-    assert house.counters().stops == 1
+        harness.node.spin()
+        await harness.settle()
+    assert harness.robot.received == [STOP]
+    assert harness.counters().stops == 1
 
 
-async def test_a_command_that_is_there_first_is_not_stopped_by_the_start(house):
-    house.start(CommandRules(on_silence=OnSilence(60)))
-    Driver(house.broker, "a").steer()
+async def test_a_command_that_is_there_first_is_not_stopped_by_the_start(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60)))
+    Driver(harness.broker, "a").steer()
     for _ in range(5):
-        house.node.spin()
-        await house.settle()
-    assert house.robot.received == [twist(0.5)]
+        harness.node.spin()
+        await harness.settle()
+    assert harness.robot.received == [twist(0.5)]
 
 
-async def test_the_end_of_the_route_or_the_bridge_stops_who_is_driven(house):
+async def test_the_end_of_the_route_or_the_bridge_stops_who_is_driven(harness):
     rules = CommandRules(on_silence=OnSilence(60))
-    bridge = house.start(rules)
-    told = len(house.broker.departures)
-    Driver(house.broker, "a").steer()
+    bridge = harness.start(rules)
+    told = len(harness.broker.departures)
+    Driver(harness.broker, "a").steer()
     bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=CommandRules(expire=1))])
-    assert house.robot.received == [twist(0.5), STOP]
-    assert len(house.broker.departures) == told
-    house.node.spin()
+    assert harness.robot.received == [twist(0.5), STOP]
+    assert len(harness.broker.departures) == told
+    harness.node.spin()
     bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
-    house.node.spin()
-    Driver(house.broker, "b").steer()
+    harness.node.spin()
+    Driver(harness.broker, "b").steer()
     await bridge.stop()
-    assert house.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
 
 
-async def test_who_fell_silent_is_disconnected_though_its_route_has_changed(house, impatient):
-    bridge = house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    stalled, gone = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_who_fell_silent_is_disconnected_though_its_route_has_changed(harness, impatient):
+    bridge = harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    stalled, gone = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     gone.steer()
     gone.cut()
     stalled.steer()
     rules = CommandRules(on_silence=OnSilence(2 * AFTER))
     bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules)])
     await until(lambda: stalled.wire.closed)
-    house.node.spin()
-    expired = house.counters().expired
+    harness.node.spin()
+    expired = harness.counters().expired
     for name in ("a", "b"):
-        Driver(house.broker, name).drive()  # what they had queued, perhaps
-    assert house.counters().expired == expired + 2
+        Driver(harness.broker, name).drive()  # what they had queued, perhaps
+    assert harness.counters().expired == expired + 2
 
 
-async def test_a_lease_and_a_driver_survive_a_reload(house):
+async def test_a_lease_and_a_driver_survive_a_reload(harness):
     rules = CommandRules(exclusive=True, on_silence=OnSilence(60))
     settings = TopicSettings("/cmd_vel", "ros", "r2d2{ros}", TWIST, rules=rules)
-    bridge = house.start(rules)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    bridge = harness.start(rules)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.steer()
     bridge.replace([settings, TopicSettings("/new", "mqtt", "r2d2{ros}")])
-    house.node.spin()
+    harness.node.spin()
     b.steer(qos=1)
     assert b.code == 0x87
-    assert house.robot.received == [twist(0.5)]
+    assert harness.robot.received == [twist(0.5)]
     a.cut()
-    assert house.robot.received == [twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_a_stop_message_that_ros_does_not_take_is_tried_until_it_does(house):
-    house.start(CommandRules(on_silence=OnSilence(60)))
-    driver = Driver(house.broker, "a")
+async def test_a_stop_message_that_ros_does_not_take_is_tried_until_it_does(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    (publisher,) = house.node.own_publishers
+    (publisher,) = harness.node.own_publishers
     publisher.error = "the transport is full"
     driver.cut()
     await asyncio.sleep(0.12)
-    assert house.robot.received == [twist(0.5)]
+    assert harness.robot.received == [twist(0.5)]
     publisher.error = None
-    await until(lambda: house.robot.received[-1] == STOP)
+    await until(lambda: harness.robot.received[-1] == STOP)
 
 
-async def test_a_stop_message_that_is_due_while_its_publisher_is_set_up_anew(house):
-    bridge = house.start(CommandRules(on_silence=OnSilence(60)))
-    driver = Driver(house.broker, "a")
+async def test_a_stop_message_that_is_due_while_its_publisher_is_set_up_anew(harness):
+    bridge = harness.start(CommandRules(on_silence=OnSilence(60)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
     (commands,) = bridge._to_ros.values()
     away, commands._out = commands._out, None
     driver.cut()
     await asyncio.sleep(0.06)
-    assert house.robot.received == [twist(0.5)]
+    assert harness.robot.received == [twist(0.5)]
     commands._out = away
-    await until(lambda: house.robot.received[-1] == STOP)
+    await until(lambda: harness.robot.received[-1] == STOP)
 
 
-async def test_when_ros_is_lost_there_is_nobody_to_be_stopped(house):
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+async def test_when_ros_is_lost_there_is_nobody_to_be_stopped(harness):
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    house.node.fail("gone")
+    harness.node.fail("gone")
     await asyncio.sleep(2 * AFTER)
-    assert house.robot.received == [twist(0.5)]
+    assert harness.robot.received == [twist(0.5)]
 
 
 @pytest.mark.parametrize(
@@ -795,80 +666,80 @@ async def test_when_ros_is_lost_there_is_nobody_to_be_stopped(house):
         (f'{{"linear":{{"x":{10**400}}}}}', "not JSON: number is infinity"),
     ],
 )
-async def test_a_stop_message_that_the_type_has_not_is_told(house, caplog, stop, problem):
-    house.start(CommandRules(on_silence=OnSilence(1, stop)))
-    await house.settle()
+async def test_a_stop_message_that_the_type_has_not_is_told(harness, caplog, stop, problem):
+    harness.start(CommandRules(on_silence=OnSilence(1, stop)))
+    await harness.settle()
     assert f"on_silence.publish: {problem}" in caplog.text
-    Driver(house.broker, "a").drive()
-    assert house.robot.received == []
+    Driver(harness.broker, "a").drive()
+    assert harness.robot.received == []
 
 
 # Fields
 
 
-async def test_numbers_are_clamped(house, caplog):
+async def test_numbers_are_clamped(harness, caplog):
     rules = CommandRules(clamp=(("linear.x", -0.5, 1.0), ("angular.z", 0.0, 0.0)))
-    house.start(rules)
-    driver = Driver(house.broker, "a")
+    harness.start(rules)
+    driver = Driver(harness.broker, "a")
     for x in (0.25, 7, -7, 1e308):
         driver.drive(b'{"linear":{"x":%r},"angular":{"z":1}}' % x)
-    assert house.robot.received == [twist(x) for x in (0.25, 1.0, -0.5, 1.0)]
-    counters = house.counters()
+    assert harness.robot.received == [twist(x) for x in (0.25, 1.0, -0.5, 1.0)]
+    counters = harness.counters()
     assert (counters.clamped, counters.messages, counters.refused) == (4, 4, 0)
-    await house.settle()
+    await harness.settle()
     assert len([r for r in caplog.records if "clamped" in r.getMessage()]) == 1
 
 
 @pytest.mark.parametrize(("x", "refused"), [(b"null", 1), (b"1e999", 0)])
-async def test_no_number_at_all_is_refused_where_it_is_clamped(house, x, refused):
-    house.start(CommandRules(clamp=(("linear.x", -0.5, 1.0),)))
-    Driver(house.broker, "a").drive(b'{"linear":{"x":%s}}' % x)
-    assert house.robot.received == []
-    assert (house.counters().refused, house.counters().errors) == (refused, 1 - refused)
+async def test_no_number_at_all_is_refused_where_it_is_clamped(harness, x, refused):
+    harness.start(CommandRules(clamp=(("linear.x", -0.5, 1.0),)))
+    Driver(harness.broker, "a").drive(b'{"linear":{"x":%s}}' % x)
+    assert harness.robot.received == []
+    assert (harness.counters().refused, harness.counters().errors) == (refused, 1 - refused)
 
 
-async def test_cdr_is_clamped_as_well(house):
+async def test_cdr_is_clamped_as_well(harness):
     rules = CommandRules(clamp=(("linear.x", -0.5, 1.0),))
     settings = TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, encoding="cdr", rules=rules)
-    super(CommandHouse, house).start(settings)
-    robot = house.node.add_subscriber("/cmd_vel", TWIST)
-    driver = Driver(house.broker, "a")
+    super(CommandHarness, harness).start(settings)
+    robot = harness.node.add_subscriber("/cmd_vel", TWIST)
+    driver = Driver(harness.broker, "a")
     driver.drive(twist(3, 1))
     driver.drive(twist(float("inf")))
     driver.drive(twist(float("nan")))
     assert robot.received == [twist(1, 1)]
-    assert (house.counters().refused, house.counters().errors) == (2, 0)
+    assert (harness.counters().refused, harness.counters().errors) == (2, 0)
 
 
-async def test_only_some_values_are_allowed(house):
-    house.start(CommandRules(allow=(("data", ("auto", "manual")),)), type=STRING, found=STRING)
-    driver = Driver(house.broker, "a")
+async def test_only_some_values_are_allowed(harness):
+    harness.start(CommandRules(allow=(("data", ("auto", "manual")),)), type=STRING, found=STRING)
+    driver = Driver(harness.broker, "a")
     driver.drive(b'{"data":"auto"}')
     driver.drive(b'{"data":"kill"}')
-    assert len(house.robot.received) == 1
+    assert len(harness.robot.received) == 1
     # Each is counted once: what breaks a rule is no error.
-    assert (house.counters().refused, house.counters().errors) == (1, 0)
-    assert "'kill' is not allowed, only auto, manual" in house.counters().last_error
+    assert (harness.counters().refused, harness.counters().errors) == (1, 0)
+    assert "'kill' is not allowed, only auto, manual" in harness.counters().last_error
 
 
 @pytest.mark.parametrize("qos", [0, 2])
 @pytest.mark.parametrize(
     "limit", [{"clamp": (("linear.x", 0.1, 0.5),)}, {"allow": (("linear.x", (0.1, 0.5)),)}]
 )
-async def test_the_stop_message_is_published_as_it_is(house, limit, qos):
+async def test_the_stop_message_is_published_as_it_is(harness, limit, qos):
     """Neither clamped, which would make it a movement, nor refused."""
-    house.start(CommandRules(on_silence=OnSilence(60), **limit))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(60), **limit))
+    driver = Driver(harness.broker, "a")
     driver.steer()
     driver.drive(b"{}", qos)
     if qos:
         driver.say(Pubrel(7))
-    assert house.robot.received == [twist(0.5), STOP]
-    counters = house.counters()
+    assert harness.robot.received == [twist(0.5), STOP]
+    counters = harness.counters()
     assert (counters.clamped, counters.refused, counters.errors) == (0, 0, 0)
     # What only looks like it where it is limited is limited.
     driver.steer(b'{"angular":{"z":1}}')
-    assert house.robot.received[2:] == ([twist(0.1, 1)] if "clamp" in limit else [])
+    assert harness.robot.received[2:] == ([twist(0.1, 1)] if "clamp" in limit else [])
 
 
 def limits(type_name, **kw):
@@ -917,22 +788,22 @@ def test_limits_that_a_type_cannot_have(type_name, rules, problem):
         limits(type_name, **rules)
 
 
-async def test_no_answer_to_a_call_is_a_command(house):
+async def test_no_answer_to_a_call_is_a_command(harness):
     """It would come late, as the appliance's own, and outlive the client that asked for it."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    dispatcher = house.bridge.calls.dispatcher
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    dispatcher = harness.bridge.calls.dispatcher
 
     async def slow():
         return Answer(GO)
 
     endpoint = CallEndpoint("r2d2/slow/_call", "slow", 1.0, CallCounters(), lambda call: slow)
     dispatcher.register(endpoint)
-    driver = Driver(house.broker, "a")
+    driver = Driver(harness.broker, "a")
     properties = {Property.RESPONSE_TOPIC: TOPIC}
     driver.say(Publish("r2d2/slow/_call", b"", properties=properties))
     await asyncio.sleep(0.02)
     dispatcher.unregister(endpoint)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 class TestBacklog:
@@ -964,57 +835,59 @@ class TestBacklog:
         assert 150 < heard < 161
 
 
-async def test_what_a_driver_had_queued_that_comes_back_unmarked(house):
+async def test_what_a_driver_had_queued_that_comes_back_unmarked(harness):
     """Libraries queue what is said without a connection, and send it as if it were new."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
     driver.cut()
-    assert house.robot.received == [twist(0.5), STOP]
-    driver = Driver(house.broker, "a")
+    assert harness.robot.received == [twist(0.5), STOP]
+    driver = Driver(harness.broker, "a")
     driver.say(*[Publish(TOPIC, GO, qos=1, packet_id=7)] * 50)
-    assert house.counters().expired == 50
+    assert harness.counters().expired == 50
     await asyncio.sleep(1.2 * AFTER)
     driver.drive(b"{}")  # it stops by itself, and is trusted when it comes back
-    assert house.robot.received == [twist(0.5), STOP, STOP]
+    assert harness.robot.received == [twist(0.5), STOP, STOP]
     driver.cut()
-    Driver(house.broker, "a").drive()
-    await until(lambda: house.robot.received == [twist(0.5), STOP, STOP, twist(0.5)])
+    Driver(harness.broker, "a").drive()
+    await until(lambda: harness.robot.received == [twist(0.5), STOP, STOP, twist(0.5)])
 
 
-async def test_a_stop_message_that_may_have_been_lost_is_published_again(house):
+async def test_a_stop_message_that_may_have_been_lost_is_published_again(harness):
     """A publisher that was made anew has not found the robot yet: what it sends goes nowhere."""
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    house.node.spin()
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    harness.node.spin()
+    driver = Driver(harness.broker, "a")
     driver.steer()
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL)
-    house.node.add_subscriber("/cmd_vel", TWIST, latched)  # for which the publisher is made anew
-    house.robot.received.clear()
+    harness.node.add_subscriber("/cmd_vel", TWIST, latched)  # for which the publisher is made anew
+    harness.robot.received.clear()
     driver.cut()
-    assert house.robot.received == [STOP]
+    assert harness.robot.received == [STOP]
     for _ in range(3):
-        house.node.spin()
+        harness.node.spin()
         await asyncio.sleep(0.01)
-    assert house.robot.received == [STOP, STOP]
+    assert harness.robot.received == [STOP, STOP]
 
 
-async def test_retained_commands_of_more_topics_than_one_turn_is_for(house):
+async def test_retained_commands_of_more_topics_than_one_turn_is_for(harness):
     """A network client goes on in its next turn; the bridge has to be given one."""
     rules = CommandRules(take_retained=True)
     names = [f"/arm/joint_{number}" for number in range(300)]
     for name in names:
-        house.client.send(f"r2d2{name}", GO, retain=True)
-    robots = [FakePeer(house.node, name, Endpoint("/robot", TWIST, QosProfile())) for name in names]
-    house.node.remote_subscribers += robots
-    House.start(
-        house, *(TopicSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
+        harness.client.send(f"r2d2{name}", GO, retain=True)
+    robots = [
+        FakePeer(harness.node, name, Endpoint("/robot", TWIST, QosProfile())) for name in names
+    ]
+    harness.node.remote_subscribers += robots
+    Harness.start(
+        harness, *(TopicSettings(name, "ros", "r2d2{ros}", TWIST, rules=rules) for name in names)
     )
     for _ in range(3):
-        house.node.spin()
-        await house.settle()
+        harness.node.spin()
+        await harness.settle()
     assert [robot.received for robot in robots] == [[twist(0.5)]] * 300
-    house.client.send(f"r2d2{names[-1]}", b"{}")  # nothing is left that others would wait behind
+    harness.client.send(f"r2d2{names[-1]}", b"{}")  # nothing is left that others would wait behind
     assert robots[-1].received == [twist(0.5), STOP]
 
 
@@ -1028,29 +901,29 @@ def test_a_bound_that_is_next_to_zero(low, high):
 
 
 @pytest.mark.parametrize("now", [b"", b'{"linear":{"x":0.1}}'])
-async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(house, now):
-    house.client.send(TOPIC, GO, retain=True)
+async def test_a_retained_command_that_is_taken_back_before_the_robot_is_there(harness, now):
+    harness.client.send(TOPIC, GO, retain=True)
     rules = CommandRules(take_retained=True)
-    House.start(house, TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
-    await house.settle()
-    house.client.send(TOPIC, now, retain=True)
-    robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    Harness.start(harness, TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules))
+    await harness.settle()
+    harness.client.send(TOPIC, now, retain=True)
+    robot = harness.node.add_subscriber("/cmd_vel", TWIST)
     robot.received.clear()
     for _ in range(3):
-        house.node.spin()
-        await house.settle()
+        harness.node.spin()
+        await harness.settle()
     assert robot.received == ([twist(0.1)] if now else [])
 
 
-async def test_what_a_driver_had_queued_while_the_appliance_was_away(house):
-    away = Driver(house.broker, "a", clean=False, expiry=60)
+async def test_what_a_driver_had_queued_while_the_appliance_was_away(harness):
+    away = Driver(harness.broker, "a", clean=False, expiry=60)
     away.cut()
-    house.start(CommandRules(on_silence=OnSilence(AFTER)))
-    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    harness.start(CommandRules(on_silence=OnSilence(AFTER)))
+    driver = Driver(harness.broker, "a", clean=False, expiry=60)
     driver.say(*[Publish(TOPIC, GO, qos=1, packet_id=7)] * 50)
-    assert house.counters().expired == 50
-    Driver(house.broker, "b").steer()
-    assert house.robot.received == [twist(0.5)]
+    assert harness.counters().expired == 50
+    Driver(harness.broker, "b").steer()
+    assert harness.robot.received == [twist(0.5)]
 
 
 # Arrivals: on times of their own
@@ -1382,205 +1255,205 @@ def test_sent_at_is_said_once_or_not_at_all():
 @pytest.mark.parametrize("qos", [0, 1])
 @pytest.mark.parametrize("version", [4, 5])
 @pytest.mark.parametrize("rules", [CommandRules(expire=0.5), None])
-async def test_a_queue_behind_connect(house, version, qos, rules):
-    house.start(rules or CommandRules(on_silence=OnSilence(0.5)))
-    driver = Driver(house.broker, "never seen", version)
+async def test_a_queue_behind_connect(harness, version, qos, rules):
+    harness.start(rules or CommandRules(on_silence=OnSilence(0.5)))
+    driver = Driver(harness.broker, "never seen", version)
     commands = [Publish(TOPIC, GO, qos=qos, packet_id=n if qos else None) for n in (1, 2, 3)]
     driver.say(*commands)  # all that there is in one segment
-    await until(lambda: house.counters().expired == 3)
+    await until(lambda: harness.counters().expired == 3)
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
-    (topic,) = house.bridge.topics()
+    assert harness.robot.received == []
+    (topic,) = harness.bridge.topics()
     assert topic.last_error == "a command was too old: others came with it at once, as of a queue"
 
 
-async def test_what_came_at_once_is_a_queue_however_long_it_takes(house, monkeypatch):
+async def test_what_came_at_once_is_a_queue_however_long_it_takes(harness, monkeypatch):
     """On a busy computer, a turn of the loop may be as long as the time between two commands."""
-    house.start(CommandRules(expire=0.5))
-    convert = house.commands._convert
+    harness.start(CommandRules(expire=0.5))
+    convert = harness.commands._convert
 
     def slowly(message, origin):
         time.sleep(0.02)
         return convert(message, origin)
 
-    monkeypatch.setattr(house.commands, "_convert", slowly)
-    Driver(house.broker, "a").say(*[Publish(TOPIC, GO)] * 5)
+    monkeypatch.setattr(harness.commands, "_convert", slowly)
+    Driver(harness.broker, "a").say(*[Publish(TOPIC, GO)] * 5)
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 @pytest.mark.parametrize("client", ["a", "b"])
-async def test_a_client_id_that_is_taken_over(house, client):
+async def test_a_client_id_that_is_taken_over(harness, client):
     """The connection is another: what waits of the first is not carried out, and it begins anew."""
-    house.start(CommandRules(expire=0.5))
-    first = Driver(house.broker, "a", clean=False, expiry=60)
+    harness.start(CommandRules(expire=0.5))
+    first = Driver(harness.broker, "a", clean=False, expiry=60)
     first.drive(b'{"linear":{"x":9}}')
-    other = Driver(house.broker, client, clean=False, expiry=60)
+    other = Driver(harness.broker, client, clean=False, expiry=60)
     other.say(*[Publish(TOPIC, GO)] * 3)
     await asyncio.sleep(0.3)
-    assert house.robot.received == ([] if client == "a" else [twist(9)])
+    assert harness.robot.received == ([] if client == "a" else [twist(9)])
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
 @pytest.mark.parametrize("version", [4, 5])
 @pytest.mark.parametrize("leaves", [False, True])
-async def test_a_single_command_behind_connect(house, version, qos, leaves):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "never seen", version)
-    before = house.broker.accounting.queued_bytes
+async def test_a_single_command_behind_connect(harness, version, qos, leaves):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "never seen", version)
+    before = harness.broker.accounting.queued_bytes
     driver.drive(qos=qos)
     if qos == 2:
         driver.say(Pubrel(7))
     if leaves:  # as mosquitto_pub does
         driver.leave()
-        assert house.robot.received == [twist(0.5)]
-    await until(lambda: house.robot.received == [twist(0.5)])
-    assert house.broker.accounting.queued_bytes == before
+        assert harness.robot.received == [twist(0.5)]
+    await until(lambda: harness.robot.received == [twist(0.5)])
+    assert harness.broker.accounting.queued_bytes == before
 
 
-async def test_a_single_command_and_a_cut(house):
+async def test_a_single_command_and_a_cut(harness):
     """It may have been the first of a queue."""
-    house.start(CommandRules(expire=0.5))
-    before = house.broker.accounting.queued_bytes
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(expire=0.5))
+    before = harness.broker.accounting.queued_bytes
+    driver = Driver(harness.broker, "a")
     driver.drive()
     driver.cut()
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
-    assert house.counters().expired == 1
-    assert house.broker.accounting.queued_bytes == before
-    assert house.commands._arrivals._paces == {}
+    assert harness.robot.received == []
+    assert harness.counters().expired == 1
+    assert harness.broker.accounting.queued_bytes == before
+    assert harness.commands._arrivals._paces == {}
 
 
-def start_two(house, mqtt="r2d2/arm"):
+def start_two(harness, mqtt="r2d2/arm"):
     """Two routes to ROS; gives what the second's node receives."""
     rules = CommandRules(expire=0.5)
     routes = [
         TopicSettings(ros, "ros", topic, TWIST, rules=rules)
         for ros, topic in (("/cmd_vel", TOPIC), ("/arm", mqtt))
     ]
-    House.start(house, *routes)
-    house.robot = house.node.add_subscriber("/cmd_vel", TWIST)
-    return house.node.add_subscriber("/arm", TWIST)
+    Harness.start(harness, *routes)
+    harness.robot = harness.node.add_subscriber("/cmd_vel", TWIST)
+    return harness.node.add_subscriber("/arm", TWIST)
 
 
 @pytest.mark.parametrize("count", [1, 60])
-async def test_what_is_known_of_a_client_holds_for_all_topics(house, count):
+async def test_what_is_known_of_a_client_holds_for_all_topics(harness, count):
     """It has one queue for them."""
-    arm = start_two(house)
-    await house.settle()
-    driver = Driver(house.broker, "a")
+    arm = start_two(harness)
+    await harness.settle()
+    driver = Driver(harness.broker, "a")
     driver.say(*[Publish(TOPIC, GO)] * count, Publish("r2d2/arm", GO))
     await asyncio.sleep(0.3)
-    assert house.robot.received == arm.received == []
+    assert harness.robot.received == arm.received == []
     for _ in range(5):
         await asyncio.sleep(0.05)
         driver.drive()
-    assert house.robot.received == [twist(0.5)] * 4
+    assert harness.robot.received == [twist(0.5)] * 4
     driver.say(Publish("r2d2/arm", GO))
     assert arm.received == [twist(0.5)]
 
 
-async def test_a_command_to_two_ros_topics_is_one(house):
-    arm = start_two(house, TOPIC)
-    await house.settle()
-    driver = Driver(house.broker, "a")
+async def test_a_command_to_two_ros_topics_is_one(harness):
+    arm = start_two(harness, TOPIC)
+    await harness.settle()
+    driver = Driver(harness.broker, "a")
     driver.drive()
-    await until(lambda: house.robot.received == arm.received == [twist(0.5)])
+    await until(lambda: harness.robot.received == arm.received == [twist(0.5)])
     await asyncio.sleep(0.5)
     driver.say(*[Publish(TOPIC, GO)] * 2)
     await asyncio.sleep(0.3)
-    assert house.robot.received == arm.received == [twist(0.5)]
+    assert harness.robot.received == arm.received == [twist(0.5)]
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
-async def test_who_drives_and_was_not_read_for_a_time(house, qos):
+async def test_who_drives_and_was_not_read_for_a_time(harness, qos):
     """Of QoS 2, that is known when the command comes, and not when it is released."""
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus()
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact()
     for _ in range(5):
         driver.drive(qos=qos)
         if qos == 2:
             driver.say(Pubrel(7))
         await asyncio.sleep(0.06)
-    assert house.robot.received
-    house.robot.received.clear()
-    driver.wire.connection = PeerStatus(held=3.0)
+    assert harness.robot.received
+    harness.robot.received.clear()
+    driver.wire.connection = Contact(held=3.0)
     commands = [Publish(TOPIC, GO, qos=qos, packet_id=n if qos else None) for n in (1, 2)]
     driver.say(*commands)
     driver.wire.connection = PeerStatus()
     if qos == 2:
         driver.say(Pubrel(1), Pubrel(2))
     await asyncio.sleep(0.3)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
-async def test_a_qos_2_command_is_not_single_when_another_comes_that_is_released_late(house):
+async def test_a_qos_2_command_is_not_single_when_another_comes_that_is_released_late(harness):
     """Its PUBREC is withheld, to see whether its client waits for that."""
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
     driver.drive(qos=2)
     driver.say(Pubrel(7))
     await asyncio.sleep(0.05)
     driver.say(Publish(TOPIC, GO, qos=2, packet_id=8))
     await asyncio.sleep(0.3)
-    assert house.robot.received == []
+    assert harness.robot.received == []
     driver.say(Pubrel(8))
     await asyncio.sleep(0.3)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
-async def test_a_stream_that_begins_is_no_reason_to_warn(house, caplog, qos):
-    house.start(CommandRules(expire=5))
+async def test_a_stream_that_begins_is_no_reason_to_warn(harness, caplog, qos):
+    harness.start(CommandRules(expire=5))
     caplog.set_level(logging.INFO)
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus()
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact()
     for number in range(5):
         driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None))
         if qos == 2:
             driver.say(Pubrel(number + 1))
         await asyncio.sleep(0.02)
-    assert house.robot.received == [twist(0.5)] * 3
-    assert house.counters().expired == 0
-    assert house.counters().last_error is None
+    assert harness.robot.received == [twist(0.5)] * 3
+    assert harness.counters().expired == 0
+    assert harness.counters().last_error is None
     assert "a stream is carried out from its third command on" in caplog.text
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
     driver.say(*[Publish(TOPIC, GO)] * 3)  # it is known
-    other = Driver(house.broker, "b")
+    other = Driver(harness.broker, "b")
     other.say(*[Publish(TOPIC, GO)] * 3)  # and this is a queue
-    assert house.counters().expired == 3
+    assert harness.counters().expired == 3
 
 
 @pytest.mark.parametrize("pauses", [False, True])
-async def test_a_command_with_something_else_behind_it(house, pauses):
+async def test_a_command_with_something_else_behind_it(harness, pauses):
     """A first command waits for what else there is, and that may be a picture."""
-    house.start(CommandRules(expire=0.3))
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus(flowing=60.0)
+    harness.start(CommandRules(expire=0.3))
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact(flowing=60.0)
     driver.drive()
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
+    assert harness.robot.received == []
     if pauses:
-        driver.wire.connection = PeerStatus(flowing=0.05)
-        await until(lambda: house.robot.received == [twist(0.5)])
+        driver.wire.connection = Contact(flowing=0.05)
+        await until(lambda: harness.robot.received == [twist(0.5)])
     else:
-        await until(lambda: house.counters().expired == 1)
-        assert house.robot.received == []
+        await until(lambda: harness.counters().expired == 1)
+        assert harness.robot.received == []
 
 
-async def test_the_stop_message_is_heard_at_once_whatever_comes_with_it(house):
-    house.start(CommandRules(on_silence=OnSilence(0.5)))
-    driver = Driver(house.broker, "a")
+async def test_the_stop_message_is_heard_at_once_whatever_comes_with_it(harness):
+    harness.start(CommandRules(on_silence=OnSilence(0.5)))
+    driver = Driver(harness.broker, "a")
     driver.drive(b"{}")
-    assert house.robot.received == [STOP]
+    assert harness.robot.received == [STOP]
     driver.drive()
     driver.drive()
     driver.drive(b"{}")
-    assert house.robot.received == [STOP, STOP]
+    assert harness.robot.received == [STOP, STOP]
     await asyncio.sleep(0.2)
-    assert house.robot.received == [STOP, STOP]
+    assert harness.robot.received == [STOP, STOP]
 
 
 def made(seconds_ago):
@@ -1590,9 +1463,9 @@ def made(seconds_ago):
 @pytest.mark.parametrize("qos", [1, 2])
 @pytest.mark.parametrize("padding", [b"", b" " * 5000])
 @pytest.mark.parametrize("way", ["dup", "sent-at"])
-async def test_an_old_stop_message_is_carried_out(house, way, padding, qos):
-    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_an_old_stop_message_is_carried_out(harness, way, padding, qos):
+    harness.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(harness.broker, "a")
     old = {"dup": True} if way == "dup" else {"properties": made(61)}
     driver.steer()
     driver.drive(b"{}" + padding, qos=qos, **old)
@@ -1600,79 +1473,79 @@ async def test_an_old_stop_message_is_carried_out(house, way, padding, qos):
     if qos == 2:
         driver.say(Pubrel(7))
     if not padding:
-        assert house.robot.received == [twist(0.5), STOP]
+        assert harness.robot.received == [twist(0.5), STOP]
     # A large one was converted for its PUBREC, and is again when it is its turn.
-    await until(lambda: house.robot.received == [twist(0.5), STOP])
-    assert house.counters().expired == 0
+    await until(lambda: harness.robot.received == [twist(0.5), STOP])
+    assert harness.counters().expired == 0
     # It shows a queue all the same: another command that comes with it is old.
     driver.drive(GO)
-    assert house.robot.received == [twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_a_stop_message_that_waited_behind_a_slow_reader_is_carried_out(house):
-    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_a_stop_message_that_waited_behind_a_slow_reader_is_carried_out(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    late = DelayedMessage(Message(TOPIC, b"{}", 1), 5.0)
-    assert house.commands.receive(late, False, driver.client.session, 9) is None
-    assert house.robot.received == [twist(0.5), STOP]
-    late = DelayedMessage(Message(TOPIC, GO, 1), 5.0)
-    assert house.commands.receive(late, False, driver.client.session, 9) is not None
-    assert house.robot.received == [twist(0.5), STOP]
+    late = Late(Message(TOPIC, b"{}", 1), 5.0)
+    assert harness.commands.receive(late, False, driver.client.session, 9) is None
+    assert harness.robot.received == [twist(0.5), STOP]
+    late = Late(Message(TOPIC, GO, 1), 5.0)
+    assert harness.commands.receive(late, False, driver.client.session, 9) is not None
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_a_will_that_stops_the_robot(house):
-    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
-    gone = Driver(house.broker, "gone", will=Will(TOPIC, b"{}"))
-    Driver(house.broker, "a").steer()
+async def test_a_will_that_stops_the_robot(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    gone = Driver(harness.broker, "gone", will=Will(TOPIC, b"{}"))
+    Driver(harness.broker, "a").steer()
     gone.cut()
-    assert house.robot.received == [twist(0.5), STOP]
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_a_stop_message_that_mqtt_has_expired_is_not_carried_out(house):
-    house.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_a_stop_message_that_mqtt_has_expired_is_not_carried_out(harness):
+    harness.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
+    driver = Driver(harness.broker, "a")
     driver.drive(b"{}", qos=1, properties={Property.MESSAGE_EXPIRY_INTERVAL: 0})
     assert driver.code == 0x83
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
-async def test_what_waits_is_not_carried_out_behind_a_stop(house):
-    house.start(CommandRules(on_silence=OnSilence(0.5)))
-    driver = Driver(house.broker, "a")
+async def test_what_waits_is_not_carried_out_behind_a_stop(harness):
+    harness.start(CommandRules(on_silence=OnSilence(0.5)))
+    driver = Driver(harness.broker, "a")
     driver.drive()
     driver.drive(b"{}")
     await asyncio.sleep(0.2)
-    assert house.robot.received == [STOP]
+    assert harness.robot.received == [STOP]
 
 
-async def test_what_has_come_and_was_not_read_is_behind_it(house):
+async def test_what_has_come_and_was_not_read_is_behind_it(harness):
     """The loop was busy: its timers are early, and its clients late."""
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus(has_unread=True)
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact(has_unread=True)
     driver.drive()
     await asyncio.sleep(0.2)
     driver.drive()
     driver.wire.connection = PeerStatus()
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
-    assert house.counters().expired == 2
+    assert harness.robot.received == []
+    assert harness.counters().expired == 2
 
 
-async def test_what_waits_for_ever_behind_it(house):
-    house.start(CommandRules(expire=0.15))
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus(has_unread=True)
+async def test_what_waits_for_ever_behind_it(harness):
+    harness.start(CommandRules(expire=0.15))
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact(has_unread=True)
     driver.drive()
-    await until(lambda: house.counters().expired == 1)
-    assert house.robot.received == []
+    await until(lambda: harness.counters().expired == 1)
+    assert harness.robot.received == []
 
 
-async def test_what_waits_takes_memory_that_is_counted(house, monkeypatch):
-    house.start(CommandRules(expire=0.5))
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
-    accounting, account = house.broker.accounting, a.client.session.account
+async def test_what_waits_takes_memory_that_is_counted(harness, monkeypatch):
+    harness.start(CommandRules(expire=0.5))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
+    accounting, account = harness.broker.accounting, a.client.session.account
     before, own = accounting.queued_bytes, account.bytes
     a.drive()
     assert accounting.queued_bytes >= before + len(GO) + len(twist())
@@ -1680,9 +1553,9 @@ async def test_what_waits_takes_memory_that_is_counted(house, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Accounting, "fits", lambda *_: False)
         b.drive()
-    await until(lambda: house.robot.received == [twist(0.5)])
+    await until(lambda: harness.robot.received == [twist(0.5)])
     assert (accounting.queued_bytes, account.bytes) == (before, own)
-    assert "no memory" in house.counters().last_error
+    assert "no memory" in harness.counters().last_error
 
 
 # Large commands are converted one a turn
@@ -1703,24 +1576,24 @@ def code(driver, payload, **kw):
     return driver.code
 
 
-def make_busy(house):
-    other = Driver(house.broker, "somebody else")
+def make_busy(harness):
+    other = Driver(harness.broker, "somebody else")
     other.steer(ANOTHER)
-    assert house.robot.received.pop() == twist(0.25)
+    assert harness.robot.received.pop() == twist(0.25)
     return other
 
 
-async def test_large_commands_of_many_are_converted_one_a_turn(house, monkeypatch):
-    house.start(CommandRules(expire=5.0, clamp=(("linear.x", -1, 1),)))
-    drivers = [Driver(house.broker, f"driver {number}") for number in range(10)]
+async def test_large_commands_of_many_are_converted_one_a_turn(harness, monkeypatch):
+    harness.start(CommandRules(expire=5.0, clamp=(("linear.x", -1, 1),)))
+    drivers = [Driver(harness.broker, f"driver {number}") for number in range(10)]
     for number, driver in enumerate(drivers):
         driver.steer(large(number / 10), qos=1)
         driver.steer(large(5), qos=1)
-    assert house.robot.received == [twist(0)]
+    assert harness.robot.received == [twist(0)]
     seen = []
 
     def look():
-        seen.append(len(house.robot.received))
+        seen.append(len(harness.robot.received))
         if seen[-1] < 20:
             asyncio.get_running_loop().call_soon(look)
 
@@ -1728,82 +1601,82 @@ async def test_large_commands_of_many_are_converted_one_a_turn(house, monkeypatc
     await until(lambda: seen[-1] == 20)
     assert max(b - a for a, b in pairwise(seen)) == 1
     # Users and clients take turns, and what one client sends stays in its order.
-    assert [one for one in house.robot.received if one != twist(1)] == [
+    assert [one for one in harness.robot.received if one != twist(1)] == [
         twist(number / 10) for number in range(10)
     ]
-    assert house.robot.received[-9:] == [twist(1)] * 9
-    assert house.counters().clamped == 10
+    assert harness.robot.received[-9:] == [twist(1)] * 9
+    assert harness.counters().clamped == 10
 
 
-async def test_a_stop_message_does_not_wait_behind_conversions(house):
-    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
-    make_busy(house)
-    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_stop_message_does_not_wait_behind_conversions(harness):
+    harness.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
+    make_busy(harness)
+    driver, other = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     for x in (0.1, 0.2, 0.3):
         driver.steer(large(x))
         other.steer(large(x))
-    assert house.robot.received == []
+    assert harness.robot.received == []
     other.drive(b"{}")
-    assert house.robot.received == [STOP]
+    assert harness.robot.received == [STOP]
     # What was said before has been overtaken: also what others said, who drive the same robot. It
     # would be set in motion again by a command that is older than the stop.
-    await until(lambda: house.counters().expired == 6)
-    assert house.robot.received == [STOP]
+    await until(lambda: harness.counters().expired == 6)
+    assert harness.robot.received == [STOP]
     driver.steer(large(0.4))
-    await until(lambda: house.robot.received == [STOP, twist(0.4)])
+    await until(lambda: harness.robot.received == [STOP, twist(0.4)])
 
 
-async def test_a_small_command_does_not_overtake_a_large_one(house):
-    house.start(CommandRules(expire=5.0))
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+async def test_a_small_command_does_not_overtake_a_large_one(harness):
+    harness.start(CommandRules(expire=5.0))
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     driver.steer(large(0.1))
     driver.steer(GO)
-    assert house.robot.received == []
+    assert harness.robot.received == []
     assert code(driver, b"[]", properties=made(0)) == 0x99
-    await until(lambda: house.robot.received == [twist(0.1), twist(0.5)])
+    await until(lambda: harness.robot.received == [twist(0.1), twist(0.5)])
 
 
-async def test_a_command_is_as_old_as_its_wait_for_its_turn(house, monkeypatch):
-    house.start(CommandRules(expire=0.2, on_silence=OnSilence(5.0)))
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+async def test_a_command_is_as_old_as_its_wait_for_its_turn(harness, monkeypatch):
+    harness.start(CommandRules(expire=0.2, on_silence=OnSilence(5.0)))
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     driver.steer(large(0.1))
     driver.drive(large(0.1), properties={Property.MESSAGE_EXPIRY_INTERVAL: 60})
     driver.steer(large(0, 10_000))
     busy_until = time.monotonic() + 0.25
     while time.monotonic() < busy_until:  # the loop has no time for them
         pass
-    await until(lambda: house.robot.received == [STOP])  # which is carried out all the same
-    assert house.counters().expired == 2
+    await until(lambda: harness.robot.received == [STOP])  # which is carried out all the same
+    assert harness.counters().expired == 2
 
 
-async def test_what_need_not_be_converted_is_not(house, monkeypatch):
-    house.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
-    driver = Driver(house.broker, "a")
-    monkeypatch.setattr(house.commands, "_read", lambda *_: pytest.fail("it was converted"))
+async def test_what_need_not_be_converted_is_not(harness, monkeypatch):
+    harness.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
+    driver = Driver(harness.broker, "a")
+    monkeypatch.setattr(harness.commands, "_read", lambda *_: pytest.fail("it was converted"))
     huge = large(0.5, 50_000)
     assert code(driver, huge, dup=True) == 0x83
     assert code(driver, huge) == 0x83  # behind an old one: a queue
-    assert house.counters().expired == 2
+    assert harness.counters().expired == 2
 
 
-async def test_who_has_the_lease_when_it_is_its_turn(house):
-    house.start(CommandRules(expire=5.0, exclusive=True))
-    other = make_busy(house)
+async def test_who_has_the_lease_when_it_is_its_turn(harness):
+    harness.start(CommandRules(expire=5.0, exclusive=True))
+    other = make_busy(harness)
     other.leave()
-    driver, late = Driver(house.broker, "a"), Driver(house.broker, "b")
+    driver, late = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     late.steer(large(0.1))
     driver.steer(GO)
-    await until(lambda: house.counters().refused == 1)
-    assert house.robot.received == [twist(0.5)]
+    await until(lambda: harness.counters().refused == 1)
+    assert harness.robot.received == [twist(0.5)]
 
 
 @pytest.mark.parametrize("proven", [True, False])
-async def test_who_leaves_before_its_turn(house, proven):
-    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
-    make_busy(house)
-    driver, lost = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_who_leaves_before_its_turn(harness, proven):
+    harness.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)))
+    make_busy(harness)
+    driver, lost = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     if proven:
         driver.steer(large(0.1))
     else:  # the first of its connection
@@ -1811,35 +1684,35 @@ async def test_who_leaves_before_its_turn(house, proven):
     lost.steer(large(0.2))
     driver.leave()
     lost.cut()
-    await until(lambda: house.robot.received == [twist(0.1), STOP])
-    await until(lambda: house.counters().expired == 1)
-    assert house.commands._queued == {}
+    await until(lambda: harness.robot.received == [twist(0.1), STOP])
+    await until(lambda: harness.counters().expired == 1)
+    assert harness.commands._queued == {}
 
 
-async def test_a_large_queue_behind_connect(house):
+async def test_a_large_queue_behind_connect(harness):
     """The first of it waits for its turn when the others come."""
-    house.start(CommandRules(expire=0.5))
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+    harness.start(CommandRules(expire=0.5))
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     driver.drive(large(0.1))
     driver.drive(large(0.2))
-    await until(lambda: house.counters().expired == 2)
-    single = Driver(house.broker, "b")
-    await until(lambda: not house.bridge._turns.is_busy)
-    make_busy(house)
+    await until(lambda: harness.counters().expired == 2)
+    single = Driver(harness.broker, "b")
+    await until(lambda: not harness.bridge._turns.is_busy)
+    make_busy(harness)
     single.drive(large(0.3))
-    await until(lambda: house.robot.received == [twist(0.3)])
+    await until(lambda: harness.robot.received == [twist(0.3)])
 
 
 @pytest.mark.parametrize("packed", [False, True], ids=["plain", "zstd"])
 @pytest.mark.parametrize("has_own", [False, True], ids=["", "behind its own"])
-async def test_a_stop_is_heard_whoever_has_filled_the_queue(house, has_own, packed):
-    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
-    make_busy(house)
-    loader, driver = Driver(house.broker, "loader"), Driver(house.broker, "a")
+async def test_a_stop_is_heard_whoever_has_filled_the_queue(harness, has_own, packed):
+    harness.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
+    make_busy(harness)
+    loader, driver = Driver(harness.broker, "loader"), Driver(harness.broker, "a")
     if has_own:
         driver.steer(large(0.2))
-    turns = house.bridge._turns
+    turns = harness.bridge._turns
     session = loader.client.session
     for size in (1_000_000, 50_000, 1100):
         while turns.has_room(session, size + 100):
@@ -1848,103 +1721,103 @@ async def test_a_stop_is_heard_whoever_has_filled_the_queue(house, has_own, pack
     stop = b"{}" + b" " * 5000
     assert code(driver, large(0.3, 5000), properties=made(0)) == 0x97, "it drives"
     assert code(driver, b"[]" + b" " * 5000) == 0x99
-    assert house.robot.received == []
-    errors = house.counters().errors
+    assert harness.robot.received == []
+    errors = harness.counters().errors
     assert code(driver, ZstdCompressor().compress(stop) if packed else stop) == 0
-    assert house.robot.received == [STOP]
-    assert house.counters().errors == errors
+    assert harness.robot.received == [STOP]
+    assert harness.counters().errors == errors
     # What it said before has been overtaken, and what the other had said.
-    waiting = sum(map(len, house.commands._queued.values()))
-    await until(lambda: house.counters().expired == waiting)
-    assert house.robot.received == [STOP]
+    waiting = sum(map(len, harness.commands._queued.values()))
+    await until(lambda: harness.counters().expired == waiting)
+    assert harness.robot.received == [STOP]
 
 
-async def test_what_may_become_large_is_not_converted_out_of_turn(house, monkeypatch):
+async def test_what_may_become_large_is_not_converted_out_of_turn(harness, monkeypatch):
     """A few bytes of zstd may be megabytes; so may those that do not say how much they are."""
-    house.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
-    make_busy(house)
-    driver = Driver(house.broker, "a")
-    monkeypatch.setattr(house.bridge._turns, "has_room", lambda *_: False)
-    monkeypatch.setattr(house.commands, "_read", lambda *_: pytest.fail("it was converted"))
+    harness.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
+    monkeypatch.setattr(harness.bridge._turns, "has_room", lambda *_: False)
+    monkeypatch.setattr(harness.commands, "_read", lambda *_: pytest.fail("it was converted"))
     huge = b"{}" + b" " * 1_000_000
     silent = ZstdCompressor(write_content_size=False).compress(b"{}")
     for payload in (huge, ZstdCompressor().compress(huge), silent, ZSTD_MAGIC + b"\xff"):
         assert code(driver, payload, properties=made(0)) == 0x97
 
 
-async def test_large_commands_that_wait_are_bounded_and_end_with_their_route(house):
-    bridge = house.start(CommandRules(expire=5.0))
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+async def test_large_commands_that_wait_are_bounded_and_end_with_their_route(harness):
+    bridge = harness.start(CommandRules(expire=5.0))
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     account = driver.client.session.account
     before = account.bytes
     codes = [code(driver, large(0.1, 1_000_000), properties=made(0)) for _ in range(20)]
     assert codes == [0] * 16 + [0x97] * 4
     bridge.replace([])
     await until(lambda: account.bytes <= before)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
-async def test_a_fault_in_the_conversion_of_a_large_command(house, monkeypatch, escaped):
-    house.start(CommandRules(expire=5.0))
-    faults = house.broker.faults.count
+async def test_a_fault_in_the_conversion_of_a_large_command(harness, monkeypatch, escaped):
+    harness.start(CommandRules(expire=5.0))
+    faults = harness.broker.faults.count
 
     def fail(*_):
         raise RuntimeError("on purpose")
 
-    monkeypatch.setattr(house.commands, "_convert", fail)
-    driver = Driver(house.broker, "a")
+    monkeypatch.setattr(harness.commands, "_convert", fail)
+    driver = Driver(harness.broker, "a")
     assert code(driver, large(0.1), properties=made(0)) == 0x83
-    Driver(house.broker, "b").steer(large(0.1))
-    await until(lambda: house.counters().errors == 2)
-    assert house.broker.faults.count == faults + 2
+    Driver(harness.broker, "b").steer(large(0.1))
+    await until(lambda: harness.counters().errors == 2)
+    assert harness.broker.faults.count == faults + 2
     escaped.clear()
 
 
-async def test_what_waits_does_not_outlive_its_route(house):
-    bridge = house.start(CommandRules(expire=0.5))
-    Driver(house.broker, "a").drive()
+async def test_what_waits_does_not_outlive_its_route(harness):
+    bridge = harness.start(CommandRules(expire=0.5))
+    Driver(harness.broker, "a").drive()
     bridge.replace([])
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
-    assert house.broker.accounting.queued_bytes == 0
+    assert harness.robot.received == []
+    assert harness.broker.accounting.queued_bytes == 0
 
 
-async def test_who_commands_meanwhile_has_the_lease(house):
-    house.start(CommandRules(expire=0.5, exclusive=True))
-    Driver(house.broker, "a").drive()
-    Driver(house.broker, "b").steer(b'{"linear":{"x":1}}')
-    await until(lambda: house.counters().refused == 1)
-    assert house.robot.received == [twist(1)]
+async def test_who_commands_meanwhile_has_the_lease(harness):
+    harness.start(CommandRules(expire=0.5, exclusive=True))
+    Driver(harness.broker, "a").drive()
+    Driver(harness.broker, "b").steer(b'{"linear":{"x":1}}')
+    await until(lambda: harness.counters().refused == 1)
+    assert harness.robot.received == [twist(1)]
 
 
-async def test_who_stops_takes_no_free_lease(house):
+async def test_who_stops_takes_no_free_lease(harness):
     """An old queue that ends with a stop, above all."""
-    house.start(CommandRules(exclusive=True, on_silence=OnSilence(60)))
-    queue, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+    harness.start(CommandRules(exclusive=True, on_silence=OnSilence(60)))
+    queue, other = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     queue.say(*[Publish(TOPIC, GO)] * 3, Publish(TOPIC, b"{}"))
-    assert house.robot.received == [STOP]
-    assert house.commands.commanding is None
+    assert harness.robot.received == [STOP]
+    assert harness.commands.commanding is None
     other.steer()
-    assert house.robot.received == [STOP, twist(0.5)]
-    assert house.commands.commanding == "b"
+    assert harness.robot.received == [STOP, twist(0.5)]
+    assert harness.commands.commanding == "b"
 
 
-async def test_who_has_the_lease_keeps_it_with_a_stop(house):
-    house.start(CommandRules(exclusive=True, lease=60, on_silence=OnSilence(60)))
-    driver = Driver(house.broker, "a")
+async def test_who_has_the_lease_keeps_it_with_a_stop(harness):
+    harness.start(CommandRules(exclusive=True, lease=60, on_silence=OnSilence(60)))
+    driver = Driver(harness.broker, "a")
     driver.steer()
-    before = house.commands._lease.heard_at
+    before = harness.commands._lease.heard_at
     await asyncio.sleep(0.001)
     driver.steer(b"{}")
-    assert house.robot.received == [twist(0.5), STOP]
-    assert house.commands.commanding == "a"
-    assert house.commands._lease.heard_at > before
+    assert harness.robot.received == [twist(0.5), STOP]
+    assert harness.commands.commanding == "a"
+    assert harness.commands._lease.heard_at > before
 
 
-async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(house):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(harness):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
 
     def say(age, dup=False):
         made = {Property.USER_PROPERTY: [("sent-at", str(time.time() - age))]}
@@ -1953,21 +1826,21 @@ async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(house):
         return driver.code
 
     assert [say(age) for age in (3, 0.1, 3, 3, 0, -0.1)] == [0x83, 0, 0x83, 0x83, 0, 0]
-    assert house.robot.received == [twist(0.5)] * 3
+    assert harness.robot.received == [twist(0.5)] * 3
     assert say(0.1, dup=True) == 0
     assert say(-1) == 0x83
-    assert "in the future: set the clocks" in house.counters().last_error
+    assert "in the future: set the clocks" in harness.counters().last_error
     driver.drive(qos=2, properties=said("yesterday"))
     assert driver.wire.written.endswith(b"(1780000000.25) or RFC 3339 (2026-05-28T20:26:40.25Z)")
 
 
-async def test_a_message_expiry_that_is_left_proves_nothing(house):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
+async def test_a_message_expiry_that_is_left_proves_nothing(harness):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
     command = Publish(TOPIC, GO, properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
     driver.say(command, command, command)
     await asyncio.sleep(0.2)
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 # What the client is told
@@ -1984,9 +1857,9 @@ async def test_a_message_expiry_that_is_left_proves_nothing(house):
         (b"", 0x99, "cannot be converted"),
     ],
 )
-async def test_a_payload_that_ros_cannot_have(house, rules, qos, payload, code, reason):
-    house.start(rules)
-    driver = Driver(house.broker, "a")
+async def test_a_payload_that_ros_cannot_have(harness, rules, qos, payload, code, reason):
+    harness.start(rules)
+    driver = Driver(harness.broker, "a")
     driver.drive(payload, qos=qos)
     packet = decode(driver.wire.written)
     assert packet.reason_code == code
@@ -1996,14 +1869,14 @@ async def test_a_payload_that_ros_cannot_have(house, rules, qos, payload, code, 
         driver.wire.written = b""
         driver.say(Pubrel(7))
         assert driver.wire.written[4] == 0x92
-    assert house.robot.received == []
-    assert house.counters().errors == 1
-    assert reason in house.bridge.topics()[0].last_error
-    old = Driver(house.broker, "old", version=4)
+    assert harness.robot.received == []
+    assert harness.counters().errors == 1
+    assert reason in harness.bridge.topics()[0].last_error
+    old = Driver(harness.broker, "old", version=4)
     old.drive(payload, qos=qos)
     assert len(old.wire.written) == 4
     # A good one is acknowledged as ever.
-    driver = Driver(house.broker, "b")
+    driver = Driver(harness.broker, "b")
     driver.drive(qos=qos)
     assert decode(driver.wire.written).reason_code == 0
 
@@ -2016,16 +1889,16 @@ def decode(data):
 
 
 @pytest.mark.parametrize(("payload", "code"), [(b'{"linear":{"x":5}}', 0x83), (GO, 0)])
-async def test_against_the_rules_is_another_code(house, payload, code):
-    house.start(CommandRules(allow=(("linear.x", (0.5,)),)))
-    driver = Driver(house.broker, "a")
+async def test_against_the_rules_is_another_code(harness, payload, code):
+    harness.start(CommandRules(allow=(("linear.x", (0.5,)),)))
+    driver = Driver(harness.broker, "a")
     driver.drive(payload, qos=1)
     assert driver.code == code
 
 
-async def test_who_does_not_want_to_know_why(house):
-    house.start(None)
-    driver = Driver(house.broker, "a")
+async def test_who_does_not_want_to_know_why(harness):
+    harness.start(None)
+    driver = Driver(harness.broker, "a")
     driver.client.output.may_explain = False
     driver.drive(b"{", qos=1)
     assert driver.wire.written == bytes((0x40, 3, 0, 7, 0x99))
@@ -2036,20 +1909,20 @@ async def test_who_does_not_want_to_know_why(house):
 
 @pytest.mark.parametrize("other", [None, CommandRules(), CommandRules(exclusive=True)])
 @pytest.mark.parametrize("remapped", [False, True])
-async def test_two_routes_to_one_ros_topic_have_one_driver(house, other, remapped):
+async def test_two_routes_to_one_ros_topic_have_one_driver(harness, other, remapped):
     ros = "/other" if remapped else "/cmd_vel"
     if remapped:
-        house.node.remapped["/other"] = "/cmd_vel"
+        harness.node.remapped["/other"] = "/cmd_vel"
     exclusive = CommandRules(exclusive=True)
-    House.start(
-        house,
+    Harness.start(
+        harness,
         TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=exclusive),
         TopicSettings(ros, "ros", "r2d2/joy", TWIST, rules=other),
     )
     for name in {"/cmd_vel", ros}:
-        house.node.add_subscriber(name, TWIST)
-    await house.settle()
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+        harness.node.add_subscriber(name, TWIST)
+    await harness.settle()
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
 
     def joy(driver):
         driver.wire.written = b""
@@ -2061,7 +1934,7 @@ async def test_two_routes_to_one_ros_topic_have_one_driver(house, other, remappe
     assert [joy(b), joy(a)] == [0x87, 0]
     a.cut()
     assert joy(b) == 0
-    a = Driver(house.broker, "a")
+    a = Driver(harness.broker, "a")
     a.drive(qos=1)
     is_taken = other is not None and other.exclusive
     assert a.code == (0x87 if is_taken else 0)
@@ -2069,16 +1942,16 @@ async def test_two_routes_to_one_ros_topic_have_one_driver(house, other, remappe
 
 
 @pytest.mark.parametrize("stays", [0, 1])
-async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, stays):
+async def test_a_lease_survives_the_end_of_another_route_to_the_topic(harness, stays):
     """Also of the one that its holder drove through; what is left sees to its end."""
     rules = CommandRules(exclusive=True, lease=60)
     routes = [
         TopicSettings("/cmd_vel", "ros", topic, TWIST, rules=rules) for topic in (TOPIC, "r2d2/joy")
     ]
-    bridge = House.start(house, *routes)
-    house.node.add_subscriber("/cmd_vel", TWIST)
-    await house.settle()
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    bridge = Harness.start(harness, *routes)
+    harness.node.add_subscriber("/cmd_vel", TWIST)
+    await harness.settle()
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.drive(qos=1)
     bridge.replace([routes[stays]])
 
@@ -2089,10 +1962,10 @@ async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, sta
         return driver.code
 
     assert [say(b), say(a)] == [0x87, 0]
-    assert house.commands._timer is not None
+    assert harness.commands._timer is not None
     bridge.replace([])
     bridge.replace(routes)
-    house.node.spin()
+    harness.node.spin()
     assert say(b) == 0
 
 
@@ -2101,22 +1974,22 @@ async def test_a_lease_survives_the_end_of_another_route_to_the_topic(house, sta
 RULES = CommandRules(expire=5.0, on_silence=OnSilence(60.0))
 
 
-def start_beside(house, rules=RULES, ros="/cmd_vel", own=RULES):
+def start_beside(harness, rules=RULES, ros="/cmd_vel", own=RULES):
     """A route for driving, and another topic whose messages go to the same robot."""
-    house.node.remapped["/other"] = "/cmd_vel"
-    bridge = House.start(
-        house,
+    harness.node.remapped["/other"] = "/cmd_vel"
+    bridge = Harness.start(
+        harness,
         TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=own),
         TopicSettings(ros, "ros", "r2d2/stop", TWIST, rules=rules),
     )
-    house.robot = house.node.add_subscriber("/cmd_vel", TWIST)
+    harness.robot = harness.node.add_subscriber("/cmd_vel", TWIST)
     if ros != "/cmd_vel":
-        house.node.add_subscriber(ros, TWIST).received = house.robot.received
+        harness.node.add_subscriber(ros, TWIST).received = harness.robot.received
     return bridge
 
 
-def total(house, counter):
-    return sum(getattr(status, counter) for status in house.bridge.status())
+def total(harness, counter):
+    return sum(getattr(status, counter) for status in harness.bridge.status())
 
 
 def stop_beside(driver, payload=b"{}", **kw):
@@ -2130,98 +2003,98 @@ def stop_beside(driver, payload=b"{}", **kw):
     [(RULES, "/cmd_vel"), (RULES, "/other"), (CommandRules(), "/cmd_vel"), (None, "/cmd_vel")],
     ids=["its rules", "by another name", "without a stop message", "no rules"],
 )
-async def test_a_stop_on_another_topic_overtakes_what_has_come(house, rules, ros, size, who):
-    start_beside(house, rules, ros)
+async def test_a_stop_on_another_topic_overtakes_what_has_come(harness, rules, ros, size, who):
+    start_beside(harness, rules, ros)
     for _ in range(3):
-        house.node.spin()
-    await house.settle()
-    house.robot.received.clear()  # the stop messages of the start
+        harness.node.spin()
+    await harness.settle()
+    harness.robot.received.clear()  # the stop messages of the start
     if size:
-        make_busy(house)
-    drivers = {name: Driver(house.broker, name) for name in "ab"}
+        make_busy(harness)
+    drivers = {name: Driver(harness.broker, name) for name in "ab"}
     drivers["a"].drive(large(0.5, size), qos=1)
     assert drivers["a"].code == 0
     stop_beside(drivers[who], properties=made(0))
     if size and who == "a" and rules is None:
         # Without rules nothing is known of a stop before its turn, behind the large one.
-        await until(lambda: house.robot.received)
-    assert house.robot.received == [STOP]
-    await until(lambda: total(house, "expired") == 1)
-    assert house.robot.received == [STOP]
-    assert "a stop came after it" in house.bridge.status()[0].last_error
+        await until(lambda: harness.robot.received)
+    assert harness.robot.received == [STOP]
+    await until(lambda: total(harness, "expired") == 1)
+    assert harness.robot.received == [STOP]
+    assert "a stop came after it" in harness.bridge.status()[0].last_error
     # What comes behind the stop is carried out.
     drivers["a"].steer(large(0.7, size))
-    await until(lambda: house.robot.received == [STOP, twist(0.7)])
+    await until(lambda: harness.robot.received == [STOP, twist(0.7)])
 
 
-async def test_a_stop_overtakes_what_waits_on_a_route_without_rules(house):
-    start_beside(house, rules=None)
-    make_busy(house)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_stop_overtakes_what_waits_on_a_route_without_rules(harness):
+    start_beside(harness, rules=None)
+    make_busy(harness)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     stop_beside(a, large(0.5))
     b.drive(b"{}")
-    await until(lambda: total(house, "expired") == 1)
+    await until(lambda: total(harness, "expired") == 1)
     stop_beside(a, large(0.7))
-    await until(lambda: house.robot.received == [STOP, twist(0.7)])
+    await until(lambda: harness.robot.received == [STOP, twist(0.7)])
 
 
 @pytest.mark.parametrize("expiry", [0, 60])
-async def test_a_stop_overtakes_what_came_on_an_earlier_connection(house, expiry):
-    house.start(RULES)
-    make_busy(house)
-    driver = Driver(house.broker, "a", clean=not expiry, expiry=expiry)
+async def test_a_stop_overtakes_what_came_on_an_earlier_connection(harness, expiry):
+    harness.start(RULES)
+    make_busy(harness)
+    driver = Driver(harness.broker, "a", clean=not expiry, expiry=expiry)
     driver.steer(large(0.5))
     driver.leave()
-    driver = Driver(house.broker, "a", clean=not expiry, expiry=expiry)
+    driver = Driver(harness.broker, "a", clean=not expiry, expiry=expiry)
     driver.drive(b"{}")
-    await until(lambda: house.counters().expired == 1)
-    assert house.robot.received == [STOP]
+    await until(lambda: harness.counters().expired == 1)
+    assert harness.robot.received == [STOP]
 
 
-async def test_what_came_behind_a_large_stop_is_carried_out(house):
+async def test_what_came_behind_a_large_stop_is_carried_out(harness):
     """Which waits for its turn itself: their order is that of their coming."""
-    house.start(RULES)
-    make_busy(house)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    harness.start(RULES)
+    make_busy(harness)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     b.steer(large(0.1))
     a.drive(large(0))
     b.steer(large(0.3))
-    await until(lambda: twist(0.3) in house.robot.received)
-    assert house.robot.received in ([twist(0.1), STOP, twist(0.3)], [STOP, twist(0.3)])
+    await until(lambda: twist(0.3) in harness.robot.received)
+    assert harness.robot.received in ([twist(0.1), STOP, twist(0.3)], [STOP, twist(0.3)])
 
 
-async def test_a_stop_of_who_does_not_have_the_lease_overtakes_nothing(house):
-    house.start(CommandRules(exclusive=True, expire=5.0, on_silence=OnSilence(60.0)))
-    make_busy(house).leave()
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
-    house.robot.received.clear()
+async def test_a_stop_of_who_does_not_have_the_lease_overtakes_nothing(harness):
+    harness.start(CommandRules(exclusive=True, expire=5.0, on_silence=OnSilence(60.0)))
+    make_busy(harness).leave()
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
+    harness.robot.received.clear()
     a.drive(large(0))  # it waits for its turn, and is not its client's to say then
     b.steer()
     b.steer(large(0.2))
     a.drive(b"{}", qos=1)
     assert a.code == 0x87
-    await until(lambda: house.robot.received == [twist(0.5), twist(0.2)])
-    assert house.counters().refused == 2
+    await until(lambda: harness.robot.received == [twist(0.5), twist(0.2)])
+    assert harness.counters().refused == 2
 
 
 @pytest.mark.parametrize("why", ["expired", "wrong"])
-async def test_a_stop_that_is_refused_overtakes_nothing(house, why):
-    house.start(RULES)
-    make_busy(house)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_stop_that_is_refused_overtakes_nothing(harness, why):
+    harness.start(RULES)
+    make_busy(harness)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.steer(large(0.1))
     over = {Property.MESSAGE_EXPIRY_INTERVAL: 0} if why == "expired" else None
     b.drive(b"{}" if over else b"{]", qos=1, properties=over)
     assert decode(b.wire.written).reason_code == (0x83 if over else 0x99)
-    await until(lambda: house.robot.received == [twist(0.1)])
+    await until(lambda: harness.robot.received == [twist(0.1)])
 
 
 @pytest.mark.parametrize("cause", ["left", "lost", "silent", "reload"])
-async def test_the_bridges_own_stop_overtakes_what_has_come(house, cause):
+async def test_the_bridges_own_stop_overtakes_what_has_come(harness, cause):
     rules = CommandRules(expire=5.0, on_silence=OnSilence(AFTER))
-    bridge = start_beside(house, rules, own=RULES)
-    make_busy(house)
-    source, other = Driver(house.broker, "source"), Driver(house.broker, "other")
+    bridge = start_beside(harness, rules, own=RULES)
+    make_busy(harness)
+    source, other = Driver(harness.broker, "source"), Driver(harness.broker, "other")
     stop_beside(source, GO, properties=made(0))
     if cause == "silent":
         other.wire.connection = PeerStatus(has_unread=True)  # until the silence is too long
@@ -2232,18 +2105,18 @@ async def test_the_bridges_own_stop_overtakes_what_has_come(house, cause):
         source.cut()
     elif cause == "reload":
         bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=RULES)])
-    await until(lambda: house.robot.received == [twist(0.5), STOP])
-    other.wire.connection = PeerStatus()
-    await until(lambda: total(house, "expired") == 1)
-    assert house.robot.received == [twist(0.5), STOP]
+    await until(lambda: harness.robot.received == [twist(0.5), STOP])
+    other.wire.connection = Contact()
+    await until(lambda: total(harness, "expired") == 1)
+    assert harness.robot.received == [twist(0.5), STOP]
 
 
-async def test_a_stop_that_ros_does_not_take_overtakes_what_has_come(house, monkeypatch):
-    house.start(RULES)
-    make_busy(house)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_stop_that_ros_does_not_take_overtakes_what_has_come(harness, monkeypatch):
+    harness.start(RULES)
+    make_busy(harness)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.steer(large(0.1))
-    publisher = house.commands._out[1]
+    publisher = harness.commands._out[1]
 
     def fail(cdr):
         raise BusError("on purpose")
@@ -2252,40 +2125,40 @@ async def test_a_stop_that_ros_does_not_take_overtakes_what_has_come(house, monk
         patch.setattr(type(publisher), "publish", lambda _, cdr: fail(cdr))
         b.drive(b"{}", qos=1)
     assert b.code == 0x83
-    await until(lambda: house.counters().expired == 1)
-    assert house.robot.received == []
+    await until(lambda: harness.counters().expired == 1)
+    assert harness.robot.received == []
 
 
-async def test_the_stop_of_the_start_overtakes_nothing(house):
+async def test_the_stop_of_the_start_overtakes_nothing(harness):
     """It is for what was before."""
-    start_beside(house)
-    Driver(house.broker, "a").drive()
+    start_beside(harness)
+    Driver(harness.broker, "a").drive()
     for _ in range(3):
-        house.node.spin()
-    await until(lambda: house.robot.received == [STOP, STOP, twist(0.5)])
+        harness.node.spin()
+    await until(lambda: harness.robot.received == [STOP, STOP, twist(0.5)])
 
 
 @pytest.mark.parametrize("stops", [True, False])
-async def test_a_stop_overtakes_a_retained_command_that_is_awaited(house, stops):
+async def test_a_stop_overtakes_a_retained_command_that_is_awaited(harness, stops):
     rules = CommandRules(take_retained=True, on_silence=OnSilence(60.0))
-    start_beside(house, own=rules)
-    a, b = Driver(house.broker, "a"), Driver(house.broker, "b")
+    start_beside(harness, own=rules)
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.drive(retain=True)
     if stops:
         stop_beside(b)
-    house.robot.received.clear()
+    harness.robot.received.clear()
     for _ in range(3):
-        house.node.spin()
-    await house.settle()
-    assert (twist(0.5) in house.robot.received) is not stops
+        harness.node.spin()
+    await harness.settle()
+    assert (twist(0.5) in harness.robot.received) is not stops
 
 
 @pytest.mark.parametrize("size", [0, 2000])
 @pytest.mark.parametrize("off", ["0.3 s ahead", "an hour ahead", "milliseconds", "no zone"])
 @pytest.mark.parametrize("qos", [0, 1, 2])
-async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(house, qos, off, size):
-    house.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
-    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(harness, qos, off, size):
+    harness.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
+    driver, other = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     other.steer()
     now = time.time()
     text = {
@@ -2298,9 +2171,9 @@ async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(house, qos, off, siz
         driver.drive(payload + b" " * size, qos=qos, properties=said(text))
         if qos == 2:
             driver.say(Pubrel(7))
-    await until(lambda: house.robot.received == [twist(0.5), STOP])
-    await until(lambda: house.counters().errors == 1)  # what is no stop is refused as before
-    assert "sent-at" in house.counters().last_error
+    await until(lambda: harness.robot.received == [twist(0.5), STOP])
+    await until(lambda: harness.counters().errors == 1)  # what is no stop is refused as before
+    assert "sent-at" in harness.counters().last_error
 
 
 @pytest.mark.parametrize("presses", [0, 4])
@@ -2323,16 +2196,16 @@ def test_what_is_known_by_a_long_expire_is_not_known_by_a_short_one(presses):
     assert sender.moved == []
 
 
-async def test_a_route_that_cannot_convert_the_first_of_a_queue_lets_no_other_carry_it_out(house):
+async def test_a_route_that_cannot_convert_the_first_of_a_queue_lets_no_other_carry_it_out(harness):
     rules = CommandRules(expire=0.5)
-    House.start(
-        house,
+    Harness.start(
+        harness,
         TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
         TopicSettings("/number", "ros", TOPIC, INT, rules=rules),
         TopicSettings("/lamp", "ros", "r2d2/lamp", TWIST, rules=rules),
     )
-    robot = house.node.add_subscriber("/cmd_vel", TWIST)
-    driver = Driver(house.broker, "a")
+    robot = harness.node.add_subscriber("/cmd_vel", TWIST)
+    driver = Driver(harness.broker, "a")
     driver.say(Publish(TOPIC, GO), *[Publish("r2d2/lamp", GO)] * 5)
     await asyncio.sleep(0.3)  # longer than a first command waits
     assert robot.received == []
@@ -2350,16 +2223,16 @@ def test_a_qos_2_command_of_two_routes_is_looked_at_once():
 
 
 @pytest.mark.parametrize("pace", [0, 0.05])
-async def test_each_message_of_a_plugin_is_a_command_of_its_own(house, pace):
+async def test_each_message_of_a_plugin_is_a_command_of_its_own(harness, pace):
     """It comes from inside: no packet from the network tells one from another."""
-    house.start(CommandRules(expire=0.5))
+    harness.start(CommandRules(expire=0.5))
     begun = asyncio.get_running_loop().time()
     for number in range(6):
-        house.broker.accounting.now = begun + number * pace
-        house.client.send(TOPIC, GO)
-    assert len(house.robot.received) == (4 if pace else 0)
+        harness.broker.accounting.now = begun + number * pace
+        harness.client.send(TOPIC, GO)
+    assert len(harness.robot.received) == (4 if pace else 0)
     await asyncio.sleep(0.2)  # longer than a first command waits
-    assert len(house.robot.received) == (4 if pace else 0)
+    assert len(harness.robot.received) == (4 if pace else 0)
 
 
 FRESH = CommandRules(expire=60.0)
@@ -2368,19 +2241,19 @@ FRESH = CommandRules(expire=60.0)
 @pytest.mark.parametrize(
     "way", ["reload", "late", "overtaken", "turn, reload", "turn, overtaken", "fault", "kept"]
 )
-async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, escaped, way):
+async def test_a_single_command_behind_one_that_was_dropped(harness, monkeypatch, escaped, way):
     """What waits no longer is nothing that the next one would be a queue with."""
     rules = CommandRules(
         expire=60.0, on_silence=OnSilence(60.0), take_retained=way == "kept", exclusive=False
     )
-    bridge = start_beside(house, own=rules)
+    bridge = start_beside(harness, own=rules)
     for _ in range(3 * (way != "kept")):
-        house.node.spin()
-    await house.settle()
-    house.robot.received.clear()
+        harness.node.spin()
+    await harness.settle()
+    harness.robot.received.clear()
     if way.startswith("turn"):
-        make_busy(house)
-    driver, other = Driver(house.broker, "a"), Driver(house.broker, "b")
+        make_busy(harness)
+    driver, other = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     if way == "late":  # by the rule of a route with a short expire
         bridge.replace(
             [
@@ -2388,11 +2261,11 @@ async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, 
                 TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=rules),
             ]
         )
-        lamp = house.node.add_subscriber("/lamp", TWIST)
-        await house.settle()
-        driver.wire.connection = PeerStatus(has_unread=True)
+        lamp = harness.node.add_subscriber("/lamp", TWIST)
+        await harness.settle()
+        driver.wire.connection = Contact(has_unread=True)
         driver.say(Publish("r2d2/lamp", GO))
-        await until(lambda: total(house, "expired") == 1)
+        await until(lambda: total(harness, "expired") == 1)
         assert lamp.received == []
         driver.wire.connection = PeerStatus()
     elif way == "fault":
@@ -2403,30 +2276,30 @@ async def test_a_single_command_behind_one_that_was_dropped(house, monkeypatch, 
         driver.drive(large(0.1) if way.startswith("turn") else GO, retain=way == "kept")
     if way.endswith("reload"):
         bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=FRESH)])
-        house.node.spin()
+        harness.node.spin()
         await until(lambda: not bridge._turns.is_busy)
     elif way.endswith("overtaken"):
         stop_beside(other, properties=made(0))
-        await until(lambda: total(house, "expired") == 1)
+        await until(lambda: total(harness, "expired") == 1)
     await asyncio.sleep(0.3)  # no burst
-    house.robot.received.clear()
+    harness.robot.received.clear()
     driver.drive(b'{"linear":{"x":0.9}}')
-    await until(lambda: house.robot.received == [twist(0.9)], timeout=3)
+    await until(lambda: harness.robot.received == [twist(0.9)], timeout=3)
     escaped.clear()
 
 
-async def test_who_left_before_its_turn_and_is_back_is_not_stopped(house):
-    house.start(RULES)
-    make_busy(house)
-    driver = Driver(house.broker, "a", clean=False, expiry=60)
+async def test_who_left_before_its_turn_and_is_back_is_not_stopped(harness):
+    harness.start(RULES)
+    make_busy(harness)
+    driver = Driver(harness.broker, "a", clean=False, expiry=60)
     driver.steer(large(0.1))
     driver.leave()
-    driver = Driver(house.broker, "a", clean=False, expiry=60)
+    driver = Driver(harness.broker, "a", clean=False, expiry=60)
     driver.steer(large(0.2))
-    await until(lambda: len(house.robot.received) == 2)
-    assert house.robot.received == [twist(0.1), twist(0.2)]
+    await until(lambda: len(harness.robot.received) == 2)
+    assert harness.robot.received == [twist(0.1), twist(0.2)]
     driver.leave()
-    assert house.robot.received == [twist(0.1), twist(0.2), STOP]
+    assert harness.robot.received == [twist(0.1), twist(0.2), STOP]
 
 
 @pytest.mark.parametrize("version", [4, 5])
@@ -2434,23 +2307,25 @@ async def test_who_left_before_its_turn_and_is_back_is_not_stopped(house):
 @pytest.mark.parametrize(
     ("what", "counter"), [("against", "refused"), ("bad", "errors"), ("old", "expired")]
 )
-async def test_a_qos_2_command_that_is_refused_is_counted_once(house, version, size, what, counter):
+async def test_a_qos_2_command_that_is_refused_is_counted_once(
+    harness, version, size, what, counter
+):
     """3.1.1 cannot refuse at its PUBREC: the exchange goes on, and it is refused in the end."""
-    house.start(CommandRules(expire=0.5, allow=(("linear.z", (0.0,)),)))
-    driver = Driver(house.broker, "a", version=version)
+    harness.start(CommandRules(expire=0.5, allow=(("linear.z", (0.0,)),)))
+    driver = Driver(harness.broker, "a", version=version)
     if what == "old":
         driver.drive(b'{"linear":{"x":1}}' + b" " * size, qos=2, dup=True)
     else:
         payload = b'{"linear":{"z":1}}' if what == "against" else b"{]"
         driver.drive(payload + b" " * size, qos=2)
     driver.say(Pubrel(7))
-    await until(lambda: getattr(house.counters(), counter))
-    await until(lambda: not house.bridge._turns.is_busy)
-    counters = house.counters()
+    await until(lambda: getattr(harness.counters(), counter))
+    await until(lambda: not harness.bridge._turns.is_busy)
+    counters = harness.counters()
     assert (counters.refused, counters.errors, counters.expired) == tuple(
         int(name == counter) for name in ("refused", "errors", "expired")
     )
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 @pytest.mark.parametrize("lights", [0, 1])
@@ -2476,8 +2351,8 @@ def test_the_pace_of_qos_2_of_a_long_expire_is_not_that_of_a_short_one(lights):
 class Stick:
     """A client that repeats its stop, as a joystick does that nobody touches."""
 
-    def __init__(self, house, name):
-        self.driver = Driver(house.broker, name)
+    def __init__(self, harness, name):
+        self.driver = Driver(harness.broker, name)
 
     def say(self, times=1):
         for _ in range(times):
@@ -2486,50 +2361,50 @@ class Stick:
 
 @pytest.mark.parametrize("sticks", [1, 2])
 @pytest.mark.parametrize("size", [0, 20_000])
-async def test_an_idle_stick_overtakes_no_command_of_others(house, size, sticks):
-    house.start(RULES)
-    idle = [Stick(house, f"stick {number}") for number in range(sticks)]
+async def test_an_idle_stick_overtakes_no_command_of_others(harness, size, sticks):
+    harness.start(RULES)
+    idle = [Stick(harness, f"stick {number}") for number in range(sticks)]
     for one in idle:
         one.say(REPEATED)
     for number in range(3):
-        driver = Driver(house.broker, f"driver {number}")
-        await until(lambda: not house.bridge._turns.is_busy)
+        driver = Driver(harness.broker, f"driver {number}")
+        await until(lambda: not harness.bridge._turns.is_busy)
         if size:
-            make_busy(house)
+            make_busy(harness)
             for one in idle:  # what moved the robot came before
                 one.say()
-        house.robot.received.clear()
+        harness.robot.received.clear()
         driver.drive(large(0.5, size), qos=1)
-        assert (driver.code, twist(0.5) in house.robot.received) == (0, False)
+        assert (driver.code, twist(0.5) in harness.robot.received) == (0, False)
         for one in idle:
             one.say(2)
-        await until(lambda: twist(0.5) in house.robot.received)
+        await until(lambda: twist(0.5) in harness.robot.received)
         for one in idle:  # it does not lock either way: the robot is stopped again
             one.say()
-        assert house.robot.received[-1] == STOP
-    assert house.counters().expired == 0
+        assert harness.robot.received[-1] == STOP
+    assert harness.counters().expired == 0
 
 
-async def test_an_idle_stick_overtakes_its_own_commands(house):
-    house.start(RULES)
-    stick = Stick(house, "stick")
+async def test_an_idle_stick_overtakes_its_own_commands(harness):
+    harness.start(RULES)
+    stick = Stick(harness, "stick")
     stick.say(REPEATED)
-    make_busy(house)
+    make_busy(harness)
     stick.say()
     stick.driver.steer(large(0.5))
     stick.driver.steer(large(0.6))
-    house.robot.received.clear()
+    harness.robot.received.clear()
     stick.say()
-    await until(lambda: house.counters().expired == 2)
-    assert house.robot.received == [STOP]
+    await until(lambda: harness.counters().expired == 2)
+    assert harness.robot.received == [STOP]
 
 
 @pytest.mark.parametrize("before", ["nothing", "a pause", "a few", "a command", "movement"])
-async def test_a_stop_that_is_not_only_repeated_overtakes(house, monkeypatch, before):
+async def test_a_stop_that_is_not_only_repeated_overtakes(harness, monkeypatch, before):
     """Also where the robot stands, and a stick says so all the time."""
-    house.start(RULES)
-    idle, stopper = Stick(house, "stick"), Stick(house, "emergency stop")
-    other, driver = Driver(house.broker, "other"), Driver(house.broker, "driver")
+    harness.start(RULES)
+    idle, stopper = Stick(harness, "stick"), Stick(harness, "emergency stop")
+    other, driver = Driver(harness.broker, "other"), Driver(harness.broker, "driver")
     idle.say(REPEATED)
     if before == "a pause":
         stopper.say(REPEATED)
@@ -2549,10 +2424,10 @@ async def test_a_stop_that_is_not_only_repeated_overtakes(house, monkeypatch, be
         other.steer(b'{"linear":{"x":0.7}}')
     else:
         idle.say()
-    house.robot.received.clear()
+    harness.robot.received.clear()
     stopper.say()
-    await until(lambda: house.counters().expired == 1)
-    assert house.robot.received == [STOP]
+    await until(lambda: harness.counters().expired == 1)
+    assert harness.robot.received == [STOP]
 
 
 def test_what_is_known_of_stops_is_bounded(monkeypatch):
@@ -2584,69 +2459,69 @@ class AnyStops:
         return True
 
 
-async def test_who_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(house):
-    house.start(RULES)
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+async def test_who_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(harness):
+    harness.start(RULES)
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     for x in (0.1, 0.2, 0.3):
         driver.steer(large(x))
     driver.leave()
-    await until(lambda: STOP in house.robot.received)
-    assert house.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
-    assert house.counters().expired == 0
+    await until(lambda: STOP in harness.robot.received)
+    assert harness.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
+    assert harness.counters().expired == 0
 
 
-async def test_who_drove_and_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(house):
-    house.start(RULES)
-    driver = Driver(house.broker, "a")
+async def test_who_drove_and_leaves_with_a_queue_is_followed_by_the_stop_behind_its_last(harness):
+    harness.start(RULES)
+    driver = Driver(harness.broker, "a")
     driver.steer(large(0.1))
     for x in (0.2, 0.3):
         driver.steer(large(x))
     driver.leave()
-    await until(lambda: STOP in house.robot.received)
-    assert house.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
+    await until(lambda: STOP in harness.robot.received)
+    assert harness.robot.received == [twist(0.1), twist(0.2), twist(0.3), STOP]
 
 
 @pytest.mark.parametrize("way", ["leave", "cut"])
-async def test_who_drove_and_is_gone_is_followed_by_the_stop_at_once(house, way):
+async def test_who_drove_and_is_gone_is_followed_by_the_stop_at_once(harness, way):
     """Where nothing of its queue is carried out, nothing is waited for."""
-    house.start(RULES)
-    driver = Driver(house.broker, "a")
+    harness.start(RULES)
+    driver = Driver(harness.broker, "a")
     driver.steer(large(0.1))
     driver.drive(large(0.2, 5000), properties=made(0 if way == "cut" else 60))
     getattr(driver, way)()
-    assert house.robot.received == [twist(0.1), STOP]
+    assert harness.robot.received == [twist(0.1), STOP]
 
 
 @pytest.mark.parametrize("last", ["old", "wrong"])
-async def test_who_leaves_is_followed_by_a_stop_though_its_last_is_not_carried_out(house, last):
-    house.start(RULES)
-    make_busy(house)
-    driver = Driver(house.broker, "a")
+async def test_who_leaves_is_followed_by_a_stop_though_its_last_is_not_carried_out(harness, last):
+    harness.start(RULES)
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
     driver.steer(large(0.1))
     if last == "old":
         driver.steer(large(0.2), properties={Property.MESSAGE_EXPIRY_INTERVAL: 1})
-        (queue,) = house.commands._queued.values()
+        (queue,) = harness.commands._queued.values()
         queue[-1].message.expires_at = -math.inf
     else:
         driver.steer(b"[]" + b" " * 20_000)
     driver.leave()
-    await until(lambda: STOP in house.robot.received)
-    assert house.robot.received == [twist(0.1), STOP]
+    await until(lambda: STOP in harness.robot.received)
+    assert harness.robot.received == [twist(0.1), STOP]
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
-async def test_the_first_command_of_a_connection_that_was_not_read_for_a_time(house, qos):
-    house.start(CommandRules(expire=0.5))
-    driver = Driver(house.broker, "a")
-    driver.wire.connection = PeerStatus(held=1.2)
+async def test_the_first_command_of_a_connection_that_was_not_read_for_a_time(harness, qos):
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
+    driver.wire.connection = Contact(held=1.2)
     driver.say(Publish(TOPIC, GO, qos=qos, packet_id=7 if qos else None))
     driver.wire.connection = PeerStatus()
     if qos == 2:
         driver.say(Pubrel(7))
-    await until(lambda: house.counters().expired == 1)
+    await until(lambda: harness.counters().expired == 1)
     await asyncio.sleep(0.3)  # longer than a first command waits
-    assert house.robot.received == []
+    assert harness.robot.received == []
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])

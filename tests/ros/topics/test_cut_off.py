@@ -17,11 +17,9 @@ from appliance.host.environment import for_other_programs
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
-from test_ros2 import TWIST, Peer, domain
+from ros2_harness import TWIST, Peer
 
-pytestmark = pytest.mark.timed
-
-__all__ = ["domain"]  # a fixture for all tests here
+pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
 AFTER = 0.3
 

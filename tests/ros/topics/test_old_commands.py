@@ -9,11 +9,8 @@ import pytest
 pytest.importorskip("rclpy")
 from appliance_process import MOSQUITTO
 from old_commands import HERE, mosquitto_pub, run
-from test_ros2 import domain
 
-__all__ = ["domain"]  # a fixture for all tests here
-
-pytestmark = pytest.mark.timed
+pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
 has_mqttjs = shutil.which("node") and (HERE.parent / "interop/mqttjs/node_modules/mqtt").exists()
 KINDS = ["paho", *(["mqttjs"] if has_mqttjs else []), *(["bridge"] if MOSQUITTO else [])]

@@ -8,11 +8,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 from slow_link import IMAGE_SIZE, LINK, at, report, trial
-from test_ros2 import domain
 
-pytestmark = pytest.mark.timed
-
-__all__ = ["domain"]  # a fixture for all tests here
+pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
 #: The 99th percentile of the texts' age at the fast client is 5 ms on a computer of its own.
 FAST_ENOUGH = float(os.environ.get("SLOW_LINK_P99", "0.05"))
