@@ -130,7 +130,7 @@ def asks(harness, action):
     """Install a plugin that has to ask; returns a function that answers after some seconds."""
     plugin = Asks(action)
     harness.broker.access = plugin
-    harness.broker.router.asked = plugin
+    harness.broker.router.pending_decisions = plugin
 
     def answer(driver, seconds):
         plugin.has_answered = True
@@ -282,7 +282,7 @@ async def test_late_messages_are_as_others_to_other_clients(harness):
     properties = {Property.USER_PROPERTY: [("a", "b")]}
     driver.drive(qos=1, dup=True, properties=properties)
     message, qos = harness.client.received[-1]
-    assert isinstance(message, Late)
+    assert isinstance(message, DelayedMessage)
     assert (message.payload, message.properties, qos) == (GO, properties, 1)
 
 
@@ -353,9 +353,7 @@ async def test_a_qos_2_command_whose_lease_was_lost_meanwhile(harness):
 
 async def test_what_ros_says_on_a_topic_of_both_ways_needs_no_lease(harness):
     rules = CommandRules(exclusive=True)
-    super(CommandHarness, harness).start(
-        TopicSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules)
-    )
+    Harness.start(harness, TopicSettings("/cmd_vel", "both", TOPIC, TWIST, rules=rules))
     harness.client.subscribe(TOPIC)
     other = harness.node.add_publisher("/cmd_vel", TWIST)
     Driver(harness.broker, "a").drive()
@@ -390,7 +388,7 @@ async def test_who_rests_before_it_drives_is_stopped_as_early(harness, disconnec
     rules = CommandRules(exclusive=True, lease=600, on_silence=OnSilence(AFTER, "{}", disconnect))
     harness.start(rules)
     driver, flow = Driver(harness.broker, "a"), harness.commands
-    driver.wire.connection = Contact(silence=0.0)
+    driver.wire.connection = PeerStatus(silence=0.0)
     driver.steer()
     driver.steer(b"{}")
     await until(lambda: flow._timer.when() > flow._heard_at + 500)
@@ -460,7 +458,7 @@ async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_an
         driver.drive()
         await until(lambda: driver.wire.probed)
         driver.wire.probed = False
-        driver.wire.connection = Contact(silence=0.0)
+        driver.wire.connection = PeerStatus(silence=0.0)
         await until(lambda: not harness.commands._asked)
         await asyncio.sleep(0.4)
         assert harness.robot.received == [twist(0.5), STOP] * round_
@@ -1371,7 +1369,7 @@ async def test_who_drives_and_was_not_read_for_a_time(harness, qos):
     """Of QoS 2, that is known when the command comes, and not when it is released."""
     harness.start(CommandRules(expire=0.5))
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     for _ in range(5):
         driver.drive(qos=qos)
         if qos == 2:
@@ -1379,7 +1377,7 @@ async def test_who_drives_and_was_not_read_for_a_time(harness, qos):
         await asyncio.sleep(0.06)
     assert harness.robot.received
     harness.robot.received.clear()
-    driver.wire.connection = Contact(held=3.0)
+    driver.wire.connection = PeerStatus(held=3.0)
     commands = [Publish(TOPIC, GO, qos=qos, packet_id=n if qos else None) for n in (1, 2)]
     driver.say(*commands)
     driver.wire.connection = PeerStatus()
@@ -1409,7 +1407,7 @@ async def test_a_stream_that_begins_is_no_reason_to_warn(harness, caplog, qos):
     harness.start(CommandRules(expire=5))
     caplog.set_level(logging.INFO)
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact()
+    driver.wire.connection = PeerStatus()
     for number in range(5):
         driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None))
         if qos == 2:
@@ -1431,12 +1429,12 @@ async def test_a_command_with_something_else_behind_it(harness, pauses):
     """A first command waits for what else there is, and that may be a picture."""
     harness.start(CommandRules(expire=0.3))
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact(flowing=60.0)
+    driver.wire.connection = PeerStatus(flowing=60.0)
     driver.drive()
     await asyncio.sleep(0.2)
     assert harness.robot.received == []
     if pauses:
-        driver.wire.connection = Contact(flowing=0.05)
+        driver.wire.connection = PeerStatus(flowing=0.05)
         await until(lambda: harness.robot.received == [twist(0.5)])
     else:
         await until(lambda: harness.counters().expired == 1)
@@ -1486,10 +1484,10 @@ async def test_a_stop_message_that_waited_behind_a_slow_reader_is_carried_out(ha
     harness.start(CommandRules(on_silence=OnSilence(60), expire=0.5))
     driver = Driver(harness.broker, "a")
     driver.steer()
-    late = Late(Message(TOPIC, b"{}", 1), 5.0)
+    late = DelayedMessage(Message(TOPIC, b"{}", 1), 5.0)
     assert harness.commands.receive(late, False, driver.client.session, 9) is None
     assert harness.robot.received == [twist(0.5), STOP]
-    late = Late(Message(TOPIC, GO, 1), 5.0)
+    late = DelayedMessage(Message(TOPIC, GO, 1), 5.0)
     assert harness.commands.receive(late, False, driver.client.session, 9) is not None
     assert harness.robot.received == [twist(0.5), STOP]
 
@@ -1523,7 +1521,7 @@ async def test_what_has_come_and_was_not_read_is_behind_it(harness):
     """The loop was busy: its timers are early, and its clients late."""
     harness.start(CommandRules(expire=0.5))
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact(has_unread=True)
+    driver.wire.connection = PeerStatus(has_unread=True)
     driver.drive()
     await asyncio.sleep(0.2)
     driver.drive()
@@ -1536,7 +1534,7 @@ async def test_what_has_come_and_was_not_read_is_behind_it(harness):
 async def test_what_waits_for_ever_behind_it(harness):
     harness.start(CommandRules(expire=0.15))
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact(has_unread=True)
+    driver.wire.connection = PeerStatus(has_unread=True)
     driver.drive()
     await until(lambda: harness.counters().expired == 1)
     assert harness.robot.received == []
@@ -2106,7 +2104,7 @@ async def test_the_bridges_own_stop_overtakes_what_has_come(harness, cause):
     elif cause == "reload":
         bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=RULES)])
     await until(lambda: harness.robot.received == [twist(0.5), STOP])
-    other.wire.connection = Contact()
+    other.wire.connection = PeerStatus()
     await until(lambda: total(harness, "expired") == 1)
     assert harness.robot.received == [twist(0.5), STOP]
 
@@ -2263,7 +2261,7 @@ async def test_a_single_command_behind_one_that_was_dropped(harness, monkeypatch
         )
         lamp = harness.node.add_subscriber("/lamp", TWIST)
         await harness.settle()
-        driver.wire.connection = Contact(has_unread=True)
+        driver.wire.connection = PeerStatus(has_unread=True)
         driver.say(Publish("r2d2/lamp", GO))
         await until(lambda: total(harness, "expired") == 1)
         assert lamp.received == []
@@ -2514,7 +2512,7 @@ async def test_who_leaves_is_followed_by_a_stop_though_its_last_is_not_carried_o
 async def test_the_first_command_of_a_connection_that_was_not_read_for_a_time(harness, qos):
     harness.start(CommandRules(expire=0.5))
     driver = Driver(harness.broker, "a")
-    driver.wire.connection = Contact(held=1.2)
+    driver.wire.connection = PeerStatus(held=1.2)
     driver.say(Publish(TOPIC, GO, qos=qos, packet_id=7 if qos else None))
     driver.wire.connection = PeerStatus()
     if qos == 2:
