@@ -33,7 +33,7 @@ from appliance.broker.ports import (
     Store,
 )
 from appliance.broker.rate_limited_log import RateLimitedLog
-from appliance.broker.retained import Retained
+from appliance.broker.retained import RetainedMessages
 from appliance.broker.routing import Fanout, Router
 from appliance.broker.session import (
     Delivery,
@@ -145,7 +145,9 @@ class Broker:
         self.sessions: dict[str, Session] = {}
         self.router = Router(access, self.accounting, self.sessions)
         self.accounting.may_still_receive = self.router.may_still_receive
-        self.retained = Retained(self.accounting, self.rate_limited_log, self._retained_changed)
+        self.retained = RetainedMessages(
+            self.accounting, self.rate_limited_log, self._retained_changed
+        )
         self.header_cache = HeaderCache()
         self.observer: Observer | None = None
         #: By topic, what parts of the appliance have to say about who publishes to it. What they

@@ -47,7 +47,7 @@ from appliance.mqtt.codec import (
     quote,
     text_size,
 )
-from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Connection, Event, RawPublish
+from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Event, RawPublish, ServerProtocol
 from appliance.mqtt.packets import (
     Auth,
     Connack,
@@ -113,15 +113,17 @@ _TOLD: Final = frozenset(
 )
 
 
-class Client:
+class ClientHandler:
     """One network connection: does what its packets say; what it is sent goes through `output`."""
 
-    def __init__(self, broker: Broker, wire: Transport) -> None:
+    def __init__(self, broker: Broker, transport: Transport) -> None:
         self.broker = broker
-        self.wire = wire
+        self.transport = transport
         limits = broker.limits
-        self.connection = Connection(limits.packet_size, limits.topic_alias, limits.user_properties)
-        self.output = Output(broker, wire, self)
+        self.protocol = ServerProtocol(
+            limits.packet_size, limits.topic_alias, limits.user_properties
+        )
+        self.output = Output(broker, transport, self)
         self.session: Session | None = None
         #: When what it publishes has come.
         self.inflow = Inflow()
@@ -173,7 +175,7 @@ class Client:
 
     def __str__(self) -> str:
         name = str(self.session) if self.session else "client"
-        return f"{name} at {self.wire.address}"
+        return f"{name} at {self.transport.address}"
 
     # --- bytes in ------------------------------------------------------------------------------
 
@@ -182,7 +184,7 @@ class Client:
         counters = self._counters
         counters.bytes_received += len(data)
         now = self._accounting.now
-        connection = self.connection
+        connection = self.protocol
         cost = counters.cost + COST_PER_TURN
         inflow = self.inflow
         if inflow.is_watched:
@@ -220,7 +222,7 @@ class Client:
             if self._has_place_behind():
                 self.receive(b"")
                 return
-            self.wire.stop_reading()
+            self.transport.stop_reading()
         if self._store.fresh:
             self._depend()
         held = connection.held
@@ -231,7 +233,7 @@ class Client:
 
     def _note_unfinished(self, data: bytes, now: float) -> None:
         """Know when a packet that is not whole began to come: what was left, when it was left."""
-        inflow, connection = self.inflow, self.connection
+        inflow, connection = self.inflow, self.protocol
         has_completed = self._heard_at == now
         came_at = now if data else self._left_since or now
         if connection.paused:  # what it keeps may be the beginning of a packet, and may be more
@@ -249,7 +251,7 @@ class Client:
     def _completing(self, data: bytes, cost: int) -> Iterator[Event]:
         """What comes in; what has come in parts, slowly, is as old as the first of them."""
         came_at, self._came_at = self._came_at, self.inflow.unfinished
-        connection = self.connection
+        connection = self.protocol
         for event in self._passing(data, cost) if self._behind else connection.receive_data(data):
             yield event
             self._came_at = came_at
@@ -263,11 +265,11 @@ class Client:
     def _count_held(self) -> None:
         """Count the memory of what came and is not done with: it is bounded, as all that waits."""
         accounting = self._accounting
-        grown = self.connection.held + self._behind_size - self._held
+        grown = self.protocol.held + self._behind_size - self._held
         self._held += grown
         accounting.take(self.account, grown)
         accounting.input_bytes += grown
-        self.wire.holds(self._held)
+        self.transport.holds(self._held)
         if (
             grown > 0
             and self._held > max(accounting.reserve, SMALL_PACKET)
@@ -425,7 +427,7 @@ class Client:
             if not allowance.used_up and questions():
                 soon = since + allowance.left
                 for step in answers(self.broker, questions, self._wake, soon):
-                    self.wire.wait(max(soon - self._accounting.now, LOOK_AGAIN))
+                    self.transport.wait(max(soon - self._accounting.now, LOOK_AGAIN))
                     yield step
                 allowance.change(since - self._accounting.now)
             self._asked_at = self._accounting.now
@@ -480,13 +482,13 @@ class Client:
         for congestion in congestions:
             congestion.wait(self)
             seconds = min(seconds, congestion.left)
-        self.wire.wait(max(seconds, LOOK_AGAIN))
+        self.transport.wait(max(seconds, LOOK_AGAIN))
         # It will come again, and is counted then.
         self._counters.publish_received -= 1
         self._counters.publish_bytes_received -= len(message.payload)
         self._behind.appendleft((arrived, self._came_at or now))
         self._behind_size += _size(arrived)
-        self.connection.pause()
+        self.protocol.pause()
         return True
 
     def _get_on(self) -> None:
@@ -503,7 +505,7 @@ class Client:
 
     def proceed(self) -> None:
         """A reader that it waits for has room again."""
-        self.wire.proceed()
+        self.transport.proceed()
 
     def _has_place_behind(self) -> bool:
         """Whether more may come behind the message that waits: as many bytes as may wait for it.
@@ -511,7 +513,7 @@ class Client:
         Nothing comes behind what is no PUBLISH, which may change what is to be done with it.
         """
         accounting = self._accounting
-        grown = self._behind_size + self.connection.held - self._held
+        grown = self._behind_size + self.protocol.held - self._held
         return (
             self._behind_size < accounting.queue_bytes
             and isinstance(self._behind[-1][0], tuple | Publish)
@@ -527,7 +529,7 @@ class Client:
         These are acknowledgements, for which others wait, and pings: all that the client may have
         on its way is looked through for them. `limit` is the cost at which its turn ends.
         """
-        connection, counters = self.connection, self._counters
+        connection, counters = self.protocol, self._counters
         if connection.paused and self._has_place_behind():
             connection.resume()
         for event in connection.receive_data(data):
@@ -579,7 +581,7 @@ class Client:
         self._came_at = 0.0
         if self._store.fresh:
             self._depend()
-        if self.connection.held + self._behind_size != self._held:
+        if self.protocol.held + self._behind_size != self._held:
             self._count_held()
 
     def hurry(self) -> None:
@@ -588,8 +590,8 @@ class Client:
         if not self._behind:
             return  # what else it waits for, as the end of its login, it waits for still
         self._try_again()  # and what that is too much for, in the turns that it asked for
-        if not self._behind and self._work is None and self.connection.paused:
-            self.connection.resume()
+        if not self._behind and self._work is None and self.protocol.paused:
+            self.protocol.resume()
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
@@ -653,7 +655,9 @@ class Client:
             if everybody and refuses:
                 code = ReasonCode.QUOTA_EXCEEDED
                 self._counters.publish_dropped += 1
-            elif not session.hold(packet_id, UnreleasedPublish(message, full, self.wire.now())):
+            elif not session.hold(
+                packet_id, UnreleasedPublish(message, full, self.transport.now())
+            ):
                 code = ReasonCode.QUOTA_EXCEEDED
                 shortage = session.shortage(message.size)
                 reason = f"no room for its unfinished QoS 2 messages: {shortage}"
@@ -694,7 +698,7 @@ class Client:
             held = session.unhold(packet_id)
             answer = ReasonCode.SUCCESS
             if held is not None:
-                self.broker.release(held, session, self.wire.now() - held.since)
+                self.broker.release(held, session, self.transport.now() - held.since)
             elif self._refused and packet_id in self._refused:
                 # paho-mqtt passes over the PUBREC that says so, and would tell of a success.
                 del self._refused[packet_id]
@@ -758,7 +762,7 @@ class Client:
                 self._work = work
                 self._is_awaiting = answer is not None
                 self._awaits_since = self._awaits_since or self._came_at or self._accounting.now
-                self.connection.pause()
+                self.protocol.pause()
                 if answer is None:
                     self.later()
                 return
@@ -835,7 +839,7 @@ class Client:
         method = properties.get(Property.AUTHENTICATION_METHOD)
         if isinstance(method, str):
             self._method = method
-            self._exchange = self.wire.exchange(method)
+            self._exchange = self.transport.exchange(method)
             if self._exchange is None:  # [MQTT-4.12.0-1]
                 reason = f"it wants to authenticate with {quote(method)}, which is not offered"
                 self.refuse(ReasonCode.BAD_AUTHENTICATION_METHOD, reason)
@@ -843,8 +847,8 @@ class Client:
             self._authenticate(self._exchange, properties)
             return
         # What follows a CONNECT is read only once it is known who sent it.
-        self.connection.pause()
-        self.wire.authenticate(packet)
+        self.protocol.pause()
+        self.transport.authenticate(packet)
 
     def _on_auth(self, packet: Auth) -> None:
         """A step of an enhanced authentication (5.0 section 4.12)."""
@@ -855,7 +859,7 @@ class Client:
         elif properties.get(Property.AUTHENTICATION_METHOD) != self._method:  # [MQTT-4.12.0-5]
             problem = "AUTH with another authentication method than CONNECT"
         elif code == ReasonCode.RE_AUTHENTICATE and self.session and not self._exchange:
-            self._exchange = self.wire.exchange(self._method)
+            self._exchange = self.transport.exchange(self._method)
             problem = "" if self._exchange else "its authentication method is not offered any more"
         elif code == ReasonCode.CONTINUE_AUTHENTICATION and self._exchange:
             problem = ""
@@ -903,11 +907,11 @@ class Client:
             "client %s (%s) at %s refused: %s",
             quote(name),
             f"user {quote(user)}" if user is not None else "no user name",
-            self.wire.address,
+            self.transport.address,
             reason,
         )
         if self.broker.audit_log is not None:
-            address, tls_info = self.wire.address, self.wire.tls_info()
+            address, tls_info = self.transport.address, self.transport.tls_info()
             self.broker.audit_log.refused(address, reason, code, name, user, tls_info)
         self._counters.connects_refused += 1
         tells = code in _TOLD and self.broker.features.reason_strings
@@ -923,13 +927,13 @@ class Client:
         packet, self._connect = self._connect, None
         if self._closed or packet is None:
             return
-        self.connection.forget_connect()
+        self.protocol.forget_connect()
         self._count_held()
         assigned = None if packet.client_id else "auto-" + str(uuid.uuid4()).upper()
         identity = Identity(username, assigned or packet.client_id)
         try:
             agreement = agree(packet, self.broker.limits)
-            refusal = self.wire.admit(self._accounting.accounts.of(identity))
+            refusal = self.transport.admit(self._accounting.accounts.of(identity))
             if refusal:
                 raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, refusal)
             session, present = self.broker.connect(
@@ -960,7 +964,7 @@ class Client:
             ", session continued" if present else "",
         )
         if self.broker.audit_log is not None:
-            address, tls_info = self.wire.address, self.wire.tls_info()
+            address, tls_info = self.transport.address, self.transport.tls_info()
             self.broker.audit_log.connected(session, address, packet.version, tls_info)
         self.broker.connected(session)
         self.receive(b"")  # what came behind CONNECT
@@ -988,7 +992,7 @@ class Client:
         self.output.open(session, agreement.aliases, explains=explains)
         self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
         self._heard_at = self._accounting.now
-        self.connection.accept()
+        self.protocol.accept()
         counters = self._counters
         counters.connects += 1
         self.broker.clients.add(self)
@@ -1010,7 +1014,7 @@ class Client:
         """Let the other clients have their turn."""
         if not self._later:
             self._later = True
-            self.wire.later()
+            self.transport.later()
 
     def send_on(self) -> None:
         """Go on where the last turn ended: with what waits for the client, and what it sent."""
@@ -1021,14 +1025,14 @@ class Client:
                 self._go_on(self._work)
             if self._work is None and not self._later:
                 self._try_again()
-            if self._work is None and self.connection.paused:
+            if self._work is None and self.protocol.paused:
                 if not self._behind:
-                    self.connection.resume()
+                    self.protocol.resume()
                 # What came meanwhile is as old as the wait is long, as far as is known.
                 self._came_at = self._awaits_since
                 self.receive(b"")
                 self._came_at = 0.0
-                if not self.connection.paused:
+                if not self.protocol.paused:
                     self._awaits_since = 0.0
 
     def _send(self, packet: Packet) -> None:
@@ -1049,12 +1053,12 @@ class Client:
         self._log_rate_limited("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
             if self.broker.audit_log is not None:
-                self.broker.audit_log.refused(self.wire.address, str(error), error.code)
+                self.broker.audit_log.refused(self.transport.address, str(error), error.code)
             # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
             # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
-            if error.told and (unknown or self.connection.version == 5):
-                self.output.version = self.connection.version
+            if error.told and (unknown or self.protocol.version == 5):
+                self.output.version = self.protocol.version
                 self._send(Connack(False, error.code))
             self._shut()
         elif error.told:
@@ -1072,7 +1076,7 @@ class Client:
         if self.session is not None:
             self._end(code, "a fault in the appliance")
             return
-        if self.connection.version == 5:
+        if self.protocol.version == 5:
             self.output.version = 5
             self._send(Connack(False, code))
         self._shut()
@@ -1089,7 +1093,7 @@ class Client:
             self.broker.faults.caught("client.cut_off", error, self)
             if self.session is not None and self.session.link is self.output:
                 self.session.link = None
-        self.wire.abort()
+        self.transport.abort()
 
     def _make_sure(self) -> None:
         """The connection has ended: so it has for its session, even if a fault came in between."""
@@ -1109,7 +1113,7 @@ class Client:
 
     def _log_rate_limited(self, message: str, *args: object) -> None:
         """Log what came from the client's address, unless it is a flood."""
-        host, _, _ = self.wire.address.rpartition(":")
+        host, _, _ = self.transport.address.rpartition(":")
         now = self._accounting.now
         self.broker.rate_limited_log.warning(now, (host, message), message, *args, burst=HOST_BURST)
 
@@ -1122,9 +1126,9 @@ class Client:
         else:
             self._make_sure()
 
-    def let_go(self, wire: Transport) -> None:
-        """The connection is gone, and not to be held any longer: `wire` stands for it now."""
-        self.wire = self.output.wire = wire
+    def let_go(self, transport: Transport) -> None:
+        """The connection is gone, and not to be held any longer: `transport` replaces it now."""
+        self.transport = self.output.transport = transport
 
     def tick(self, now: float) -> bool:
         """Close a client that was silent for one and a half times its keep alive."""
@@ -1140,7 +1144,7 @@ class Client:
         try:
             self._shut()
             if session is not None and audit_log is not None:
-                audit_log.disconnected(session, self.wire.address, why)
+                audit_log.disconnected(session, self.transport.address, why)
         finally:
             if session is not None:
                 self.broker.disconnect(
@@ -1159,6 +1163,6 @@ class Client:
             self._stop_waiting()
             self._behind.clear()
             self._behind_size = 0
-            self.connection.close()
-        finally:  # or the other end would learn of it only when the wire's patience is over
+            self.protocol.close()
+        finally:  # or the other end would learn of it only when the transport's patience is over
             self.output.end()

@@ -56,8 +56,8 @@ class Output:
     What it is sent is collected, and goes to the `Transport` at the flush.
     """
 
-    def __init__(self, broker: Broker, wire: Transport, client: OutputOwner) -> None:
-        self.wire = wire
+    def __init__(self, broker: Broker, transport: Transport, client: OutputOwner) -> None:
+        self.transport = transport
         self.writable = True
         self.session: Session | None = None
         #: That of the client's CONNECT, and what else was agreed with it.
@@ -159,7 +159,7 @@ class Output:
         """Whether the network has yet to take what it was given, or will be at the flush."""
         if self._out_size > LARGE_MESSAGE:
             self._full = True
-        elif not self.wire.is_behind():
+        elif not self.transport.is_behind():
             return False
         self._look_at_all(True)
         return True
@@ -248,15 +248,15 @@ class Output:
 
     def peer_status(self) -> PeerStatus:
         """How the client's computer answers."""
-        return self.wire.peer_status()
+        return self.transport.peer_status()
 
     def probe(self) -> None:
         """Have the client's computer answer, if it can."""
-        self.wire.probe()
+        self.transport.probe()
 
     def withhold(self, seconds: float) -> None:
         """Let nothing out for so long."""
-        self.wire.withhold(seconds)
+        self.transport.withhold(seconds)
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """End the connection with a DISCONNECT that says why; its will is due."""
@@ -338,12 +338,12 @@ class Output:
             self._out_size = 0
             if self._full:
                 self.writable = not self._closed
-            self.wire.write(out)
+            self.transport.write(out)
             session = self.session
             if session is not None and session.congestion is not None:
                 session.congestion.written(self._broker.store.committed)
         if self._closed:
-            self.wire.close()
+            self.transport.close()
         elif self._full:
             self._full = False
             if self.writable:  # the network has not asked for a pause
@@ -377,7 +377,7 @@ class Output:
         while waiting and waiting[0][0] <= committed:
             chunks = waiting.popleft()[1]
             if chunks:
-                self.wire.write(chunks)
+                self.transport.write(chunks)
         session = self.session
         if session is not None and session.congestion is not None:
             session.congestion.written(committed)
@@ -396,7 +396,7 @@ class Output:
             if self._client is not None:
                 self._client.lost()
         finally:
-            self.wire.close()
+            self.transport.close()
 
     def resume_writing(self) -> None:
         """The network takes bytes again: send what waited."""

@@ -38,7 +38,7 @@ def retained_size(message: Message) -> int:
 _IN_ALL: Final = "there is no room left (broker.limits.{})"
 
 
-class Retained:
+class RetainedMessages:
     """The retained messages by topic; `changed` is told of each that is new, replaced or gone.
 
     One that is gone it is told as an empty message. A message is in the account of who published

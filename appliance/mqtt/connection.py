@@ -1,7 +1,7 @@
-"""One connection's bytes: framing, size limits, topic aliases and the table of legal packet orders.
+"""The server side of one MQTT connection: framing, size limits, topic aliases and packet order.
 
-A `Connection` is given what came in and yields what was said; it does no I/O and knows no clock.
-Three kinds of event come out of it:
+`ServerProtocol` takes received bytes and yields events. It does no I/O and has no clock. There are
+three kinds of event:
 
 * a `Packet`, decoded;
 * a `RawPublish`, a PUBLISH without properties that is taken apart but not wrapped: the data path;
@@ -116,7 +116,7 @@ _FLAGS_OF_V311 = {
 _FLAGLESS = frozenset({PacketType.SUBACK, PacketType.UNSUBACK, PacketType.PINGRESP})
 
 
-class Connection:
+class ServerProtocol:
     """The server's end of one MQTT connection, as bytes.
 
     `maximum_packet_size` bounds a whole packet, in bytes, once the client has logged in;

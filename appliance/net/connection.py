@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import cast
 
 from appliance.broker.accounts import Account
-from appliance.broker.client import Client
+from appliance.broker.client import ClientHandler
 from appliance.broker.inflow import PAUSE_BEHIND
 from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, Refusal, TlsInfo
 from appliance.mqtt.connection import MAXIMUM_CONTROL
@@ -73,7 +73,7 @@ _NOTHING = memoryview(b"")
 
 
 class ClientConnection:
-    """One connection: bytes to the `Client`, and as its `Wire` bytes from it.
+    """One connection: bytes to the `ClientHandler`, and as its `Wire` bytes from it.
 
     It is an `asyncio.Protocol` without being derived from it, which makes it faster when compiled.
     """
@@ -96,7 +96,7 @@ class ClientConnection:
         self._transport: asyncio.Transport | None = None
         self._entries = scheduler.entries
         self._loop = scheduler.entries.loop
-        self._client = Client(self._broker, self)
+        self._client = ClientHandler(self._broker, self)
         self._closing = False
         self._is_lost = False
         # Input: what was received and waits, and what it waits for.
@@ -565,7 +565,7 @@ class ClientConnection:
         """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
         if self._client.session is None:
             return MAXIMUM_CONTROL
-        return self._client.connection.maximum_packet_size + MAXIMUM_CONTROL
+        return self._client.protocol.maximum_packet_size + MAXIMUM_CONTROL
 
     def count_buffered(self, size: int) -> None:
         """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
@@ -596,10 +596,10 @@ class ClientConnection:
 
     def _note_partial_input(self, is_kept: bool) -> None:
         """Know since when the beginning of something is kept below: what it holds is as old."""
-        inflow, connection = self._client.inflow, self._client.connection
+        inflow, protocol = self._client.inflow, self._client.protocol
         if is_kept:
             inflow.unfinished = inflow.unfinished or self._loop.time()
-        elif not (connection.unfinished or connection.paused or self._backlog):
+        elif not (protocol.unfinished or protocol.paused or self._backlog):
             inflow.unfinished = 0.0  # what it held is done, or it was a ping
 
     # --- bytes out -----------------------------------------------------------------------------

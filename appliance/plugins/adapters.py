@@ -10,7 +10,7 @@ from amqtt.broker import RetainedApplicationMessage
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
-from appliance.broker.client import Client
+from appliance.broker.client import ClientHandler
 from appliance.broker.message import Message
 from appliance.broker.output import Output
 from appliance.broker.ports import Identity
@@ -64,7 +64,7 @@ def _shown(session: Session) -> AmqttSession:
     shown.is_anonymous = shown.username is None
     shown.clean_session = not session.persistent
     if isinstance(session.link, Output):
-        shown.remote_address, shown.remote_port = _split(session.link.wire.address)
+        shown.remote_address, shown.remote_port = _split(session.link.transport.address)
     if session.will is not None:
         will = session.will.message
         shown.will_flag, shown.will_topic, shown.will_message = True, will.topic, will.payload
@@ -124,7 +124,7 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
     def _claim_login(self, session: Session) -> AmqttSession | None:
         """What plugins saw of the login behind the session's connection, once."""
         link, identity = session.link, session.identity
-        login = self._logins.pop(link.wire.address, None) if isinstance(link, Output) else None
+        login = self._logins.pop(link.transport.address, None) if isinstance(link, Output) else None
         # An address can be used again; who it is cannot be mistaken.
         if (
             login is None
@@ -157,8 +157,8 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
         for client_id, (session, _) in list(self._known.items()):
             if self._broker.sessions.get(client_id) is not session:
                 del self._known[client_id]
-        clients = (client for client in self._broker.clients if isinstance(client, Client))
-        addresses = {client.wire.address for client in clients}
+        clients = (client for client in self._broker.clients if isinstance(client, ClientHandler))
+        addresses = {client.transport.address for client in clients}
         for address in self._logins.keys() - addresses:
             del self._logins[address]
 

@@ -9,7 +9,7 @@ import pytest
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
-from appliance.broker.client import Client
+from appliance.broker.client import ClientHandler
 from appliance.broker.message import Message
 from appliance.broker.ports import (
     LOCAL_PEER,
@@ -174,7 +174,7 @@ class FakeStore(MemoryStore):
             del self.owed[session.client_id, message]
 
 
-class FakeWire:
+class FakeTransport:
     """A connection that takes everything; the test answers `authenticate`."""
 
     address = "192.0.2.1:40000"
@@ -255,8 +255,8 @@ class Peer:
     def __init__(self, broker: Broker, version: int = 5) -> None:
         self.broker = broker
         self.version = version
-        self.wire = FakeWire()
-        self.client = Client(broker, self.wire)
+        self.transport = FakeTransport()
+        self.client = ClientHandler(broker, self.transport)
         self._packet_id = 0
 
     @property
@@ -273,16 +273,16 @@ class Peer:
 
     def go_on(self) -> None:
         """Take the turn that was asked for, or is due."""
-        self.wire.laters = 0
-        self.wire.stopped = False
+        self.transport.laters = 0
+        self.transport.stopped = False
         self.client.send_on()
         self.broker.flush()
 
     def wait(self) -> None:
         """Let the time pass that what it published waits for its readers at most."""
-        while self.wire.waits is not None:
-            self.broker.accounting.now += self.wire.waits
-            self.wire.waits = None
+        while self.transport.waits is not None:
+            self.broker.accounting.now += self.transport.waits
+            self.transport.waits = None
             self.go_on()
 
     def received(self) -> list[Packet]:
@@ -290,8 +290,8 @@ class Peer:
         return list(self._take())
 
     def _take(self) -> Iterator[Packet]:
-        data = bytes(self.wire.written)
-        self.wire.written.clear()
+        data = bytes(self.transport.written)
+        self.transport.written.clear()
         pos = 0
         while pos < len(data):
             length, body = decode_varint(data, pos + 1)
@@ -356,7 +356,7 @@ class Peer:
         self.let_in()
         first, *rest = self._take()
         for packet in rest:
-            self.wire.written += packet.encode(self.version)
+            self.transport.written += packet.encode(self.version)
         assert isinstance(first, Connack)
         return first
 
@@ -376,7 +376,7 @@ class Peer:
         (answer,) = (packet for packet in packets if isinstance(packet, Suback))
         for packet in packets:
             if packet is not answer:
-                self.wire.written += packet.encode(self.version)
+                self.transport.written += packet.encode(self.version)
         assert answer.packet_id == packet_id  # v5 [MQTT-3.8.4-2]
         (code,) = answer.reason_codes
         return code
@@ -414,7 +414,7 @@ class Peer:
         return answer.reason_code
 
     def _keep(self, packet: Packet) -> bool:
-        self.wire.written += packet.encode(self.version)
+        self.transport.written += packet.encode(self.version)
         return False
 
     def acknowledge(self, *packets: Packet) -> None:
@@ -445,7 +445,7 @@ class Peer:
 
     def disconnect(self, code: int = 0, properties: Properties | None = None) -> None:
         self.send(Disconnect(code, properties))
-        assert self.wire.closed
+        assert self.transport.closed
 
     def slow(self) -> None:
         """The network takes nothing more."""
@@ -458,7 +458,7 @@ class Peer:
 
     def farewell(self) -> ReasonCode:
         """The connection was closed, and what the DISCONNECT (5.0) said."""
-        assert self.wire.closed
+        assert self.transport.closed
         packets = self.received()
         assert isinstance(packets[-1], Disconnect), packets
         return ReasonCode(packets[-1].reason_code)
@@ -524,7 +524,7 @@ def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Accou
             assert (session in account.absent) is (session.link is None), session
             sessions[account] += 1
     for client in broker.clients:
-        assert isinstance(client, Client)
+        assert isinstance(client, ClientHandler)
         queued[client.account] += client._held
     for message in retained:
         owner = broker.retained.owner(message.topic)

@@ -93,7 +93,7 @@ class Actor:
                 self.codes.add(packet.reason_code)
                 self.acknowledged += 1
                 self.moved.append(step)
-        if self.peer.wire.stopped or self.peer.wire.laters:
+        if self.peer.transport.stopped or self.peer.transport.laters:
             return  # it is not read
         answers = [self._owed.popleft() for _ in range(min(self.pace, len(self._owed)))]
         room = min(self.window - (self.sent - self.acknowledged), self.count - self.sent)
@@ -141,7 +141,7 @@ def play(
 
 def take_turn(actor: Actor) -> None:
     """The turn that it asked for, or for which it is time."""
-    wire, now = actor.peer.wire, actor.peer.broker.now
+    wire, now = actor.peer.transport, actor.peer.broker.now
     if wire.waits is not None:
         if actor.due is None:
             actor.due = now + wire.waits
@@ -576,9 +576,9 @@ def test_who_leaves_is_not_waited_for(join: Join, broker: Broker):
     reader = join("reader", **lasting(5))
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4), ["a"], 1100)
-    play(broker, publisher, until=lambda: publisher.peer.wire.waits is not None)
+    play(broker, publisher, until=lambda: publisher.peer.transport.waits is not None)
     reader.lose()
-    assert publisher.peer.wire.laters, "at once"
+    assert publisher.peer.transport.laters, "at once"
     play(broker, publisher)
     assert broker.counters.publish_dropped == 1100 - 1000 - 20
     assert not broker.accounting.congested
@@ -607,7 +607,7 @@ def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
     other_reader.subscribe("b", 1)
     publisher = Actor(join("publisher", version=4), ["a"], 1500)
     receivers = [Actor(reader, pace=ALL if index else 0) for index, reader in enumerate(readers)]
-    waits = publisher.peer.wire
+    waits = publisher.peer.transport
     play(broker, publisher, *receivers, until=lambda: waits.waits is not None)
     other = Actor(join("other", version=4), ["b"], 500)
     other_receiver = Actor(other_reader)
@@ -647,7 +647,7 @@ def waiting(join: Join, broker: Broker) -> Peer:
     play(broker, publisher, until=lambda: publisher.done)
     publisher.peer.send(Publish("a", b"waits", 1, False, False, 10_000))
     assert publisher.peer.received() == []
-    assert publisher.peer.wire.waits is not None and publisher.peer.wire.waits <= PATIENCE
+    assert publisher.peer.transport.waits is not None and publisher.peer.transport.waits <= PATIENCE
     return publisher.peer
 
 
@@ -665,11 +665,11 @@ def test_what_may_change_the_message_waits_behind_it(waiting: Peer):
         Publish("b", b"behind", 1, False, False, 10_002),
         Disconnect(),
     )
-    assert waiting.received() == [] and waiting.wire.stopped, "nothing is read behind it"
+    assert waiting.received() == [] and waiting.transport.stopped, "nothing is read behind it"
     waiting.wait()
     packets = waiting.received()
     assert [type(packet) for packet in packets] == [Puback, Suback, Puback]
-    assert waiting.wire.closed
+    assert waiting.transport.closed
 
 
 def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
@@ -678,7 +678,7 @@ def test_what_waits_is_bounded(waiting: Peer, broker: Broker):
     accounting.queue_bytes = 100_000
     packets = [Publish("b", bytes(1000), 1, False, False, 10_001 + n) for n in range(100)]
     sent = 0
-    while not waiting.wire.stopped:
+    while not waiting.transport.stopped:
         waiting.send(packets[sent])
         sent += 1
     assert 60 < sent < 70 and 100_000 <= client._behind_size < 102_000
@@ -701,10 +701,10 @@ def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
     for _ in range(1000):
         broker.accounting.now += STEP
         acknowledge_all(reader)
-        if publisher.wire.laters:
+        if publisher.transport.laters:
             publisher.go_on()
-            counted = client.connection.held + client._behind_size
-            assert client._held == counted == publisher.wire.held
+            counted = client.protocol.held + client._behind_size
+            assert client._held == counted == publisher.transport.held
         if not client._behind:
             break
     assert not client._behind and not client._held
@@ -718,9 +718,9 @@ def test_what_waits_takes_no_memory_that_there_is_not(waiting: Peer, broker: Bro
     accounting.quotas.memory = Quota.of(accounting.queued_bytes + 50_000, None)
     for number in range(100):
         waiting.send(Publish("b", bytes(1000), 1, False, False, 10_001 + number))
-        if waiting.wire.stopped:
+        if waiting.transport.stopped:
             break
-    assert waiting.wire.stopped and not waiting.wire.closed
+    assert waiting.transport.stopped and not waiting.transport.closed
     assert 0 < accounting.input_bytes < 20_000
 
 
@@ -744,16 +744,16 @@ def test_much_that_comes_behind_it_is_taken_in_turns(waiting: Peer, broker: Brok
     waiting.send(*packets)
     for _ in range(10):
         begun = broker.counters.cost
-        assert waiting.wire.laters
+        assert waiting.transport.laters
         waiting.go_on()
         assert broker.counters.cost - begun < 1100
-        if not waiting.wire.laters:
+        if not waiting.transport.laters:
             break
     assert len(waiting.client._behind) == 5001
     begun = broker.counters.cost
     waiting.client.hurry()
     assert broker.counters.cost - begun < 1100 and waiting.client._behind
-    while waiting.wire.laters:
+    while waiting.transport.laters:
         waiting.go_on()
     assert not waiting.client._behind
     assert len(waiting.received()) == 5001
@@ -764,7 +764,7 @@ def test_a_large_message_may_be_behind_it(waiting: Peer):
         Publish("b", bytes(100_000), 1, False, False, 10_001),
         Publish("b", b"", 1, False, False, 10_002),
     )
-    assert not waiting.wire.stopped and len(waiting.client._behind) == 3
+    assert not waiting.transport.stopped and len(waiting.client._behind) == 3
     waiting.wait()
     assert waiting.received() == [Puback(10_000), Puback(10_001), Puback(10_002)]
 
@@ -805,7 +805,7 @@ def test_a_publisher_that_is_cut_off_is_forgotten(waiting: Peer, broker: Broker)
 
 def test_wrong_bytes_behind_it_end_the_connection(waiting: Peer, broker: Broker):
     waiting.send(b"\x00\x00")
-    assert waiting.wire.closed and not waiting.client._behind
+    assert waiting.transport.closed and not waiting.client._behind
     waiting.go_on()
 
 
@@ -813,12 +813,12 @@ def test_keep_alive_is_for_those_who_are_read(join: Join, broker: Broker):
     reader = join("reader", version=4)
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4, keep_alive=1), ["a"], 1021)
-    play(broker, publisher, until=lambda: publisher.peer.wire.waits is not None)
+    play(broker, publisher, until=lambda: publisher.peer.transport.waits is not None)
     broker.tick(broker.now + 2)
-    assert not publisher.peer.wire.closed
+    assert not publisher.peer.transport.closed
     publisher.peer.wait()
     broker.tick(broker.now + 2)
-    assert publisher.peer.wire.closed, "it is silent now"
+    assert publisher.peer.transport.closed, "it is silent now"
 
 
 def test_what_the_appliance_publishes_itself_never_waits(join: Join, broker: Broker):

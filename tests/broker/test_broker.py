@@ -150,7 +150,7 @@ def test_clients_do_not_publish_to_topics_that_begin_with_a_dollar(join: Join):
     subscriber.subscribe("$SYS/#")
     assert publisher.publish("$SYS/broker/uptime", b"0", 1) == ReasonCode.NOT_AUTHORIZED
     assert subscriber.payloads() == []
-    assert not publisher.wire.closed
+    assert not publisher.transport.closed
 
 
 def test_no_subscriber_is_told_to_a_5_0_publisher(join: Join):
@@ -669,7 +669,7 @@ def test_the_number_of_sessions_is_bounded(join: Join, broker: Broker):
         join(name, **lasting(5))
     refused = Peer(broker)
     assert refused.connect("d").reason_code == ReasonCode.QUOTA_EXCEEDED
-    assert refused.wire.closed
+    assert refused.transport.closed
     join("a")  # in place of its own
 
 
@@ -693,7 +693,7 @@ def test_a_second_connection_takes_over(join: Join, broker: Broker, version):
     if version == 5:
         assert first.farewell() == ReasonCode.SESSION_TAKEN_OVER
     else:
-        assert first.wire.closed and first.received() == []
+        assert first.transport.closed and first.received() == []
     join("publisher").publish("a", b"x", 1)
     assert [m.payload for m in second.drain()] == [b"x"]
     first.lose()  # the network notices later
@@ -721,8 +721,8 @@ def test_another_user_does_not_get_the_session(join: Join, broker: Broker, versi
         peer = Peer(broker, version)
         answer = peer.connect(user=thief, clean=clean)
         assert answer.reason_code == ReasonCode.CLIENT_IDENTIFIER_NOT_VALID
-        assert peer.wire.closed
-    assert not owner.wire.closed
+        assert peer.transport.closed
+    assert not owner.transport.closed
     owner.lose()
     for clean in (True, False):
         assert Peer(broker, version).connect(user=thief, clean=clean).reason_code >= 0x80
@@ -742,14 +742,14 @@ def test_nothing_changes_before_the_client_is_known(join: Join, broker: Broker, 
     stranger.say_connect(user="user", clean=True, will=will)
     stranger.send(Subscribe(1, [Subscription("#")]), Publish("a", b"from a stranger", retain=True))
     assert stranger.received() == []
-    assert not owner.wire.closed
+    assert not owner.transport.closed
     stranger.client.refuse(ReasonCode.NOT_AUTHORIZED, "wrong password")
     broker.flush()
     answer = stranger.only(Connack)
     assert answer == Connack(False, ReasonCode.NOT_AUTHORIZED)
-    assert stranger.wire.closed
+    assert stranger.transport.closed
     stranger.lose()
-    assert not owner.wire.closed
+    assert not owner.transport.closed
     assert owner.received() == []
     assert set(broker.sessions) == {"client"}
     assert len(broker.retained) == 0
@@ -800,7 +800,7 @@ def test_breaking_the_protocol_publishes_the_will(join: Join, version):
     watcher.subscribe("w")
     peer = join(version=version, will=Will("w", b"gone"))
     peer.send(b"\x00\x00")
-    assert peer.wire.closed
+    assert peer.transport.closed
     assert watcher.payloads() == [b"gone"]
 
 
@@ -896,7 +896,7 @@ def test_publishing_is_refused(join: Join, access: FakeAccess, broker: Broker, v
     peer = join(version=version)
     code = peer.publish("forbidden/x", b"x", qos, retain=True)
     assert code == (ReasonCode.NOT_AUTHORIZED if version == 5 and qos else 0)
-    assert not peer.wire.closed
+    assert not peer.transport.closed
     assert watcher.messages() == [] and len(broker.retained) == 0
     assert broker.counters.publish_refused == 1
     peer.publish("allowed", b"x", qos)
@@ -1156,14 +1156,14 @@ def test_one_chunk_of_subscribes_does_not_make_the_broker_grow(join: Join, broke
     publisher.publish("a", bytes(1_000_000), retain=True)
     subscriber = join("subscriber", version=4)
     largest = 0
-    write = subscriber.wire.write
+    write = subscriber.transport.write
 
     def watch(chunks: list[bytes]) -> None:
         nonlocal largest
         largest = max(largest, sum(map(len, chunks)))
         write(chunks)
 
-    subscriber.wire.write = watch  # type: ignore[method-assign]
+    subscriber.transport.write = watch  # type: ignore[method-assign]
     subscriber.send(*[Subscribe(1, [Subscription("#")])] * 200)
     assert largest < 10_000_000
 

@@ -51,7 +51,7 @@ def test_connack_of_3_1_1(broker: Broker):
     peer = Peer(broker, 4)
     peer.say_connect()
     peer.let_in()
-    assert bytes(peer.wire.written) == bytes.fromhex("20 02 00 00")
+    assert bytes(peer.transport.written) == bytes.fromhex("20 02 00 00")
 
 
 @pytest.mark.parametrize("limits", [Limits(packet_size=5000, inflight=7, topic_alias=3)])
@@ -84,7 +84,7 @@ def test_3_1_1_without_an_id_needs_a_clean_session(broker: Broker):
     peer = Peer(broker, 4)
     peer.say_connect("", clean=False)
     assert peer.received() == [Connack(False, ReasonCode.CLIENT_IDENTIFIER_NOT_VALID)]
-    assert peer.wire.closed
+    assert peer.transport.closed
 
 
 @pytest.mark.parametrize(
@@ -102,13 +102,13 @@ def test_refusals(broker: Broker, version, code, return_code):
     peer.say_connect()
     peer.client.refuse(code, "for a reason")
     broker.flush()
-    answer = bytes(peer.wire.written)
+    answer = bytes(peer.transport.written)
     assert answer == (
         b"\x20\x03\0" + bytes((code, 0))
         if version == 5
         else b"\x20\x02\0\5"[:3] + bytes((return_code,))
     )
-    assert peer.wire.closed and broker.sessions == {}
+    assert peer.transport.closed and broker.sessions == {}
     peer.client.accept("user")  # too late
     assert broker.sessions == {}
 
@@ -119,7 +119,7 @@ def test_an_unknown_version_is_told_so(broker: Broker):
         peer = Peer(broker, 4)
         peer.send(bytes.fromhex(data))
         assert peer.received() == [Connack(False, ReasonCode.UNSUPPORTED_PROTOCOL_VERSION)]
-        assert peer.wire.closed
+        assert peer.transport.closed
 
 
 @pytest.mark.parametrize(
@@ -139,9 +139,9 @@ def test_what_is_no_connect_is_not_answered(broker: Broker, data):
     peer = Peer(broker, 4)
     peer.send(bytes.fromhex(data))
     assert peer.received() == []
-    assert peer.wire.asked is None
+    assert peer.transport.asked is None
     if data != "16 03 01":
-        assert peer.wire.closed
+        assert peer.transport.closed
 
 
 def test_a_second_connect_is_a_protocol_error(join: Join, version):
@@ -150,7 +150,7 @@ def test_a_second_connect_is_a_protocol_error(join: Join, version):
     peer.send(Connect("client", version=version))
     if version == 5:
         assert peer.farewell() == ReasonCode.PROTOCOL_ERROR
-    assert peer.wire.closed
+    assert peer.transport.closed
 
 
 def test_packets_behind_connect_are_done_after_the_login(broker: Broker, version):
@@ -169,7 +169,7 @@ def test_packets_behind_connect_are_done_after_the_login(broker: Broker, version
     broker.flush()
     kinds = [type(packet) for packet in peer.received()]
     assert kinds == [Connack, Suback, Publish, Puback, Pingresp]
-    assert peer.wire.closed
+    assert peer.transport.closed
 
 
 def test_a_login_of_a_client_that_has_left_comes_to_nothing(broker: Broker):
@@ -186,7 +186,7 @@ def test_enhanced_authentication_is_refused(broker: Broker):
     peer = Peer(broker)
     peer.say_connect(properties={P.AUTHENTICATION_METHOD: "SCRAM", P.AUTHENTICATION_DATA: b"x"})
     assert peer.received() == [Connack(False, ReasonCode.BAD_AUTHENTICATION_METHOD)]
-    assert peer.wire.closed
+    assert peer.transport.closed
 
 
 def test_auth_without_a_method_is_a_protocol_error(join: Join):
@@ -206,11 +206,11 @@ def test_one_and_a_half_keep_alive_without_a_packet_ends_it(join: Join, broker: 
     peer.send(Pingreq())
     peer.only(Pingresp)  # [MQTT-3.12.4-1]
     broker.tick(broker.now + 15)
-    assert not peer.wire.closed
+    assert not peer.transport.closed
     broker.tick(broker.now + 0.5)
     if version == 5:
         assert peer.farewell() == ReasonCode.KEEP_ALIVE_TIMEOUT
-    assert peer.wire.closed and broker.sessions == {}
+    assert peer.transport.closed and broker.sessions == {}
 
 
 def test_half_a_packet_is_no_sign_of_life(join: Join, broker: Broker):
@@ -218,8 +218,8 @@ def test_half_a_packet_is_no_sign_of_life(join: Join, broker: Broker):
     peer = join(keep_alive=10)
     for _ in range(4):
         broker.tick(broker.now + 4)
-        peer.client.receive(b"\x30\x7f"[:1] if not peer.client.connection.held else b"\x7f")
-    assert peer.wire.closed
+        peer.client.receive(b"\x30\x7f"[:1] if not peer.client.protocol.held else b"\x7f")
+    assert peer.transport.closed
 
 
 def test_every_packet_counts_for_the_keep_alive(join: Join, broker: Broker, version):
@@ -234,14 +234,14 @@ def test_every_packet_counts_for_the_keep_alive(join: Join, broker: Broker, vers
     ):
         broker.tick(broker.now + 14)
         peer.send(packet)
-    assert not peer.wire.closed
+    assert not peer.transport.closed
 
 
 def test_without_keep_alive_a_client_may_be_silent(join: Join, broker: Broker, version):
     """[MQTT-3.1.2-24]: zero turns it off"""
     peer = join(version=version, keep_alive=0)
     broker.tick(broker.now + 1_000_000)
-    assert not peer.wire.closed
+    assert not peer.transport.closed
 
 
 @pytest.mark.parametrize("limits", [Limits(keep_alive=60)])
@@ -252,9 +252,9 @@ def test_a_longer_keep_alive_than_allowed_is_shortened(broker: Broker, asked, gi
     answer = peer.connect(keep_alive=asked)
     assert (answer.properties or {}).get(P.SERVER_KEEP_ALIVE) == given
     broker.tick(broker.now + 1.5 * (given or asked))
-    assert not peer.wire.closed
+    assert not peer.transport.closed
     broker.tick(broker.now + 1)
-    assert peer.wire.closed
+    assert peer.transport.closed
 
 
 # --- QoS from the client
@@ -334,7 +334,7 @@ def test_more_than_the_receive_maximum_ends_the_connection(join: Join):
     peer.send(Publish("a", b"", 1, packet_id=4))  # answered at once, so that it takes no room
     peer.send(Publish("a", b"", 2, dup=True, packet_id=1), Pubrel(1))
     peer.send(Publish("a", b"", 2, packet_id=5))
-    assert not peer.wire.closed
+    assert not peer.transport.closed
     peer.send(Publish("a", b"", 2, packet_id=6))
     assert peer.farewell() == ReasonCode.RECEIVE_MAXIMUM_EXCEEDED
 
@@ -347,7 +347,7 @@ def test_the_receive_maximum_is_a_connections(join: Join):
     peer.lose()
     peer = join(**lasting(5))
     peer.send(*[Publish("a", b"", 2, packet_id=n) for n in (4, 5, 6)])
-    assert not peer.wire.closed
+    assert not peer.transport.closed
     assert set(peer.session.received) == {1, 2, 3, 4, 5, 6}
     peer.send(*[Pubrel(n) for n in range(1, 7)])
     assert not peer.session.received
@@ -358,7 +358,7 @@ def test_unfinished_qos_2_messages_are_bounded_in_bytes(join: Join, broker: Brok
     """Rule 3 of the design"""
     peer = join(version=version)
     for packet_id in range(1, 20):
-        if not peer.wire.closed:
+        if not peer.transport.closed:
             peer.send(Publish("a", bytes(5000), 2, packet_id=packet_id))
     assert broker.accounting.queued_bytes <= 20_000
     answers = [p.reason_code for p in peer.received() if isinstance(p, Pubrec)]
@@ -471,7 +471,7 @@ def test_acknowledgements_of_nothing_do_no_harm(join: Join, version):
     peer.subscribe("a", 2)
     peer.send(Puback(7), Pubrec(7), Pubcomp(7), Pubrel(7))
     assert peer.received() == [Pubrel(7), Pubcomp(7)]
-    assert not peer.wire.closed
+    assert not peer.transport.closed
 
 
 @pytest.mark.parametrize(("qos", "answer"), [(1, Pubrec), (1, Pubcomp), (2, Puback), (2, Pubcomp)])
@@ -483,7 +483,7 @@ def test_the_wrong_acknowledgement_ends_the_connection(join: Join, version, qos,
     (message,) = peer.messages()
     assert message.packet_id
     peer.send(answer(message.packet_id))
-    assert peer.wire.closed
+    assert peer.transport.closed
     if version == 5:
         assert peer.farewell() == ReasonCode.PROTOCOL_ERROR
     again = join(version=version, **lasting(version))
@@ -514,7 +514,7 @@ def test_a_puback_with_an_error_is_an_acknowledgement(join: Join):
     join("publisher").publish("a", b"x", 1)
     (message,) = peer.messages()
     peer.send(Puback(message.packet_id, ReasonCode.UNSPECIFIED_ERROR, {P.REASON_STRING: "no"}))
-    assert not peer.session.inflight and not peer.wire.closed
+    assert not peer.session.inflight and not peer.transport.closed
 
 
 @pytest.mark.parametrize("qos", [1, 2])
@@ -703,7 +703,7 @@ def test_errors_that_mosquitto_does_not_answer(join: Join, data):
     """A PINGREQ with a body, DISCONNECT with a reason of the server's, a length of five bytes"""
     peer = join()
     peer.send(bytes.fromhex(data))
-    assert peer.wire.closed and peer.received() == []
+    assert peer.transport.closed and peer.received() == []
 
 
 @pytest.mark.parametrize(
@@ -727,7 +727,7 @@ def test_wrong_connects(broker: Broker, body, answer):
     rest = bytes.fromhex("0004 4d515454" + body)
     peer = Peer(broker)
     peer.send(bytes((0x10, len(rest))) + rest)
-    assert peer.wire.closed and bytes(peer.wire.written).hex() == answer.replace(" ", "")
+    assert peer.transport.closed and bytes(peer.transport.written).hex() == answer.replace(" ", "")
 
 
 def test_errors_of_3_1_1_just_close(join: Join, broker: Broker):
@@ -736,7 +736,7 @@ def test_errors_of_3_1_1_just_close(join: Join, broker: Broker):
     peer = join(version=4)
     peer.send(Pingreq(), bytes.fromhex("30 05 0001 2b 00 00"), Pingreq())
     assert peer.received() == [Pingresp()]
-    assert peer.wire.closed and not other.wire.closed
+    assert peer.transport.closed and not other.transport.closed
     assert set(broker.sessions) == {"other"}
 
 
@@ -746,7 +746,7 @@ def test_disconnect_is_the_last_packet(join: Join, version):
     watcher.subscribe("#")
     peer = join(version=version)
     peer.send(Publish("a", b"1"), Disconnect(), Publish("a", b"2"), Pingreq())
-    assert peer.wire.closed and peer.received() == []
+    assert peer.transport.closed and peer.received() == []
     peer.send(Publish("a", b"3"))
     assert watcher.payloads() == [b"1"]
 
@@ -767,7 +767,7 @@ def test_unsuback_of_3_1_1_has_no_codes(join: Join):
     """[MQTT-3.10.4-5], section 3.11"""
     peer = join(version=4)
     peer.send(Unsubscribe(258, ["a", "b"]))
-    assert bytes(peer.wire.written) == bytes.fromhex("b0 02 0102")
+    assert bytes(peer.transport.written) == bytes.fromhex("b0 02 0102")
     peer.only(Unsuback)
 
 
@@ -779,7 +779,7 @@ def test_a_topic_alias_is_resolved_for_the_receivers(join: Join):
     peer.send(Publish("a/long/topic", b"1", properties={P.TOPIC_ALIAS: 1}))
     peer.send(Publish("", b"2", properties={P.TOPIC_ALIAS: 1}))
     assert [(m.topic, m.properties) for m in watcher.messages()] == [("a/long/topic", None)] * 2
-    assert not watcher.wire.closed
+    assert not watcher.transport.closed
 
 
 @pytest.mark.parametrize("end", ["lost", "disconnected", "taken over", "refused"])
@@ -801,7 +801,7 @@ def test_the_memory_of_a_client_is_free_at_once(broker: Broker, end: str):
         elif end == "taken over":
             Peer(broker).connect(**lasting(5))
         broker.flush()
-        wire = weakref.ref(peer.wire)  # which is held by the client
+        wire = weakref.ref(peer.transport)  # which is held by the client
         del peer
         assert wire() is None
     finally:

@@ -34,8 +34,8 @@ def test_messages_of_qos_2_that_are_never_released_take_turns(join: Join, broker
     count = 2 * COST_PER_TURN
     peer.send(*(Publish("a", b"", 2, packet_id=number + 1) for number in range(count)))
     held = len(peer.session.received)
-    assert 0 < held <= COST_PER_TURN and peer.client.connection.paused
-    while peer.wire.laters:
+    assert 0 < held <= COST_PER_TURN and peer.client.protocol.paused
+    while peer.transport.laters:
         peer.go_on()
     assert len(peer.session.received) == count
 

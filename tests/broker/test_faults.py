@@ -96,7 +96,7 @@ def goes_on(broker: Broker, other: Peer) -> None:
     """The other client is served as ever, and the clock goes on."""
     assert other.publish("other/x", b"1", 1) == 0
     assert broker.tick(broker.now + 1) >= broker.now
-    assert not other.wire.closed
+    assert not other.transport.closed
 
 
 def join(broker: Broker, name: str, version: int = 5, **options: object) -> Peer:
@@ -114,11 +114,11 @@ def test_who_cannot_be_written_to_is_abandoned_and_the_others_are_not(broker, es
     peers = {name: join(broker, name) for name in names}
     for peer in peers.values():
         peer.subscribe("t")
-    peers["b"].wire.write = fail
+    peers["b"].transport.write = fail
     sender = join(broker, "sender")
     sender.publish("t", b"x")
     assert peers["a"].payloads() == peers["c"].payloads() == [b"x"]
-    assert peers["b"].wire.closed and broker.faults.by_entry == {"flush": 1}
+    assert peers["b"].transport.closed and broker.faults.by_entry == {"flush": 1}
     assert len(broker.clients) == 3
     escaped.clear()
 
@@ -131,15 +131,15 @@ def test_a_commit_goes_on_with_the_next_output(broker, store, escaped, kept):
         peer.send(Subscribe(1, [Subscription("t", 1)]))
         assert not peer.received()
     if kept:
-        peers[1].wire.write = fail
+        peers[1].transport.write = fail
     else:
-        peers[1].wire.close = fail
+        peers[1].transport.close = fail
     store.commit(kept)
     assert 1 <= broker.faults.count <= 3
     if kept:
-        assert all(peers[n].received() for n in (0, 2)) and peers[1].wire.closed
+        assert all(peers[n].received() for n in (0, 2)) and peers[1].transport.closed
     else:
-        assert peers[0].wire.closed and peers[2].wire.closed
+        assert peers[0].transport.closed and peers[2].transport.closed
     escaped.clear()
 
 
@@ -153,7 +153,7 @@ def test_a_part_of_the_appliance_that_fails_misses_its_message_alone(broker, oth
     assert sender.publish("other/x", b"1", 1) == 0
     assert b"1" in other.payloads()
     assert broker.faults.by_entry == {"broker.delivery": 1}
-    assert not sender.wire.closed
+    assert not sender.transport.closed
     escaped.clear()
 
 
@@ -172,7 +172,7 @@ def test_who_cannot_be_asked_has_not_allowed_it(broker, access, other, escaped, 
         broker.rules_changed()
     sender = join(broker, "sender")
     assert sender.publish("drive", b"go", 1) == ReasonCode.NOT_AUTHORIZED
-    assert not sender.wire.closed and broker.faults.by_entry[f"broker.{entry}"]
+    assert not sender.transport.closed and broker.faults.by_entry[f"broker.{entry}"]
     escaped.clear()
 
 
@@ -197,7 +197,7 @@ def test_one_keep_alive_will_session_and_retained_message_that_fail(broker, stor
     for n in "abc":
         silent = join(broker, f"silent-{n}", keep_alive=10)
         if n == "b":
-            silent.wire.write = fail
+            silent.transport.write = fail
         willing = join(
             broker,
             f"willing-{n}",
@@ -261,7 +261,7 @@ def test_a_qos_2_message_whose_topic_is_no_longer_allowed(broker, other):
     broker.use(Limits(topic_levels=20), Features())
     peer.send(Pubrel(7))
     assert peer.only(Pubcomp).packet_id == 7
-    assert not peer.wire.closed and broker.counters.publish_dropped == 1
+    assert not peer.transport.closed and broker.counters.publish_dropped == 1
 
 
 @pytest.mark.parametrize("qos", [1, 2])
@@ -306,14 +306,14 @@ def test_the_longest_client_id(broker, version, size):
     peer = Peer(broker, version)
     peer.say_connect("ä" * (size // 2) + "x" * (size % 2))
     if size <= 1024:
-        assert peer.wire.asked is not None
+        assert peer.transport.asked is not None
         return
     # 0x85, and 2 in 3.1.1; nobody was asked who it is, and nothing of it is kept.
     if version == 4:
-        assert bytes(peer.wire.written) == bytes((0x20, 2, 0, 2))
+        assert bytes(peer.transport.written) == bytes((0x20, 2, 0, 2))
     else:
         assert peer.only(Connack).reason_code == ReasonCode.CLIENT_IDENTIFIER_NOT_VALID
-    assert peer.wire.closed and peer.wire.asked is None and not broker.sessions
+    assert peer.transport.closed and peer.transport.asked is None and not broker.sessions
 
 
 def test_response_information_is_left_out_where_it_is_too_long(broker):
@@ -406,7 +406,7 @@ PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
     (lambda broker, peer: broker.store, "session_removed"),
     (lambda broker, peer: broker.router, "leave"),
     (lambda broker, peer: peer.client, "_stop_waiting"),
-    (lambda broker, peer: peer.client.connection, "close"),
+    (lambda broker, peer: peer.client.protocol, "close"),
     (lambda broker, peer: peer.client.output, "end"),
 ]
 
@@ -474,7 +474,7 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
         except BrokenError as error:
             broker.fault("connection.lost", error, peer.client)
     broker.flush()
-    assert peer.wire.closed, "at once, not when the wire's patience is over"
+    assert peer.transport.closed, "at once, not when the wire's patience is over"
     assert len(broker.router) == subscriptions - (0 if expiry else 1)
     assert peer.client not in broker.clients
     assert account.connections == (1 if account is other.session.account else 0)
@@ -584,7 +584,7 @@ def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
         "reconnected": Session,
         "set_will": Session,
         "open": peer.client.output,
-        "accept": peer.client.connection,
+        "accept": peer.client.protocol,
     }[name]
     once(monkeypatch, owner, name)
     try:
@@ -593,7 +593,7 @@ def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
         broker.fault("connection.turn", error, peer.client)
     broker.flush()
     assert peer.only(Connack).reason_code == FAULT
-    assert peer.wire.closed and peer.client not in broker.clients
+    assert peer.transport.closed and peer.client not in broker.clients
     session = broker.sessions.get("a")
     assert session is None or session.link is None
     assert not [each for each in other.received() if isinstance(each, Publish)]

@@ -84,9 +84,9 @@ def test_a_failed_commit_closes_the_connections_concerned(join: Join, store: Fak
     other = join("other")
     publisher.send(Publish("a", b"x", 1, packet_id=1))
     store.commit(kept=False)
-    assert publisher.received() == [] and publisher.wire.closed
-    assert subscriber.received() == [] and subscriber.wire.closed
-    assert not other.wire.closed
+    assert publisher.received() == [] and publisher.transport.closed
+    assert subscriber.received() == [] and subscriber.transport.closed
+    assert not other.transport.closed
     store.commit()
     other.send(Publish("a", b"x", 1, packet_id=1))
     other.only(Puback)
@@ -96,7 +96,7 @@ def test_a_failed_commit_closes_a_connection_that_was_ending(join: Join, store: 
     _, publisher = held_back(join, store)
     publisher.send(Publish("a", b"x", 1, packet_id=1), bytes((0xE0, 0)))
     store.commit(kept=False)
-    assert publisher.received() == [] and publisher.wire.closed
+    assert publisher.received() == [] and publisher.transport.closed
 
 
 def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store: FakeStore):
@@ -106,7 +106,7 @@ def test_bytes_wait_for_the_commit_when_the_client_leaves_too(join: Join, store:
     assert publisher.received() == []
     store.commit()
     publisher.only(Puback)
-    assert publisher.wire.closed
+    assert publisher.transport.closed
 
 
 def failing(join: Join, store: FakeStore, version: int = 5) -> tuple[Peer, Peer]:
@@ -135,7 +135,7 @@ def test_what_cannot_be_stored_is_refused(join: Join, store: FakeStore, qos: int
 def test_3_1_1_is_not_told_a_lie(join: Join, store: FakeStore, qos: int):
     subscriber, publisher = failing(join, store, version=4)
     publisher.send(Publish("a", b"x", qos, packet_id=1))
-    assert publisher.received() == [] and publisher.wire.closed
+    assert publisher.received() == [] and publisher.transport.closed
     store.commit()
     assert subscriber.received() == []
 

@@ -99,7 +99,7 @@ def test_disconnect_ends_the_connection_and_keeps_the_session(join: Join, qos):
     subscriber.subscribe("a", qos)
     publisher = join("publisher")
     fill(publisher, 4, qos)
-    assert not subscriber.wire.closed
+    assert not subscriber.transport.closed
     fill(publisher, 1, qos)
     assert subscriber.farewell() == ReasonCode.QUOTA_EXCEEDED
     back = join("subscriber", **lasting(5))
@@ -117,7 +117,7 @@ def test_a_chain_of_wills_behind_full_queues_comes_to_an_end(join: Join):
         for _ in range(4):
             publisher.publish(f"t/{number}", b"x", 1)
     publisher.publish("t/0", b"x", 1)
-    assert all(peer.wire.closed for peer in peers)
+    assert all(peer.transport.closed for peer in peers)
 
 
 # --- QoS 0 for slow clients
@@ -201,8 +201,8 @@ def test_long_topics(join: Join, broker: Broker):
 def take_turns(broker: Broker, peer: Peer, most: int = 1000) -> list[int]:
     """Give the peer its turns until it wants no more; returns the cost of each."""
     costs: list[int] = []
-    while peer.wire.laters and len(costs) < most:
-        peer.wire.laters -= 1
+    while peer.transport.laters and len(costs) < most:
+        peer.transport.laters -= 1
         begun = broker.counters.cost
         peer.client.send_on()
         broker.flush()
@@ -232,7 +232,7 @@ def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access
         broker.retained.keep(message, broker.accounting.accounts.inside)
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
-    assert subscriber.payloads() == [] and subscriber.wire.laters == 1
+    assert subscriber.payloads() == [] and subscriber.transport.laters == 1
     for number in range(REPLAYED_A_TURN + 5):
         broker.retained.delete(f"r/{number}")
 
@@ -244,7 +244,7 @@ def test_what_one_client_sends_takes_turns(join: Join, broker: Broker):
     count = 3 * COST_PER_TURN
     peer.send(Publish("a", b"x").encode(5) * count)
     heard = len(subscriber.payloads())
-    assert 0 < heard < count and peer.client.connection.paused
+    assert 0 < heard < count and peer.client.protocol.paused
     peer.send(Publish("a", b"last").encode(5))  # what comes meanwhile waits its turn
     take_turns(broker, peer)
     payloads = subscriber.payloads()
@@ -261,12 +261,12 @@ def test_a_search_that_passes_many_filters_ends_the_turn_though_none_matches(
     begun = broker.counters.cost
     topics = ["/".join(["a"] * 11 + [f"new{number}"]) for number in range(3)]
     peer.send(*(Publish(topic, b"x") for topic in topics))
-    assert peer.client.connection.paused and peer.wire.laters  # the others have their turn
+    assert peer.client.protocol.paused and peer.transport.laters  # the others have their turn
     assert broker.counters.publish_received == 1
     assert broker.counters.cost - begun > COST_PER_TURN
     assert len(take_turns(broker, peer)) >= 2
     assert broker.counters.publish_received == 3
-    assert not peer.client.connection.paused
+    assert not peer.client.protocol.paused
 
 
 @pytest.mark.parametrize("limits", [Limits(subscriptions=MAXIMUM_FILTERS)])
@@ -335,13 +335,13 @@ def test_what_has_come_in_is_counted(join: Join, broker: Broker):
     peers = [join(f"p{n}") for n in range(3)]
     for peer in peers:
         peer.send(Publish("a", bytes(100_000)).encode(5)[:80_000])
-    assert [peer.wire.closed for peer in peers] == [False, False, True]
+    assert [peer.transport.closed for peer in peers] == [False, False, True]
     assert peers[2].farewell() == ReasonCode.QUOTA_EXCEEDED
     peers[0].send(bytes(20_100))
     peers[1].lose()
     assert broker.accounting.input_bytes < 200
     alias = {Property.TOPIC_ALIAS: 1}
-    peers[0].wire.closed or peers[0].lose()
+    peers[0].transport.closed or peers[0].lose()
     aliased = join("aliased")
     aliased.publish("x" * 10_000, properties=alias)
     assert 10_000 < broker.accounting.input_bytes < 10_300
@@ -389,9 +389,9 @@ def test_a_stranger_has_fewer_user_properties(broker: Broker):
         peer.say_connect(will=will, properties=user_properties(STRANGERS_PAIRS // 2 + more))
         if more:
             assert peer.only(Connack).reason_code == ReasonCode.QUOTA_EXCEEDED  # type: ignore
-            assert peer.wire.closed
+            assert peer.transport.closed
         else:
-            assert peer.wire.asked is not None
+            assert peer.transport.asked is not None
 
 
 @pytest.mark.parametrize("limits", [Limits(user_properties=200)])
@@ -456,9 +456,9 @@ def test_thousands_that_fall_silent_end_in_turns(join: Join, broker: Broker):
     peers = [join(f"p{n}", keep_alive=10) for n in range(2 * ENDINGS_PER_TICK + 1)]
     for turn in (1, 2):
         assert broker.tick(1020.0) == 1020.0
-        assert sum(peer.wire.closed for peer in peers) == turn * ENDINGS_PER_TICK
+        assert sum(peer.transport.closed for peer in peers) == turn * ENDINGS_PER_TICK
     assert broker.tick(1020.0) > 1020.0
-    assert all(peer.wire.closed for peer in peers)
+    assert all(peer.transport.closed for peer in peers)
 
 
 def test_thousands_of_sessions_expire_in_turns(join: Join, broker: Broker):
@@ -570,7 +570,7 @@ def test_a_keep_alive_over_the_limit(broker: Broker, version, asked):
         return
     peer.say_connect("id", keep_alive=asked)
     peer.let_in()
-    assert bytes(peer.wire.written) == b"\x20\x02\x00\x02"
+    assert bytes(peer.transport.written) == b"\x20\x02\x00\x02"
 
 
 @pytest.mark.parametrize("policy", ["refuse", "drop-oldest", "disconnect"])

@@ -245,7 +245,7 @@ class Conversations(RuleBasedStateMachine):
         assert answer.reason_code < 0x80
         for packet in packets:
             if packet is not answer:
-                peer.wire.written += packet.encode(peer.version)
+                peer.transport.written += packet.encode(peer.version)
 
     @rule(name=names, topic=topics)
     def publish_half_of_qos_2(self, name, topic):
@@ -357,7 +357,7 @@ class Conversations(RuleBasedStateMachine):
         )
         for known in self.known.values():
             if known.peer is not None and not known.slow:
-                assert known.peer.wire.written or not known.live
+                assert known.peer.transport.written or not known.live
 
     def teardown(self):
         """In the end everyone is back, reads and answers: all that is owed has come."""
@@ -507,14 +507,14 @@ def test_a_large_message_waits_while_the_network_is_behind_and_a_small_one_does_
 ):
     peer, origin, counted = join(version=version), broker.attach("inside", Recorder()), Counted()
     peer.subscribe("#")
-    peer.wire.behind = True
+    peer.transport.behind = True
     for payload in (LARGE + b"1", LARGE + b"2"):
         broker.publish(watched("image", payload, counted), origin)
     broker.publish(Message("state", b"s"), origin)
     broker.flush()
     assert peer.payloads() == [b"s"]
     assert counted.skipped == broker.counters.publish_dropped == 1
-    peer.wire.behind = False
+    peer.transport.behind = False
     peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE + b"2"]
@@ -527,14 +527,14 @@ def test_a_large_message_does_not_come_behind_a_newer_one_of_its_topic(
     broker.accounting.limits = dataclasses.replace(broker.accounting.limits, keep=keep or 0)
     peer, publisher = join(version=version), join("publisher")
     peer.subscribe("#")
-    peer.wire.behind = True
+    peer.transport.behind = True
     origin, counted = broker.attach("inside", Recorder()), Counted()
     broker.publish(watched("a", LARGE, counted), origin)
     broker.publish(Message("b", LARGE), origin)
     publisher.send(Publish("a", b"1"))
     broker.publish(Message("a", b"2"), origin)
     broker.flush()
-    peer.wire.behind = False
+    peer.transport.behind = False
     peer.client.output.caught_up()
     broker.publish(Message("a", b"3"), origin)
     broker.flush()
@@ -551,10 +551,10 @@ def test_one_that_waited_for_a_pause_to_end_does_not_either(broker: Broker, join
     peer.subscribe("#")
     peer.slow()
     broker.publish(Message("a", LARGE), origin)
-    peer.wire.behind = True
+    peer.transport.behind = True
     peer.fast()
     broker.publish(Message("a", b"1"), origin)
-    peer.wire.behind = False
+    peer.transport.behind = False
     peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [b"1"]
@@ -573,10 +573,10 @@ def test_large_messages_go_one_by_one_and_behind_small_ones(broker: Broker, join
     peer.slow()
     for topic in ("a", "b"):
         broker.publish(Message(topic, LARGE), origin)
-    peer.wire.behind = True
+    peer.transport.behind = True
     peer.fast()
     assert peer.payloads() == []
-    peer.wire.behind = False
+    peer.transport.behind = False
     peer.client.output.caught_up()
     broker.flush()
     assert peer.payloads() == [LARGE, LARGE]
@@ -587,10 +587,10 @@ def test_retained_messages_that_are_large_are_all_sent(broker: Broker, join: Joi
     for number in range(20):
         broker.publish(Message(f"map/{number}", LARGE, 0, True), origin)
     peer = join()
-    peer.wire.behind = True
+    peer.transport.behind = True
     peer.subscribe("map/#")
     assert peer.payloads() == []
-    peer.wire.behind = False
+    peer.transport.behind = False
     peer.client.output.caught_up()
     broker.flush()
     assert len(peer.payloads()) == 20
@@ -600,7 +600,7 @@ def test_retained_messages_that_are_large_are_all_sent(broker: Broker, join: Joi
 def test_a_client_that_leaves_takes_what_waits_for_it_along(broker: Broker, join: Join):
     peer, origin = join(), broker.attach("inside", Recorder())
     peer.subscribe("#")
-    peer.wire.behind = True
+    peer.transport.behind = True
     broker.publish(Message("image", LARGE), origin)
     broker.flush()
     assert waiting_bytes(broker) > len(LARGE)

@@ -142,7 +142,7 @@ def test_a_user_whose_sessions_are_all_in_use_is_refused(broker: Broker, join: J
     crowd = [join(f"m-{number}", user="mallory") for number in range(3)]
     refused = try_to_connect(broker, "one-more", "mallory")
     assert refused.code == FULL
-    assert not any(peer.wire.closed for peer in crowd)
+    assert not any(peer.transport.closed for peer in crowd)
 
 
 @pytest.mark.parametrize("limits", [Limits(sessions=8)])
@@ -198,11 +198,11 @@ def test_a_session_in_use_makes_room_only_when_there_is_no_other(broker: Broker,
     leave_sessions(broker, "mallory", 1)
     assert leave_sessions(broker, "alice", 1) == [0]
     assert "mallory-0" not in broker.sessions
-    assert not any(peer.wire.closed for peer in (first, second, third))
+    assert not any(peer.transport.closed for peer in (first, second, third))
     bob = try_to_connect(broker, "bob", "bob")
     assert bob.code == 0
     assert third.farewell() == FULL  # the newest
-    assert not first.wire.closed and not second.wire.closed
+    assert not first.transport.closed and not second.transport.closed
 
 
 @pytest.mark.parametrize("limits", [Limits(sessions=8)])
@@ -245,7 +245,7 @@ def test_a_refused_connect_changes_nothing(broker: Broker):
     refused = try_to_connect(broker, "absent", "alice", clean=True)
     assert refused.code == FULL
     assert broker.sessions["absent"] is before and before.persistent
-    assert not other.wire.closed
+    assert not other.transport.closed
 
 
 # --- connections
@@ -257,12 +257,12 @@ def test_the_newest_connection_of_who_has_most_makes_room(broker: Broker, join: 
     alice = try_to_connect(broker, "alice", "alice")
     assert alice.code == 0
     assert crowd[3].farewell() == FULL
-    assert not any(peer.wire.closed for peer in crowd[:3])
+    assert not any(peer.transport.closed for peer in crowd[:3])
     assert "m-3" in broker.sessions, "its session goes on without it"
     assert "broker.limits.user.connections" in caplog.text
     again = try_to_connect(broker, "m-3", "mallory")
     assert again.code == FULL
-    assert not alice.wire.closed
+    assert not alice.transport.closed
     crowd[0].lose()
     again = try_to_connect(broker, "m-3", "mallory")
     assert again.code == 0
@@ -280,10 +280,10 @@ def test_small_users_end_no_connection_beyond_their_sure_share(broker: Broker):
     fleet = connect_many(broker, "fleet", 10)
     small = [peer for user in ("low", "low2") for peer in connect_many(broker, user, 10)]
     # The first got what was free; the second its quarter, which the fleet had beyond its own.
-    ended = [peer for peer in fleet if peer.wire.closed]
+    ended = [peer for peer in fleet if peer.transport.closed]
     assert len(ended) <= 4
     by_user = {user: len([p for p in small if p.session.identity.username == user
-                          and not p.wire.closed]) for user in ("low", "low2")}  # fmt: skip
+                          and not p.transport.closed]) for user in ("low", "low2")}  # fmt: skip
     assert by_user["low2"] == 4
     assert by_user["low"] + len(fleet) - len(ended) == 12
     assert by_user["low"] >= 4
@@ -297,11 +297,11 @@ def test_who_has_its_sure_share_takes_no_connection_of_who_has_more(broker: Brok
     fleet = connect_many(broker, "fleet", 12)
     refused = try_to_connect(broker, "low-more", "low")
     assert refused.code == FULL
-    assert not any(peer.wire.closed for peer in small + fleet)
+    assert not any(peer.transport.closed for peer in small + fleet)
     alice = try_to_connect(broker, "alice", "alice")
     assert alice.code == 0
-    assert [peer.wire.closed for peer in fleet] == [False] * 11 + [True]
-    assert not any(peer.wire.closed for peer in small)
+    assert [peer.transport.closed for peer in fleet] == [False] * 11 + [True]
+    assert not any(peer.transport.closed for peer in small)
 
 
 @pytest.mark.parametrize("limits", [Limits(connections=16, user=UserLimits(connections=10))])
@@ -309,7 +309,7 @@ def test_who_keeps_within_a_configured_number_loses_no_connection(broker: Broker
     fleet = connect_many(broker, "fleet", 10)
     assert len(connect_many(broker, "low", 10)) == 6
     assert connect_many(broker, "low2", 10) == []
-    assert not any(peer.wire.closed for peer in fleet)
+    assert not any(peer.transport.closed for peer in fleet)
 
 
 @pytest.mark.parametrize("limits", [Limits(connections=4, sessions=4)])
@@ -323,7 +323,7 @@ def test_who_is_refused_for_its_session_ends_no_connection(broker: Broker, join:
     broker.use(Limits(connections=3, sessions=4, user=UserLimits(sessions=0)), Features())
     refused = try_to_connect(broker, "bob", "bob")
     assert refused.code == FULL
-    assert not any(peer.wire.closed for peer in crowd)
+    assert not any(peer.transport.closed for peer in crowd)
     assert broker.counters.evicted == 0
 
 
@@ -673,7 +673,7 @@ def test_a_reload_takes_nothing_from_who_holds_more(broker: Broker, join: Join):
         peers[0].publish(f"r/{number}", b"x", 0, retain=True)
     user = UserLimits(connections=2, sessions=2, retained_messages=2)
     broker.use(Limits(user=user), Features())
-    assert not any(peer.wire.closed for peer in peers)
+    assert not any(peer.transport.closed for peer in peers)
     assert len(broker.retained) == 4
     refused = try_to_connect(broker, "m-5", "mallory")
     assert refused.code == FULL
@@ -746,7 +746,7 @@ class Mallory:
     def act(self) -> None:
         actions: list[Callable[[], None]] = [self.come, self.come, self.go, self.listen, self.say]
         self.chance.choice(actions)()
-        self.peers = [peer for peer in self.peers if not peer.wire.closed]
+        self.peers = [peer for peer in self.peers if not peer.transport.closed]
 
     def come(self) -> None:
         number = self.chance.randrange(200)
@@ -806,7 +806,7 @@ def test_whatever_mallory_does_alice_has_her_share(broker: Broker, access: FakeA
         assert alice.subscribe(f"alice/+/{turn % 5}", 1) == 1, turn
         owed.append(bytes(chance.randrange(1000)))
         assert alice.publish("alice/queue", owed[-1], 1) == 0, turn
-        assert not alice.wire.closed, turn
+        assert not alice.transport.closed, turn
         if chance.random() < 0.5:
             alice.lose()
         else:

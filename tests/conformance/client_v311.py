@@ -69,7 +69,7 @@ class Client(Peer):
     @property
     def closed(self) -> bool:
         """Whether the broker has closed the connection."""
-        return self.wire.closed
+        return self.transport.closed
 
     def say(self, *packets: Wire) -> bytes:
         """Send the packets in one chunk; returns all that was heard since the last look."""
@@ -78,8 +78,8 @@ class Client(Peer):
 
     def hear(self) -> bytes:
         """What has come since the last look."""
-        heard = bytes(self.wire.written)
-        self.wire.written.clear()
+        heard = bytes(self.transport.written)
+        self.transport.written.clear()
         return heard
 
     def log_in(self, connect: bytes, user: str | None = "user") -> bytes:

@@ -106,7 +106,7 @@ def turned_away(client: Client, *packets: Wire) -> bool:
     """
     heard = client.say(*packets)
     is_refusal = len(heard) == 5 and heard[3] >= 0x80 and heard == connack(heard[3])
-    return client.closed and client.wire.asked is None and (not heard or is_refusal)
+    return client.closed and client.transport.asked is None and (not heard or is_refusal)
 
 
 def is_closed(client: Client, code: int, *packets: Wire) -> bool:

@@ -58,7 +58,7 @@ statement = pytest.mark.statement
 def test_what_comes_before_connect_closes_the_connection(broker: Broker, first: str) -> None:
     client = Client(broker)
     assert refused(client, first, connect("c"))
-    assert client.wire.asked is None
+    assert client.transport.asked is None
     assert broker.sessions == {} and len(broker.retained) == 0
 
 
@@ -99,7 +99,7 @@ def test_another_protocol_is_not_taken_for_mqtt(broker: Broker, name: str, level
     # It may be told what the server speaks, in the form that 3.1 knows too, or nothing.
     assert client.say(connect("c", name=name, level=level), "c0 00") in (b"", wire("20 02 00 01"))
     assert client.closed
-    assert client.wire.asked is None and broker.sessions == {}
+    assert client.transport.asked is None and broker.sessions == {}
 
 
 @statement("3.1.1", "MQTT-3.1.2-2", "MQTT-3.2.2-4", "MQTT-3.2.2-5")
@@ -108,7 +108,7 @@ def test_an_unsupported_level_is_answered_and_closed_upon(broker: Broker, level:
     client = Client(broker)
     assert client.say(connect("c", level=level), "c0 00") == wire("20 02 00 01")
     assert client.closed
-    assert client.wire.asked is None and broker.sessions == {}
+    assert client.transport.asked is None and broker.sessions == {}
 
 
 @statement("3.1.1", "MQTT-3.1.2-3", "MQTT-3.1.4-1")
@@ -154,7 +154,7 @@ FIVE = ("c", "w", b"gone", "user", b"secret")
 def test_a_malformed_connect_gets_no_connack(broker: Broker, data: str) -> None:
     client = Client(broker)
     assert refused(client, data)
-    assert client.wire.asked is None and broker.sessions == {}
+    assert client.transport.asked is None and broker.sessions == {}
 
 
 @statement("3.1.1", "MQTT-3.1.4-1", "MQTT-3.2.2-6")
@@ -213,7 +213,7 @@ def test_flags_and_fields_that_do_not_agree_close_the_connection(
 ) -> None:
     client = Client(broker)
     assert refused(client, connect(*fields, flags=flags))
-    assert client.wire.asked is None and broker.sessions == {}
+    assert client.transport.asked is None and broker.sessions == {}
 
 
 @statement("3.1.1", "MQTT-3.1.3-1", "MQTT-3.1.3-3", "MQTT-3.1.2-9", "MQTT-3.1.2-19")
@@ -221,7 +221,7 @@ def test_flags_and_fields_that_do_not_agree_close_the_connection(
 def test_the_fields_are_taken_in_their_order(broker: Broker) -> None:
     client = Client(broker)
     client.say(connect(*FIVE, flags=ALL | WILL_RETAIN | 0x10, keep_alive=0x0102))
-    asked = client.wire.asked
+    asked = client.transport.asked
     assert asked is not None
     assert (asked.client_id, asked.username, asked.password) == ("c", "user", b"secret")
     assert asked.will == Will("w", b"gone", 2, True)

@@ -69,7 +69,7 @@ def is_refused(broker: Broker, where: str, text: bytes) -> bool:
     """Whether the connection is closed upon the string, without a CONNACK or another answer."""
     if where in IN_CONNECT:
         client = Client(broker)
-        return refused(client, IN_CONNECT[where](text)) and client.wire.asked is None
+        return refused(client, IN_CONNECT[where](text)) and client.transport.asked is None
     return refused(joined(broker), BEHIND_CONNECT[where](text))
 
 

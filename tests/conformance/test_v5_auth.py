@@ -61,9 +61,9 @@ def auth(code: int, *items: Wire) -> bytes:
 def beginning(broker: Broker, *answers: Answer, **options: object) -> tuple[Client, Scripted]:
     """A client that has sent CONNECT with the method and data; what it was told is not heard."""
     client, exchange = Client(broker), Scripted(*answers)
-    client.wire.exchanges["M"] = exchange
+    client.transport.exchanges["M"] = exchange
     client.send(connect("c", **{"props": properties(METHOD, DATA), **options}))  # type: ignore[arg-type]
-    assert client.wire.asked is None, "it is not by its password that it comes in"
+    assert client.transport.asked is None, "it is not by its password that it comes in"
     return client, exchange
 
 
@@ -72,7 +72,7 @@ def authenticated(broker: Broker, *later: Answer) -> tuple[Client, Scripted]:
     client, _ = beginning(broker, Accepted("user", b""))
     assert client.hear()[:4] == wire("20 0d 00 00")
     again = Scripted(*later)
-    client.wire.exchanges["M"] = again
+    client.transport.exchanges["M"] = again
     return client, again
 
 
@@ -147,7 +147,7 @@ def test_what_comes_behind_a_refused_exchange_has_no_effect(broker: Broker) -> N
     watcher = joined(broker, "watcher")
     watcher.subscribe("#")
     client = Client(broker)
-    client.wire.exchanges["M"] = Scripted(BAD)
+    client.transport.exchanges["M"] = Scripted(BAD)
     heard = client.say(
         connect("c", b"\0", "w", "gone", flags=CLEAN_START | WILL, props=properties(METHOD)),
         publish("a", b"x"),
@@ -238,9 +238,9 @@ def test_an_auth_that_is_no_answer_ends_it(broker: Broker, wrong: bytes) -> None
 @statement("5.0", "MQTT-4.12.0-6")
 def test_without_a_method_there_is_no_auth_and_no_method(broker: Broker) -> None:
     client = Client(broker)
-    client.wire.exchanges["M"] = Scripted(b"one")
+    client.transport.exchanges["M"] = Scripted(b"one")
     assert client.log_in(connect("c")) == ACCEPTED
-    assert client.wire.asked is not None
+    assert client.transport.asked is not None
 
 
 @statement("5.0", "MQTT-4.12.0-7", "MQTT-4.13.1-1")

@@ -75,7 +75,7 @@ def test_the_first_packet_is_connect(broker: Broker, first: str) -> None:
     watcher = watching(broker)
     client = Client(broker)
     assert client.say(first, connect("c")) == b""
-    assert client.closed and client.wire.asked is None
+    assert client.closed and client.transport.asked is None
     assert watcher.hear() == b""
 
 
@@ -98,7 +98,7 @@ UNSUPPORTED = (b"", wire("20 02 00 01"), connack(0x84))
 def test_another_protocol_name_is_not_served(broker: Broker, name: str) -> None:
     client = Client(broker)
     assert client.say(connect("c", name=name)) in UNSUPPORTED
-    assert client.closed and client.wire.asked is None
+    assert client.closed and client.transport.asked is None
 
 
 @statement("5.0", "MQTT-3.1.2-2", "MQTT-3.14.0-1")
@@ -106,7 +106,7 @@ def test_another_protocol_name_is_not_served(broker: Broker, name: str) -> None:
 def test_another_version_is_not_served(broker: Broker, version: int) -> None:
     client = Client(broker)
     assert client.say(connect("c", version=version)) in UNSUPPORTED
-    assert client.closed and client.wire.asked is None
+    assert client.closed and client.transport.asked is None
 
 
 # --- 3.1.2.3 flags
@@ -478,8 +478,8 @@ def test_user_name_and_password_are_what_the_packet_has(
 ) -> None:
     client = Client(broker)
     assert client.log_in(connect(*payload, flags=CLEAN_START | flags), user) == ACCEPTED
-    assert client.wire.asked is not None
-    assert (client.wire.asked.username, client.wire.asked.password) == (user, password)
+    assert client.transport.asked is not None
+    assert (client.transport.asked.username, client.transport.asked.password) == (user, password)
 
 
 # --- 3.1.2.10 keep alive
@@ -750,7 +750,7 @@ def test_the_payload_is_read_in_its_order(broker: Broker) -> None:
     will_properties = properties("26 0001 6b 0001 76")
     data = connect("1", will_properties, "2", "3", "4", "5", flags=CLEAN_START | 0xC4)
     assert client.log_in(data, "4") == ACCEPTED
-    asked = client.wire.asked
+    asked = client.transport.asked
     assert asked is not None
     assert (asked.client_id, asked.username, asked.password) == ("1", "4", b"5")
     client.lose()

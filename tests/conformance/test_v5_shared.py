@@ -44,7 +44,7 @@ def members(
 
 def chosen(clients: list[Client]) -> tuple[Client, list[Client]]:
     """Who of them was sent something, that is not heard yet; and the others."""
-    (one,) = [client for client in clients if client.wire.written]
+    (one,) = [client for client in clients if client.transport.written]
     return one, [client for client in clients if client is not one]
 
 

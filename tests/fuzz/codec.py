@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from inputs import Source, chunks, damage
 
 from appliance.mqtt.codec import PacketType, decode_string, decode_varint
-from appliance.mqtt.connection import ALIAS_SIZE, Connection, RawPublish
+from appliance.mqtt.connection import ALIAS_SIZE, RawPublish, ServerProtocol
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, decode_packet
 from appliance.mqtt.reason import ProtocolError
 
@@ -95,7 +95,7 @@ def read_stream(wire: bytes, version: int, rng: random.Random) -> None:
 
 def _read(parts: Iterable[bytes], version: int) -> tuple[list[Packet], int]:
     """The packets in it, and the code of the error that ended it, 0 for none."""
-    connection = Connection(MAXIMUM, ALIASES)
+    connection = ServerProtocol(MAXIMUM, ALIASES)
     connect = Source(random.Random(0)).packet(version, [PacketType.CONNECT])
     done = b""
     packets: list[Packet] = []
@@ -126,7 +126,7 @@ def _read(parts: Iterable[bytes], version: int) -> tuple[list[Packet], int]:
     return packets, 0
 
 
-def _as_publish(event: RawPublish, version: int, connection: Connection) -> Publish:
+def _as_publish(event: RawPublish, version: int, connection: ServerProtocol) -> Publish:
     """What the short form says; its topic is looked at by who takes it, which ends it here too."""
     first, topic_wire, packet_id, payload, head = event
     body = topic_wire + (packet_id.to_bytes(2, "big") if packet_id else b"")

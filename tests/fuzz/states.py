@@ -73,7 +73,7 @@ class Known:
 
     @property
     def closed(self) -> bool:
-        return self.lost or self.peer.wire.closed
+        return self.lost or self.peer.transport.closed
 
     def has_said(self, packet: Packet) -> None:
         """Take in what the packet means for the messages that it was sent."""
@@ -175,8 +175,8 @@ class World:
             self.access.epoch += 1
             self.broker.rules_changed()
         elif what < 0.33:
-            for _ in range(peer.wire.laters):
-                peer.wire.laters -= 1
+            for _ in range(peer.transport.laters):
+                peer.transport.laters -= 1
                 peer.client.output.resume_writing()
             self.broker.flush()
         elif client.open_ids and what < 0.6:
@@ -190,7 +190,7 @@ class World:
         self.came += 1
         user = rng.choice(("mallory", "trudy"))
         client = Known(self.came, Peer(self.broker, version), user)
-        client.peer.wire.exchanges[METHOD] = Riddle(rng, client.user)
+        client.peer.transport.exchanges[METHOD] = Riddle(rng, client.user)
         if rng.random() < 0.1:
             self._note(client, "says nothing right")
             client.peer.send(damage(rng, self.source.packet(version).encode(version)))
@@ -204,7 +204,7 @@ class World:
         if rng.random() < 0.2:  # what comes behind CONNECT waits for the login
             wire += self.source.packet(version, KINDS).encode(version)
         client.peer.send(wire)
-        if client.peer.wire.asked is not None:
+        if client.peer.transport.asked is not None:
             decision = rng.random()
             if decision < 0.1:
                 client.peer.client.refuse(ReasonCode.NOT_AUTHORIZED, "the test says so")

@@ -15,8 +15,8 @@ from appliance.mqtt.codec import Property, decode_properties, decode_string, enc
 from appliance.mqtt.connection import (
     MAXIMUM_CONNECT,
     MAXIMUM_CONTROL,
-    Connection,
     Event,
+    ServerProtocol,
     State,
 )
 from appliance.mqtt.packets import (
@@ -48,9 +48,9 @@ ALIASES = 10
 ACKNOWLEDGEMENTS = {cls.TYPE: cls for cls in (Puback, Pubrec, Pubrel, Pubcomp)}
 
 
-def connected(version: int, size: int = SIZE) -> Connection:
+def connected(version: int, size: int = SIZE) -> ServerProtocol:
     """A connection whose client has logged in."""
-    connection = Connection(size, ALIASES)
+    connection = ServerProtocol(size, ALIASES)
     properties = {Property.AUTHENTICATION_METHOD: "m"} if version == 5 else None
     packet = Connect("client", version=version, properties=properties)  # type: ignore[arg-type]
     (connect,) = connection.receive_data(packet.encode())
@@ -112,7 +112,7 @@ def without_pairs(packet: Packet) -> Packet:
     return packet
 
 
-def said(connection: Connection, chunks: Iterable[bytes]) -> list[Packet | ReasonCode]:
+def said(connection: ServerProtocol, chunks: Iterable[bytes]) -> list[Packet | ReasonCode]:
     """All that the connection makes of the chunks, and the error that ended it."""
     found: list[Packet | ReasonCode] = []
     try:
@@ -273,7 +273,7 @@ def test_what_comes_behind_connect_waits_for_the_login(connect, version, topic, 
             connect.will.properties = None
         connect.username = connect.username or ""
     message = Publish(topic, payload, 1, packet_id=7)
-    connection = Connection(SIZE, ALIASES)
+    connection = ServerProtocol(SIZE, ALIASES)
     found: list[Packet] = []
     for chunk in split_at(connect.encode() + message.encode(version), cuts):
         for event in connection.receive_data(chunk):
@@ -311,11 +311,11 @@ def test_a_packet_of_the_largest_size_is_taken():
 
 def test_a_stranger_gets_less():
     """Before the login a packet is bounded by what a CONNECT can sensibly be."""
-    connection = Connection(1 << 28, ALIASES)
+    connection = ServerProtocol(1 << 28, ALIASES)
     header = b"\x10" + encode_varint(MAXIMUM_CONNECT)
     assert said(connection, [header]) == [ReasonCode.QUOTA_EXCEEDED]
     large = Connect("x" * 33_000, version=4, username="y" * 33_000, password=bytes(33_000))
-    assert said(Connection(1 << 28, ALIASES), [large.encode()]) == [large]
+    assert said(ServerProtocol(1 << 28, ALIASES), [large.encode()]) == [large]
 
 
 def test_millions_of_filters_are_refused():
@@ -390,7 +390,7 @@ SERVERS_ONLY = {PacketType.CONNACK, PacketType.SUBACK, PacketType.UNSUBACK, Pack
 @pytest.mark.parametrize("packet", SAYABLE, ids=lambda packet: packet.TYPE.name)
 def test_the_first_packet_is_connect(packet):
     """[MQTT-3.1.0-1]"""
-    connection = Connection(SIZE, ALIASES)
+    connection = ServerProtocol(SIZE, ALIASES)
     found = said(connection, [packet.encode(5)])
     if packet.TYPE is PacketType.CONNECT:
         assert found == [packet]
@@ -422,9 +422,9 @@ def test_a_protocol_that_is_not_ours():
     for name in (b"\x00\x06MQIsdp\x04", b"\x00\x04MQTT\x03", b"\x00\x04MQTT\x06"):
         body = name + b"\x02\x00\x00\x00\x00"
         wire = b"\x10" + encode_varint(len(body)) + body
-        found = said(Connection(SIZE, ALIASES), [wire])
+        found = said(ServerProtocol(SIZE, ALIASES), [wire])
         assert found == [ReasonCode.UNSUPPORTED_PROTOCOL_VERSION]
-    assert said(Connection(SIZE, ALIASES), [b"GET / HTTP/1.1\r\n\r\n"]) == [
+    assert said(ServerProtocol(SIZE, ALIASES), [b"GET / HTTP/1.1\r\n\r\n"]) == [
         ReasonCode.PROTOCOL_ERROR
     ]
 
@@ -530,7 +530,7 @@ def test_topic_aliases_that_are_wrong(wire, code):
 
 def test_an_alias_needs_to_be_allowed():
     """v5 [MQTT-3.2.2-17] [MQTT-3.2.2-18]"""
-    connection = Connection(SIZE, 0)
+    connection = ServerProtocol(SIZE, 0)
     list(connection.receive_data(Connect("client").encode()))
     connection.accept()
     assert said(connection, [with_alias(1, "a")]) == [ReasonCode.TOPIC_ALIAS_INVALID]
@@ -545,7 +545,7 @@ def test_a_client_sends_no_subscription_identifiers():
 @pytest.mark.parametrize("data", [b"\0", b"\0\0", b"\0\1", bytes(40)])
 def test_zeros_are_no_packet_in_any_state(data):
     """Before the first PUBLISH nothing is taken for a repetition of it."""
-    for connection in (Connection(SIZE, ALIASES), connected(4), connected(5)):
+    for connection in (ServerProtocol(SIZE, ALIASES), connected(4), connected(5)):
         found = said(connection, [data, data])
         assert found == [ReasonCode.PROTOCOL_ERROR]
 
@@ -559,4 +559,4 @@ def test_zeros_are_no_packet_in_any_state(data):
 )
 def test_who_comes_to_the_wrong_listener_is_told_to_the_log(sent: bytes, hint: str) -> None:
     with pytest.raises(ProtocolError, match=hint):
-        list(Connection(SIZE, ALIASES).receive_data(sent))
+        list(ServerProtocol(SIZE, ALIASES).receive_data(sent))

@@ -332,7 +332,7 @@ async def test_a_stranger_is_not_listened_to_during_the_login(harness: Harness):
     for _ in range(50):
         await asyncio.sleep(0)
         assert not protocol._transport.is_reading()
-    assert protocol._client.connection.held <= MIB
+    assert protocol._client.protocol.held <= MIB
     peer.hang_up()
     harness.gate.set()
     await until(lambda: not harness.scheduler.connections)

@@ -9,7 +9,7 @@ import time
 
 from bridge_harness import TWIST, Harness
 
-from appliance.broker.client import Client as NetworkClient
+from appliance.broker.client import ClientHandler as NetworkClient
 from appliance.broker.ports import Decision, PeerStatus
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (

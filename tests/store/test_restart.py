@@ -448,7 +448,7 @@ class Chaos:
         dice = self.dice
         name = dice.choice(self.NAMES)
         peer = self.peers.get(name)
-        if peer is None or peer.wire.closed:
+        if peer is None or peer.transport.closed:
             await self._connect(name)
             return
         self._listen(name, peer)
@@ -485,12 +485,12 @@ class Chaos:
         topic = dice.choice(self.TOPICS)
         retain = dice.random() < 0.3
         peer.send(Publish(topic, payload, qos, retain, False, number, properties))
-        if qos == 2 and dice.random() < 0.7 and not peer.wire.closed:
+        if qos == 2 and dice.random() < 0.7 and not peer.transport.closed:
             peer.send(Pubrel(number))  # type: ignore[arg-type]
 
     def _answer(self, name: str, peer: Peer) -> None:
         waiting = self.unanswered[name]
-        while waiting and not peer.wire.closed:
+        while waiting and not peer.transport.closed:
             packet = waiting.pop(0)
             if isinstance(packet, Pubrel):
                 peer.send(Pubcomp(packet.packet_id))
