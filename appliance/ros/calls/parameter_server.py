@@ -1,11 +1,12 @@
-"""Parameters of a bus that keeps them all in one place, as ROS 1's Master does.
+"""Parameters of a bus with one server for all of them, as ROS 1's Master is.
 
-They are shown and set as those of nodes are (parameters.py): `/arm/speed` is retained at
-`r2d2/arm/_param/speed`, `…/_param/speed/set` sets it, `…/_param/_set` several of them. What is
-before the last `/` stands for the node, which there need not be. The values are read once a second.
+They are published and set like those of nodes (parameters.py): `/arm/speed` is retained at
+`r2d2/arm/_param/speed`, `…/_param/speed/set` sets it, `…/_param/_set` sets several. The namespace
+before the last `/` stands for the node; there need not be such a node. The values are read once a
+second.
 
-A parameter has no declared type: it takes that of the value, but an integer for a double is a
-double, as JSON does not tell the two.
+Parameters have no declared type, so they take the type of the value. An integer for a parameter
+that is a double becomes a double, as JSON does not distinguish the two.
 """
 
 from __future__ import annotations
@@ -15,33 +16,30 @@ import logging
 import re
 from collections.abc import Callable
 from functools import partial
-from time import monotonic
 from typing import Any
 
 import pybase64
 
 from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
+from appliance.ros.calls.parameter_reader import ParameterReader
 from appliance.ros.calls.parameter_topics import ParameterGroup, ParameterTopics, shorten, to_bytes
-from appliance.ros.node import BusError, ParameterServer, RosNode
+from appliance.ros.node import BusError, RosNode
 from appliance.ros.patterns import is_plain
 from appliance.ros.payload.encodings.registry import VALUE_ENCODINGS
 from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the parameters.
-INTERVAL = 1.0
-
-#: Lists in lists that a parameter may have.
-DEEPEST = 16
+#: Levels of lists in lists that a parameter may have.
+MAX_DEPTH = 16
 
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
 class ServerParameters(ParameterTopics[ParameterGroup]):
-    """The routes of parameters; for the loop's thread, where it does not say otherwise.
+    """The routes of parameters; for the loop's thread, and `source` for the ROS thread.
 
-    What stands for a node is a namespace: parameters that are beside each other.
+    A group is a namespace: the parameters that differ in their last name only.
     """
 
     def __init__(
@@ -56,63 +54,62 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
         super().__init__(dispatcher)
         self._node = node
         self._loop = loop
-        self._post = post
         self._changed = changed
-        #: All parameters of the last look, by namespace, and the values of those that are wanted.
+        self.source = ParameterReader(node, self, post)
+        #: All parameters as last read, by namespace, and the values of those that are wanted.
         self._names: dict[str, list[str]] = {}
         self._values: dict[str, Any] = {}
-        #: Whether nothing is known of the parameters, so that none is absent either; and why not.
-        self._is_blind = True
+        #: Whether the parameters have not been read yet, so that none can be called absent.
+        self._is_unknown = True
+        #: Why the last read has failed.
         self._problem: str | None = None
-        # The ROS thread's.
-        self._looked_at = 0.0
 
-    def _look_again(self) -> None:
-        self._looked_at = 0.0
+    def _routes_changed(self) -> None:
+        self.source.replace(tuple(self._routes))
 
     def follow(self) -> None:
-        """Services have come or gone: no matter."""
+        """Ignore services that come and go: the values are polled."""
 
-    def _take(self, names: dict[str, list[str]], values: dict[str, Any]) -> None:
-        """What there is now."""
+    def parameters_read(self, names: dict[str, list[str]], values: dict[str, Any]) -> None:
+        """Publish the parameters as they are now."""
         absent = self._absent()
-        has_changed = self._is_blind or self._problem is not None
+        has_changed = self._is_unknown or self._problem is not None
         self._names, self._values = names, values
-        self._is_blind, self._problem = False, None
+        self._is_unknown, self._problem = False, None
         has_changed |= self._absent() != absent
         found: dict[str, dict[str, Any]] = {}
         for full_name, value in values.items():
             space, _, name = full_name.rpartition("/")
             found.setdefault(space, {})[name] = value
-        for shown in list(self._groups.values()):
-            if shown.name not in found:
-                self._leave(shown)
+        for group in list(self._groups.values()):
+            if group.name not in found:
+                self._remove(group)
                 has_changed = True
         for name, own in found.items():
-            namespace = self._groups.get(name) or self._find(name, ParameterGroup)
+            namespace = self._groups.get(name) or self._new_group(name, ParameterGroup)
             if namespace is None:  # the routes have changed meanwhile
                 continue
             if name not in self._groups:
-                self._join(namespace)
+                self._add(namespace)
                 log.info("the parameters of %s are at %s", name or "/", namespace.base)
                 has_changed = True
-            for parameter in namespace.shown.keys() - own.keys():
-                self._show(namespace, parameter, None)
+            for parameter in namespace.retained.keys() - own.keys():
+                self._publish_value(namespace, parameter, None)
             for parameter, value in own.items():
                 if namespace.wants(parameter):
-                    self._show(namespace, parameter, value)
+                    self._publish_value(namespace, parameter, value)
         if has_changed:
             self._changed()
 
-    def _fail(self, problem: str) -> None:
-        """They could not be read; what was read last stays."""
+    def read_failed(self, problem: str) -> None:
+        """Report that the parameters could not be read; those that were read before stay."""
         if problem != self._problem:
             log.warning("the parameters cannot be read: %s", problem)
-            self._is_blind, self._problem = False, problem
+            self._is_unknown, self._problem = False, problem
             self._changed()
 
-    def _show(self, namespace: ParameterGroup, name: str, value: Any) -> None:
-        """Publish a parameter as it is now; None for one that is no more."""
+    def _publish_value(self, namespace: ParameterGroup, name: str, value: Any) -> None:
+        """Publish a parameter as it is now; None clears it."""
         encoding = VALUE_ENCODINGS[namespace.route.encoding]
         try:
             payload = (
@@ -121,7 +118,7 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
                 else encoding.dumps(value if encoding.has_bytes else _to_plain(value))
             )
         except TypeError:  # an integer too large for JSON
-            log.debug("%s/%s cannot be shown", namespace.name, name)
+            log.debug("%s/%s cannot be published", namespace.name, name)
             return
         self._publish(namespace, name, payload)
 
@@ -141,15 +138,15 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
             full_names[full_name] = _like(self._values.get(full_name), full_name, value)
         done: asyncio.Future[None] = self._loop.create_future()
         try:
-            self._node.call_soon(partial(self._set_all, full_names, done))
+            self._node.call_soon(partial(self.source.set_all, full_names, done))
         except BusError as error:
             raise CallError("ros_error", str(error)) from None
         await done
         return ""
 
     def skips(self) -> list[Skipped]:
-        """The parameters that routes name and are not there."""
-        if self._is_blind:
+        """The parameters that a route names and that are not there."""
+        if self._is_unknown:
             return []
         if self._problem is not None:
             return [Skipped("/", "parameters", "", "problem", self._problem)]
@@ -163,73 +160,32 @@ class ServerParameters(ParameterTopics[ParameterGroup]):
         return named - self._values.keys()
 
     async def stop(self) -> None:
-        """The bus has been left: no value is true any more."""
-        self._forget()
+        """Clear all values, once the bus has been left."""
+        self.bus_lost()
 
-    def _forget(self) -> None:
+    def bus_lost(self) -> None:
+        """Clear all values: nothing is known of the parameters any more."""
         self._names, self._values = {}, {}
-        self._is_blind = True
-        self._leave_all()
+        self._is_unknown = True
+        self._remove_all()
 
-    # The ROS thread
-
-    def look(self) -> None:
-        """Read the parameters, now and then."""
-        server = self._node.parameter_server
-        now = monotonic()
-        if server is None or not self._routes or now < self._looked_at + INTERVAL:
+    def settle(self, done: asyncio.Future[None], problem: CallError | None) -> None:
+        """Finish a call that sets parameters."""
+        if done.done():
             return
-        self._looked_at = now
-        try:
-            self._read(server)
-        except BusError as error:
-            self._post(self._fail, str(error))
-
-    def _read(self, server: ParameterServer) -> None:
-        names: dict[str, list[str]] = {}
-        for full_name in server.names():
-            space, _, name = full_name.rpartition("/")
-            names.setdefault(space, []).append(name)
-        for space in list(names):
-            while space:
-                space = space.rpartition("/")[0]
-                names.setdefault(space, [])
-        spaces = {space: self._find(space, ParameterGroup) for space in names}
-        wanted = [
-            f"{space}/{name}"
-            for space, found in names.items()
-            if (namespace := spaces[space]) is not None
-            for name in found
-            if namespace.wants(name)
-        ]
-        self._post(self._take, names, server.get(wanted))
-
-    def _set_all(self, values: dict[str, Any], done: asyncio.Future[None]) -> None:
-        server = self._node.parameter_server
-        problem: CallError | None = None
-        try:
-            if server is None:
-                raise BusError("ROS is not ready")
-            for name, value in values.items():
-                server.set(name, value)
-            self._read(server)
-        except BusError as error:
-            problem = CallError("ros_error", str(error))
-        self._post(_settle, done, problem)
-
-    def lost(self) -> None:
-        """The bus is gone, and nothing is known of its parameters."""
-        self._looked_at = 0.0
-        self._post(self._forget)
+        if problem is None:
+            done.set_result(None)
+        else:
+            done.set_exception(problem)
 
 
 def _is_value(value: Any, depth: int = 0) -> bool:
-    """Whether a parameter can have it: XML-RPC has no word for nothing, nor XML for all
-    characters."""
+    """Whether a parameter can have the value: XML-RPC cannot express None, nor XML every
+    character."""
     if isinstance(value, str):
         return _NOT_XML.search(value) is None
     if isinstance(value, list):
-        return depth < DEEPEST and all(_is_value(item, depth + 1) for item in value)
+        return depth < MAX_DEPTH and all(_is_value(item, depth + 1) for item in value)
     if isinstance(value, dict):
         return _is_value([*value.keys(), *value.values()], depth)
     if isinstance(value, int):
@@ -238,7 +194,7 @@ def _is_value(value: Any, depth: int = 0) -> bool:
 
 
 def _like(before: Any, name: str, value: Any) -> Any:
-    """A value as its payload cannot say it: a double without a fraction, bytes in base64."""
+    """The value with the type of the one before: a double without a fraction, bytes of base64."""
     if isinstance(before, float) and type(value) is int:
         return float(value)
     if isinstance(before, bytes) and not isinstance(value, bytes):
@@ -247,18 +203,9 @@ def _like(before: Any, name: str, value: Any) -> Any:
 
 
 def _to_plain(value: Any) -> Any:
-    """A value as JSON knows it: bytes are base64."""
+    """A value that JSON can express: bytes become base64."""
     if isinstance(value, list):
         return [_to_plain(item) for item in value]
     if isinstance(value, dict):
         return {key: _to_plain(item) for key, item in value.items()}
     return pybase64.b64encode_as_string(value) if isinstance(value, bytes) else value
-
-
-def _settle(done: asyncio.Future[None], problem: CallError | None) -> None:
-    if done.done():
-        return
-    if problem is None:
-        done.set_result(None)
-    else:
-        done.set_exception(problem)

@@ -1,13 +1,13 @@
 """Parameters as MQTT clients see them: retained topics below a node's, and calls that set them.
 
-Where the values come from is different: each node has its own (parameters.py), or there is one
-place for all (parameter_server.py).
+The values come from the nodes, which keep their own (parameters.py), or from a server that keeps
+all of them (parameter_server.py).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -32,11 +32,11 @@ from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE, VALUE_ENCODINGS
 from appliance.ros.payload.payloads import InputLimits
 
-#: Parameters that one call sets.
-SET_AT_ONCE = 200
+#: Parameters that one call may set.
+MAX_SET_AT_ONCE = 200
 
-#: Longer names, in characters, are not shown: they would be no topics.
-LONGEST_NAME = 1024
+#: Longer names, in characters, are not published: they would be no topics.
+MAX_NAME_LENGTH = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class ParameterSettings:
     encoding: EncodingName = "json"
 
     def of(self, node: str) -> Names | None:
-        """Those that are wanted of a node; None for none at all."""
+        """The names of a node's parameters that are bridged; None when there are none."""
         mine: list[str] = []
         for text in self.names:
             is_excluded = text.startswith("!")
@@ -66,27 +66,37 @@ class ParameterSettings:
 
 @dataclass(eq=False, slots=True)
 class ParameterGroup:
-    """A node whose parameters are shown, or what stands for one: by name, what is retained."""
+    """A node whose parameters are published, or a namespace that stands for one.
+
+    `retained` has the payloads that are retained now, by the parameter's name.
+    """
 
     name: str
     base: str
     route: ParameterSettings
     wanted: list[Names]
-    shown: dict[str, bytes] = field(default_factory=dict)
+    retained: dict[str, bytes] = field(default_factory=dict)
     endpoints: list[CallEndpoint] = field(default_factory=list)
 
     def wants(self, parameter: str) -> bool:
-        """Whether it is shown, and may be set."""
+        """Whether the parameter is published, and may be set."""
         return any(parameter in names for names in self.wanted)
 
 
 GroupT = TypeVar("GroupT", bound=ParameterGroup)
 
 
-class ParameterTopics(ABC, Generic[GroupT]):
-    """The routes of parameters, and what they show now; for the loop's thread."""
+def matching_routes(
+    routes: Iterable[ParameterSettings], node: str
+) -> dict[ParameterSettings, Names]:
+    """The routes that bridge parameters of the node, each with their names."""
+    return {route: names for route in routes if (names := route.of(node))}
 
-    #: The type of a value on the bus, for who asks what is bridged.
+
+class ParameterTopics(ABC, Generic[GroupT]):
+    """The routes of parameters, and what they publish now; for the loop's thread."""
+
+    #: The type of a value on the bus, as `bridged` reports it.
     type_name = ""
 
     def __init__(self, dispatcher: CallDispatcher) -> None:
@@ -96,40 +106,40 @@ class ParameterTopics(ABC, Generic[GroupT]):
         self._groups: dict[str, GroupT] = {}
 
     def start(self) -> None:
-        """Nothing is known of the bus yet."""
+        """Clear what another run has left retained: nothing is known of the bus yet."""
         for route in self._counters:
             self._dispatcher.clear_retained(route.mqtt, "{node}", ".+")
 
     def replace(self, routes: Sequence[ParameterSettings]) -> None:
-        """Have these routes from now on."""
+        """Use these routes from now on."""
         if list(routes) == list(self._routes):
             return
         self._routes = routes
         self._counters = {route: self._counters.get(route) or CallCounters() for route in routes}
-        self._leave_all()  # which patterns a value is of has to be asked anew
-        self._look_again()
+        self._remove_all()  # their parameters have to be matched with the patterns anew
+        self._routes_changed()
 
     @abstractmethod
-    def _look_again(self) -> None:
-        """Show what the routes want; nothing is shown now."""
+    def _routes_changed(self) -> None:
+        """Publish what the routes want; nothing is published now."""
 
     @abstractmethod
     async def _set(self, group: GroupT, values: dict[str, Any], call: Call, at_once: bool) -> str:
-        """Set parameters, all or none if `at_once`; returns what the bus says of it.
+        """Set parameters, all or none if `at_once`; returns the reason that the bus gives.
 
-        Those that the routes do not want have been refused. Raises CallError.
+        Parameters that no route wants have been rejected before. Raises CallError.
         """
 
-    def _find(self, name: str, kind: type[GroupT]) -> GroupT | None:
-        """The node of that name as the routes want it; None when they do not."""
-        wanted = {route: names for route in self._counters if (names := route.of(name))}
+    def _new_group(self, name: str, kind: type[GroupT]) -> GroupT | None:
+        """A new group for the node of that name; None when no route wants it."""
+        wanted = matching_routes(self._counters, name)
         if not wanted:
             return None
         route = next(iter(wanted))
         return kind(name, route.mqtt.replace("{node}", name), route, list(wanted.values()))
 
-    def _join(self, group: GroupT) -> None:
-        """Take calls for it from now on."""
+    def _add(self, group: GroupT) -> None:
+        """Accept calls for a group from now on."""
         self._groups[group.name] = group
 
         def set_one(call: Call) -> Callable[[], Awaitable[Answer]]:
@@ -154,27 +164,27 @@ class ParameterTopics(ABC, Generic[GroupT]):
             group.endpoints.append(endpoint)
             self._dispatcher.register(endpoint)
 
-    def _leave(self, group: GroupT) -> None:
-        """It is gone, and its values are true no more."""
+    def _remove(self, group: GroupT) -> None:
+        """Remove a group that is gone, and clear its values."""
         del self._groups[group.name]
         for endpoint in group.endpoints:
             self._dispatcher.unregister(endpoint)
-        for parameter in list(group.shown):
+        for parameter in list(group.retained):
             self._publish(group, parameter, b"")
 
-    def _leave_all(self) -> None:
+    def _remove_all(self) -> None:
         for group in list(self._groups.values()):
-            self._leave(group)
+            self._remove(group)
 
     def _publish(self, group: GroupT, name: str, payload: bytes) -> None:
-        """Show a parameter as it is now; without a payload it is no more."""
+        """Publish a parameter where it has changed; an empty payload clears it."""
         topic = f"{group.base}/{name}"
-        if payload == group.shown.get(name, b"") or not _is_topic(name, topic):
+        if payload == group.retained.get(name, b"") or not _is_topic(name, topic):
             return
         if payload:
-            group.shown[name] = payload
+            group.retained[name] = payload
         else:
-            del group.shown[name]
+            del group.retained[name]
         properties: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE[group.route.encoding]}
         self._dispatcher.publish(Message(topic, payload, 1, True, properties))
 
@@ -186,11 +196,11 @@ class ParameterTopics(ABC, Generic[GroupT]):
                 text = f"the parameter {group.name}/{name} is not among bridge.parameters"
                 raise CallError("not_authorized", text)
         reason = await self._set(group, values, call, at_once)
-        said = {"successful": True, "reason": reason}
-        return Answer(VALUE_ENCODINGS[call.encoding].dumps(said), call.encoding)
+        result = {"successful": True, "reason": reason}
+        return Answer(VALUE_ENCODINGS[call.encoding].dumps(result), call.encoding)
 
     def status(self) -> list[tuple[ParameterSettings, CallCounters, list[str]]]:
-        """Each route, what it has counted, and the nodes that it shows now."""
+        """Each route, its counters, and the nodes that it bridges now."""
         return [
             (route, counters, [name for name in self._groups if route.of(name)])
             for route, counters in self._counters.items()
@@ -211,12 +221,12 @@ class ParameterTopics(ABC, Generic[GroupT]):
 
 
 def _is_topic(name: str, topic: str) -> bool:
-    """Whether a parameter's name makes a topic: a node may give it any."""
+    """Whether a parameter's name can be in a topic: a node may choose any name."""
     try:
         check_topic(topic)
     except ValueError:
         return False
-    return len(name) <= LONGEST_NAME
+    return len(name) <= MAX_NAME_LENGTH
 
 
 def value_of(call: Call, limits: InputLimits) -> Any:
@@ -232,13 +242,13 @@ def value_of(call: Call, limits: InputLimits) -> Any:
 
 
 def values_of(call: Call, limits: InputLimits) -> dict[str, Any]:
-    """The values in a call, by the names of parameters. Raises CallError."""
+    """The values in a call, by the parameters' names. Raises CallError."""
     values = value_of(call, limits)
     is_mapping = isinstance(values, dict) and all(isinstance(name, str) for name in values)
     if not is_mapping or not values:
         raise CallError("bad_request", 'expected parameters and values: {"speed": 0.5, …}')
-    if len(values) > SET_AT_ONCE:
-        text = f"{len(values)} parameters, at most {SET_AT_ONCE} are set at once"
+    if len(values) > MAX_SET_AT_ONCE:
+        text = f"{len(values)} parameters, at most {MAX_SET_AT_ONCE} are set at once"
         raise CallError("too_large", text)
     named: dict[str, Any] = values
     return named
@@ -262,7 +272,7 @@ def unlike(name: str, expected: str, value: Any) -> CallError:
 
 
 def shorten(value: Any) -> str:
-    """A value as an error shows it."""
+    """A value as errors quote it."""
     try:
         text = orjson.dumps(value).decode()
     except TypeError:  # what only CBOR has

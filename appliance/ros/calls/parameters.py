@@ -2,16 +2,15 @@
 
 `r2d2/node/_param/speed` has the value of `/node`'s parameter `speed` as plain JSON, and follows
 `/parameter_events`; byte arrays are base64, or bytes where the encoding is `cbor`.
-`…/_param/speed/set` sets it, `…/_param/_set` several of the node at once or none of them:
-`{"speed": 0.5, "mode": "slow"}`. The type is the one that the node has declared, so that `1` will
-do for a double. When the node goes, so do its values.
+`…/_param/speed/set` sets it, `…/_param/_set` sets several of the node or none of them:
+`{"speed": 0.5, "mode": "slow"}`. Values have the type that the node has declared: `1` is accepted
+for a double. When the node goes, its values are cleared.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ import pybase64
 
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
+from appliance.ros.calls.parameter_events import EVENT, EVENTS, ParameterEvents
 from appliance.ros.calls.parameter_topics import (
     ParameterGroup,
     ParameterTopics,
@@ -28,7 +28,7 @@ from appliance.ros.calls.parameter_topics import (
     unlike,
 )
 from appliance.ros.calls.requests import Requests
-from appliance.ros.node import BusError, QosProfile, RosNode, RosSubscription
+from appliance.ros.node import RosNode
 from appliance.ros.patterns import is_plain
 from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
 from appliance.ros.payload.definitions import UnknownTypeError
@@ -38,20 +38,15 @@ from appliance.ros.skipped import Skipped
 
 log = logging.getLogger(__name__)
 
-EVENTS = "/parameter_events"
-EVENT = "rcl_interfaces/msg/ParameterEvent"
 GET = "/get_parameters"
 
-#: Events that wait for the loop's thread; with more, all nodes are read anew.
-WAITING_EVENTS = 1000
-
-#: Seconds until a node is asked again that did not tell its parameters.
+#: Seconds until a node is asked again that has not answered.
 RETRY = 2.0
 
-#: The longest that a node may take to tell them, in seconds.
-PATIENCE = 5.0
+#: Seconds that a node may take to send all its parameters.
+READ_TIMEOUT = 5.0
 
-#: Parameters that are asked for at a time.
+#: Parameters that one request asks for.
 CHUNK = 200
 
 #: By the numbers of rcl_interfaces/msg/ParameterType: the field of a value, and its name.
@@ -73,7 +68,7 @@ _BOOLS, _INTEGERS, _DOUBLES, _STRINGS = range(6, 10)
 
 @dataclass(eq=False, slots=True)
 class _NodeParameters(ParameterGroup):
-    """A node, and how its values are read."""
+    """A node, and the state of reading its values."""
 
     is_loading: bool = False
     is_stale: bool = True
@@ -83,7 +78,7 @@ class _NodeParameters(ParameterGroup):
 
 
 class ParameterRoutes(ParameterTopics[_NodeParameters]):
-    """The routes of parameters; for the loop's thread, where it does not say otherwise."""
+    """The routes of parameters; for the loop's thread, and `source` for the ROS thread."""
 
     type_name = "rcl_interfaces/msg/ParameterValue"
 
@@ -101,23 +96,16 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         self._converters = converters
         self._node = node
         self._entries = entries
-        self._post = post
+        self.source = ParameterEvents(node, self, post)
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_stopped = False
-        # Both threads'.
-        self._events: deque[bytes] = deque()
-        self._is_awake = False
-        # The ROS thread's.
-        self._subscription: RosSubscription | None = None
-        self._is_refused = False
-        #: How many nodes there are of each name.
-        self._nodes: Counter[str] = Counter()
 
-    def _look_again(self) -> None:
+    def _routes_changed(self) -> None:
+        self.source.enable(bool(self._routes))
         self.follow()
 
     def follow(self) -> None:
-        """Show the nodes that are on the bus now."""
+        """Publish the parameters of the nodes that are on the bus now."""
         there = {
             service.removesuffix(GET)
             for service, types in self._requests.services.items()
@@ -125,25 +113,26 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         }
         for node in list(self._groups.values()):
             if node.name not in there:
-                self._leave(node)
+                self._remove(node)
         for name in sorted(there - self._groups.keys() - {self._node.name}):
-            found = self._find(name, _NodeParameters)
+            found = self._new_group(name, _NodeParameters)
             if found is not None:
-                self._join(found)
+                self._add(found)
                 self._load(found)
 
-    def _came_anew(self, names: Iterable[str]) -> None:
+    def nodes_restarted(self, names: Iterable[str]) -> None:
+        """Read the parameters of nodes anew of which another has appeared."""
         for name in names:
             node = self._groups.get(name)
             if node is not None:
                 self._load(node)
 
-    def _leave(self, node: _NodeParameters) -> None:
+    def _remove(self, node: _NodeParameters) -> None:
         node.is_gone = True
-        super()._leave(node)
+        super()._remove(node)
 
     def skips(self) -> list[Skipped]:
-        """The nodes that routes name and are not there, or do not tell their parameters."""
+        """The nodes that a route names and that are not there, or do not answer."""
         if self._is_stopped:
             return []
         skips = [
@@ -159,12 +148,12 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         ]
 
     async def stop(self) -> None:
-        """The bus has been left: no value is true any more."""
+        """Clear all values, once the bus has been left."""
         self._is_stopped = True
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._leave_all()
+        self._remove_all()
 
     # Values
 
@@ -190,13 +179,13 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
             raise CallError("unknown_type", str(error)) from None
 
     def _load(self, node: _NodeParameters) -> None:
-        """Read a node's parameters, in the background, until nothing has changed meanwhile."""
+        """Read a node's parameters in the background, again until none has changed meanwhile."""
         node.is_stale = True
         if not node.is_loading and not self._is_stopped:
             node.is_loading = True
-            self._begin(self._read(node))
+            self._start_task(self._read(node))
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
         task = self._entries.task("parameters.read", work)
         self._tasks.add(task)
         self._entries.when_done("parameters.end", task, self._tasks.discard, task)
@@ -212,7 +201,7 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         while node.is_stale and not node.is_gone:
             node.is_stale = False
             try:
-                values = await asyncio.wait_for(self._get_all(node), PATIENCE)
+                values = await asyncio.wait_for(self._get_all(node), READ_TIMEOUT)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
                 if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
                     return
@@ -225,10 +214,10 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
                 continue
             node.problem = None
             if not node.is_stale and not node.is_gone:
-                for name in node.shown.keys() - values.keys():
-                    self._show(node, name, None)
+                for name in node.retained.keys() - values.keys():
+                    self._publish_value(node, name, None)
                 for name, value in values.items():
-                    self._show(node, name, value)
+                    self._publish_value(node, name, value)
                 log.info("%d parameters of %s are at %s", len(values), node.name, node.base)
 
     async def _get_all(self, node: _NodeParameters) -> dict[str, Any]:
@@ -239,7 +228,7 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
             chunk = names[start : start + CHUNK]
             got = await self._get(node, chunk)
             if len(got) != len(chunk):
-                # One that the node cannot give leaves all of them out.
+                # A parameter that the node cannot give leaves the response without any.
                 single = [await self._get(node, [name]) for name in chunk]
                 chunk = [name for name, one in zip(chunk, single, strict=True) if len(one) == 1]
                 got = [one[0] for one in single if len(one) == 1]
@@ -247,43 +236,42 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         return values
 
     async def _get(self, node: _NodeParameters, names: list[str]) -> list[Any]:
-        said = await self._ask(node, "get_parameters", "GetParameters", {"names": names})
-        values: list[Any] = said["values"]
+        response = await self._ask(node, "get_parameters", "GetParameters", {"names": names})
+        values: list[Any] = response["values"]
         return values
 
-    def _show(self, node: _NodeParameters, name: str, value: Mapping[str, Any] | None) -> None:
-        """Publish a parameter as it is now; None for one that is no more."""
+    def _publish_value(
+        self, node: _NodeParameters, name: str, value: Mapping[str, Any] | None
+    ) -> None:
+        """Publish a parameter as it is now; None clears it."""
         if node.wants(name):
             payload = b"" if value is None else _to_payload(value, node.route.encoding)
             self._publish(node, name, payload)
 
-    def _sleep(self) -> None:
-        self._is_awake = False
-
-    def _take_events(self) -> None:
-        self._is_awake = False
-        events = self._events
-        if len(events) >= WAITING_EVENTS:
-            events.clear()
+    def take_events(self) -> None:
+        """Publish what the queued events report as changed."""
+        queue = self.source.queue
+        queue.sleep()
+        if queue.clear_if_full():
             for node in self._groups.values():
                 self._load(node)
             return
-        while events:
+        while queue:
             try:
-                said = self._converters.get(EVENT).to_dict(events.popleft())
+                event = self._converters.get(EVENT).to_dict(queue.take())
             except (ConversionError, UnknownTypeError) as error:
                 log.warning("%s: a message cannot be read: %s", EVENTS, error)
                 continue
-            known = self._groups.get(said["node"])
-            if known is None:
+            group = self._groups.get(event["node"])
+            if group is None:
                 continue
-            if known.is_loading:
-                known.is_stale = True  # what is being read may be older, or newer
+            if group.is_loading:
+                group.is_stale = True  # what is being read may be older, or newer
                 continue
-            for one in (*said["new_parameters"], *said["changed_parameters"]):
-                self._show(known, one["name"], one["value"])
-            for one in said["deleted_parameters"]:
-                self._show(known, one["name"], None)
+            for one in (*event["new_parameters"], *event["changed_parameters"]):
+                self._publish_value(group, one["name"], one["value"])
+            for one in event["deleted_parameters"]:
+                self._publish_value(group, one["name"], None)
 
     # Setting
 
@@ -291,8 +279,10 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         self, node: _NodeParameters, values: dict[str, Any], call: Call, at_once: bool
     ) -> str:
         names = list(values)
-        said = await self._ask(node, "describe_parameters", "DescribeParameters", {"names": names})
-        descriptors = {one["name"]: one for one in said["descriptors"]}
+        response = await self._ask(
+            node, "describe_parameters", "DescribeParameters", {"names": names}
+        )
+        descriptors = {one["name"]: one for one in response["descriptors"]}
         verb, kind = "set_parameters", "SetParameters"
         if at_once:
             verb, kind = "set_parameters_atomically", "SetParametersAtomically"
@@ -306,55 +296,16 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
 
         try:
             request = await self._dispatcher.convert(call.caller, len(call.payload), write)
-            said = await self._ask_for(node, verb, kind, request)
+            response = await self._ask_for(node, verb, kind, request)
         except TooLargeError as error:
             raise CallError("too_large", str(error)) from None
         except ConversionError as error:
             raise CallError("bad_request", f"{', '.join(names)}: {error.problem}") from None
-        result = said["result"] if at_once else (said["results"] or [{}])[0]
+        result = response["result"] if at_once else (response["results"] or [{}])[0]
         if not result.get("successful"):
             reason = result.get("reason") or "it gives no reason"
             raise CallError("rejected", f"{node.name} does not set {', '.join(names)}: {reason}")
         return str(result["reason"])
-
-    # The ROS thread
-
-    def look(self) -> None:
-        """Follow the changes of all nodes' parameters while there are routes."""
-        if self._routes and self._subscription is None and not self._is_refused:
-            try:
-                self._subscription = self._node.subscribe_raw(
-                    EVENTS, EVENT, QosProfile(depth=1000), self._on_event
-                )
-            except (BusError, UnknownTypeError) as error:
-                self._is_refused = True
-                self._post(log.error, "%s is not followed: %s", EVENTS, error)
-        elif not self._routes and self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None
-        if self._routes:
-            self._look_for_restarts()
-
-    def _look_for_restarts(self) -> None:
-        """A node that was killed stays on the graph for a while, next to the one that takes its
-        place and has values of its own."""
-        before, self._nodes = self._nodes, Counter(self._node.nodes())
-        anew = [name for name, count in self._nodes.items() if count > before.get(name, count)]
-        if anew:
-            self._post(self._came_anew, anew)
-
-    def _on_event(self, cdr: bytes) -> None:
-        if len(self._events) < WAITING_EVENTS:
-            self._events.append(cdr)
-        if not self._is_awake:
-            self._is_awake = True
-            self._post(self._take_events, failed=self._sleep)
-
-    def lost(self) -> None:
-        """The bus is gone, and with it the subscription."""
-        self._subscription = None
-        self._is_refused = False
-        self._nodes.clear()
 
 
 def _to_payload(value: Mapping[str, Any], encoding: EncodingName) -> bytes:
@@ -370,9 +321,9 @@ def _to_payload(value: Mapping[str, Any], encoding: EncodingName) -> bytes:
 
 
 def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, Any]:
-    """The ParameterValue of a JSON value, of the type that the node has declared.
+    """The ParameterValue of a JSON value, with the type that the node has declared.
 
-    A parameter that may have any type, or that is not declared, takes its type from the value.
+    A parameter of dynamic type, or one that is not declared, takes its type from the value.
     Raises CallError: bad_request, rejected for what is read-only.
     """
     if descriptor.get("read_only"):
@@ -395,7 +346,7 @@ def to_value(name: str, value: Any, descriptor: Mapping[str, Any]) -> dict[str, 
 
 
 def _is(kind: int, value: Any) -> bool:
-    """Whether a JSON value will do for a parameter of that type, which is not an array."""
+    """Whether a JSON value is accepted for a parameter of that type, which is no array."""
     if kind in (_BOOL, _STRING):
         return isinstance(value, bool if kind == _BOOL else str)
     if isinstance(value, bool):

@@ -170,7 +170,7 @@ class CallBridge:
         looks = [
             self._services.servers.poll_graph,
             self._actions.topics.poll_graph,
-            self._parameters.look,
+            self._parameters.source.poll_graph,
         ]
         has_routes = routes.services or routes.actions or routes.parameters
         if has_routes or self._requests.clients.has_clients:
@@ -186,4 +186,4 @@ class CallBridge:
         self._requests.clients.on_bus_lost()
         self._services.servers.on_bus_lost()
         self._actions.topics.on_bus_lost()
-        self._parameters.lost()
+        self._parameters.source.on_bus_lost()

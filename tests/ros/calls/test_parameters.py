@@ -10,9 +10,10 @@ from waiting import until
 pytest.importorskip("rcl_interfaces.srv")
 from call_harness import AllTypes, CallHarness, action, call_routes, parameters
 
-from appliance.ros.calls import parameters as module
+from appliance.ros.calls import parameter_events
 from appliance.ros.calls.dispatcher import CallError
-from appliance.ros.calls.parameters import EVENT, EVENTS, to_value
+from appliance.ros.calls.parameter_events import EVENT, EVENTS
+from appliance.ros.calls.parameters import to_value
 from appliance.ros.node import FakeNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
@@ -113,7 +114,7 @@ async def test_a_node_that_takes_the_place_of_one_that_was_killed(harness):
 
 
 async def test_a_flood_of_changes_has_the_node_read_anew(harness, monkeypatch):
-    monkeypatch.setattr(module, "WAITING_EVENTS", 20)
+    monkeypatch.setattr(parameter_events, "MAX_EVENTS", 20)
     harness.start(parameters("/arm/*"))
     arm = Declaring(harness, speed=1, other=1)
     harness.node.spin()
@@ -233,4 +234,4 @@ async def test_names_that_make_no_topic_hide_no_others(harness):
     for name in ("y" * 70_000, "tab\tbed", "speed"):
         arm.change(name, 2)
     await shown(harness, "speed", 2)
-    assert not harness.bridge.calls._parameters._events
+    assert not harness.bridge.calls._parameters.source.queue
