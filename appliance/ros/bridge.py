@@ -288,7 +288,7 @@ class Bridge:
         there = self._to_mqtt.get(key)
         back = self._found.get(key) or self._to_ros.get(key)
         if there is not None and back is not None and (back.echo is None or there.echo is None):
-            there.echo = back.echo = EchoFilter(self._node.wire)
+            there.echo = back.echo = EchoFilter(self._node.serialization)
 
     # The loop's thread
 

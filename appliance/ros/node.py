@@ -149,13 +149,13 @@ class RosNode(Protocol):
     only from inside the callbacks, which are called on the ROS thread. Only those of a subscription
     may be called on another, one at a time.
 
-    What is called CDR here is what `wire` says: the bus's own serialized bytes.
+    What is called CDR here is what `serialization` says: the bus's own serialized bytes.
     """
 
     #: The node's full name, such as `/appliance`.
     name: str
     #: How messages are serialized on the bus.
-    wire: Serialization
+    serialization: Serialization
     #: Where parameters are; None when every node keeps its own, and has services for them.
     parameter_server: ParameterServer | None
 
@@ -388,7 +388,7 @@ class FakeNode:
     `takes_on_loop` set, the caller's thread is the loop's for those who offered to be called there.
     """
 
-    wire = CDR
+    serialization = CDR
     parameter_server: ParameterServer | None = None
     obstacle: str | None = None
 

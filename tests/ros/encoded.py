@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from appliance.ros.payload.converter import Converter
-from appliance.ros.payload.cost import ITEMS
+from appliance.ros.payload.cost import DEFAULT_ITEMS
 from appliance.ros.payload.encodings.registry import ENCODINGS
 
 
@@ -14,7 +14,7 @@ def encoded(encoding: str, converter: Converter, cdr: bytes) -> bytes:
 
 def decoded(encoding: str, converter: Converter, payload: bytes) -> bytes:
     """The serialized message of a payload."""
-    return ENCODINGS[encoding].decoder(converter, ITEMS)(payload)
+    return ENCODINGS[encoding].decoder(converter, DEFAULT_ITEMS)(payload)
 
 
 def to_cbor(converter: Converter, cdr: bytes) -> bytes:

@@ -395,7 +395,7 @@ class BridgedAction:
         self._requests = requests
         self._converters = converters
         self._node = node
-        self._wire = node.wire
+        self._serialization = node.serialization
         self._registry = registry
         self._tasks = tasks
         self._goals: dict[bytes, Goal] = {}
@@ -417,7 +417,7 @@ class BridgedAction:
                 counters,
                 handler,
                 route.encoding,
-                (*WITHOUT_RAW, self._wire.encoding),
+                (*WITHOUT_RAW, self._serialization.encoding),
                 MAX_CANCEL_BYTES if verb == "_cancel" else None,
                 verb == "_cancel",
             )
@@ -478,7 +478,7 @@ class BridgedAction:
             raise CallError("rejected", "its client has gone, and so would its goal be cancelled")
         goal = self._registry.begin(call.caller)
         self._goals[goal.id] = goal
-        request = goals.with_id(goal_cdr, goal.id, self._wire)
+        request = goals.with_id(goal_cdr, goal.id, self._serialization)
         try:
             cdr = await self._requests.ask(
                 f"{self.ros}{SEND_GOAL}", f"{type_name}_SendGoal", request
@@ -564,7 +564,7 @@ class BridgedAction:
                 raise
             # The server was there, as it has accepted the goal.
             raise CallError("vanished", f"{service} went away before it answered") from None
-        status = goals.status_of(response, self._wire)
+        status = goals.status_of(response, self._serialization)
         if status == "unknown":
             text = f"the server of {self.ros} was restarted and does not know the goal"
             raise CallError("vanished", text)

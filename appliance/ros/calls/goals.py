@@ -41,15 +41,15 @@ _WHICH = (
 # it is by itself.
 
 
-def with_id(goal: bytes, id_: bytes, wire: Serialization) -> bytes:
+def with_id(goal: bytes, id_: bytes, serialization: Serialization) -> bytes:
     """The serialized request of `send_goal`."""
-    start = len(wire.header)
+    start = len(serialization.header)
     return goal[:start] + id_ + goal[start:]
 
 
-def split_id(cdr: bytes, wire: Serialization) -> tuple[bytes, bytes]:
+def split_id(cdr: bytes, serialization: Serialization) -> tuple[bytes, bytes]:
     """The goal's id and the serialized feedback, of a message with both."""
-    start = len(wire.header)
+    start = len(serialization.header)
     return cdr[start : start + 16], cdr[:start] + cdr[start + 16 :]
 
 
@@ -69,9 +69,9 @@ def accepted(
     return Answer(VALUE_ENCODINGS[encoding].dumps(value), encoding)
 
 
-def status_of(result: bytes, wire: Serialization) -> str:
+def status_of(result: bytes, serialization: Serialization) -> str:
     """The status in a response of `get_result`."""
-    start = len(wire.header)
+    start = len(serialization.header)
     return _state(result[start] if len(result) > start else 0)
 
 
@@ -82,7 +82,7 @@ def result(converters: Converters, action: str, cdr: bytes, encoding: EncodingNa
     converter = converters.get(f"{action}_GetResult_Response")
     values = VALUE_ENCODINGS[encoding]
     response = values.values(converter, cdr)
-    status = status_of(cdr, converter.description.wire)
+    status = status_of(cdr, converter.description.serialization)
     return values.dumps({"status": status, "result": response["result"]})
 
 

@@ -187,7 +187,7 @@ class ServiceRoutes:
             self._counters[route],
             partial(self._handle, name, route),
             route.encoding,
-            (*WITHOUT_RAW, self._node.wire.encoding),
+            (*WITHOUT_RAW, self._node.serialization.encoding),
         )
         self._endpoints[name] = route, endpoint
         self._dispatcher.register(endpoint)

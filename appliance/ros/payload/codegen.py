@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from appliance.ros.payload.arrays import WRITERS, binary_readers, readers
-from appliance.ros.payload.cost import weight_of
+from appliance.ros.payload.cost import cost_of
 from appliance.ros.payload.definitions import (
-    LONGEST_ROW,
+    MAX_INLINE_ITEMS,
     PRIMITIVES,
     Array,
     FieldType,
@@ -52,7 +52,7 @@ _COUNT = PRIMITIVES["uint32"]
 _PADDING = Primitive("padding", "x", 1)
 
 
-class Generated(NamedTuple):
+class GeneratedConverters(NamedTuple):
     """The functions of a type, and their source. Where `decode_plain` gives lists, `decode` gives
     numpy arrays, which orjson writes faster and, those of float32, in half the digits."""
 
@@ -74,7 +74,7 @@ class OverBudgetError(Exception):
     """A message is more work than it may be."""
 
 
-class Binary(NamedTuple):
+class BinaryDecoder(NamedTuple):
     """The function that reads a type for encodings that have bytes, and its source. Octets are
     bytes, and other arrays of numbers `arrays.Numbers`."""
 
@@ -82,27 +82,30 @@ class Binary(NamedTuple):
     source: str
 
 
-def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> Binary:
+def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> BinaryDecoder:
     """Generates and compiles the reader of a type, or of some of its fields."""
-    decoder = _Decoder(description.wire, wanted, "numbers_{}({})")
+    decoder = _Decoder(description.serialization, wanted, "numbers_{}({})")
     source = decoder.function(description)
     namespace = {**decoder.constants, **binary_readers()}
     exec(compile(source, f"<binary reader of {description.name}>", "exec"), namespace)
-    return Binary(namespace["decode"], source)
+    return BinaryDecoder(namespace["decode"], source)
 
 
 def generate_checker(description: TypeDescription) -> Checker:
     """Generates and compiles the function that looks whether a message is one of the type."""
-    decoder = _Decoder(description.wire, None, has_budget=True)
+    decoder = _Decoder(description.serialization, None, has_budget=True)
     source = decoder.function(description)
     namespace = {**decoder.constants, **binary_readers(), "OverBudgetError": OverBudgetError}
     exec(compile(source, f"<checker of {description.name}>", "exec"), namespace)
     return Checker(namespace["decode"], source)
 
 
-def generate(description: TypeDescription, wanted: Selection | None = None) -> Generated:
+def generate(description: TypeDescription, wanted: Selection | None = None) -> GeneratedConverters:
     """Generates and compiles the converters of a type; those that decode, of some of its fields."""
-    decoder, encoder = _Decoder(description.wire, wanted), _Encoder(description.wire)
+    decoder, encoder = (
+        _Decoder(description.serialization, wanted),
+        _Encoder(description.serialization),
+    )
     source = decoder.function(description) + "\n\n" + encoder.function(description)
     code = compile(source, f"<converters of {description.name}>", "exec")
     fast = {**decoder.constants, **readers(with_numpy=True)}
@@ -110,14 +113,14 @@ def generate(description: TypeDescription, wanted: Selection | None = None) -> G
     encoding = {**encoder.constants, **WRITERS}
     for namespace in (fast, plain, encoding):
         exec(code, namespace)
-    return Generated(fast["decode"], plain["decode"], encoding["encode"], source)
+    return GeneratedConverters(fast["decode"], plain["decode"], encoding["encode"], source)
 
 
 # --- where we are ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Phase:
+class Alignment:
     """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1).
 
     Nothing is aligned to more than `most`.
@@ -127,32 +130,32 @@ class Phase:
     rest: int
     most: int
 
-    def align(self, size: int) -> Phase:
+    def align(self, size: int) -> Alignment:
         size = min(size, self.most)
         if size > self.modulus:
-            return Phase(size, 0, self.most)
+            return Alignment(size, 0, self.most)
         return self.advance(-self.rest % size)
 
     def is_aligned(self, size: int) -> bool:
         size = min(size, self.most)
         return self.modulus >= size and self.rest % size == 0
 
-    def advance(self, count: int) -> Phase:
-        return Phase(self.modulus, (self.rest + count) % self.modulus, self.most)
+    def advance(self, count: int) -> Alignment:
+        return Alignment(self.modulus, (self.rest + count) % self.modulus, self.most)
 
-    def lost(self, modulus: int = 1) -> Phase:
+    def lost(self, modulus: int = 1) -> Alignment:
         """What is known behind something unknown: it ends at a multiple of `modulus`."""
-        return Phase(modulus, 0, self.most)
+        return Alignment(modulus, 0, self.most)
 
-    def join(self, other: Phase) -> Phase:
+    def join(self, other: Alignment) -> Alignment:
         """What is known when it may be this or the other."""
         modulus = min(self.modulus, other.modulus)
         while self.rest % modulus != other.rest % modulus:
             modulus //= 2
-        return Phase(modulus, self.rest % modulus, self.most)
+        return Alignment(modulus, self.rest % modulus, self.most)
 
 
-def _after(type_: FieldType, phase: Phase) -> Phase:
+def _after(type_: FieldType, phase: Alignment) -> Alignment:
     """What is known of the position behind a value, given what is known before it."""
     if isinstance(type_, Primitive):
         return phase.align(type_.size).advance(type_.size)
@@ -163,7 +166,7 @@ def _after(type_: FieldType, phase: Phase) -> Phase:
     if isinstance(type_, TypeDescription):
         for field in type_.fields:
             phase = _after(field.type, phase)
-        return phase if type_.fields else phase.advance(len(type_.wire.empty))
+        return phase if type_.fields else phase.advance(len(type_.serialization.empty))
     if isinstance(type_, Sequence):
         phase = phase.align(4).advance(4)
         return phase.join(_after(type_.item, _loop_phase(type_.item, phase)))
@@ -172,7 +175,7 @@ def _after(type_: FieldType, phase: Phase) -> Phase:
     return _after(type_.item, _loop_phase(type_.item, phase))
 
 
-def _loop_phase(item: FieldType, phase: Phase) -> Phase:
+def _loop_phase(item: FieldType, phase: Alignment) -> Alignment:
     """What is known at the beginning of every round of a loop over items."""
     phase = phase.align(_first_size(item))
     while (joined := phase.join(_after(item, phase))) != phase:
@@ -196,7 +199,7 @@ def _is_row(type_: FieldType) -> bool:
     return (
         isinstance(type_, Array)
         and isinstance(type_.item, Primitive)
-        and (type_.item.is_octet or (type_.length <= LONGEST_ROW and type_.item.code != "f"))
+        and (type_.item.is_octet or (type_.length <= MAX_INLINE_ITEMS and type_.item.code != "f"))
     )
 
 
@@ -210,7 +213,7 @@ def _is_run(type_: FieldType) -> bool:
 def _run_size(type_: FieldType, rest: int, most: int) -> int:
     """The bytes of a value that is part of a run, from a position that is `rest` modulo 8."""
     if isinstance(type_, TypeDescription):
-        size = 0 if type_.fields else len(type_.wire.empty)
+        size = 0 if type_.fields else len(type_.serialization.empty)
         for field in type_.fields:
             size += _run_size(field.type, rest + size, most)
         return size
@@ -249,16 +252,16 @@ class _Generator:
     have yet to be added to `q`.
     """
 
-    def __init__(self, wire: Serialization) -> None:
+    def __init__(self, serialization: Serialization) -> None:
         self.constants: dict[str, Any] = {}
-        self._wire = wire
+        self._serialization = serialization
         self._lines: list[str] = []
         self._indent = 1
         self._names = 0
         self._run: list[_Part] = []
-        self._phase = Phase(8, 0, wire.alignment)
+        self._phase = Alignment(8, 0, serialization.alignment)
         self._variable = False
-        self._offset = len(wire.header)
+        self._offset = len(serialization.header)
         self._terms: list[str] = []
 
     def _line(self, text: str) -> None:
@@ -299,11 +302,11 @@ class _Generator:
         for rest in range(self._phase.rest, 8, self._phase.modulus):
             position, codes = rest, "<"
             for part in self._run:
-                padding = -position % min(part.primitive.size, self._wire.alignment)
+                padding = -position % min(part.primitive.size, self._serialization.alignment)
                 codes += "x" * padding + part.code
                 position += padding + part.size
             # The header makes an index four more than the position that is aligned.
-            layouts[(rest + len(self._wire.header)) % 8] = struct.Struct(codes)
+            layouts[(rest + len(self._serialization.header)) % 8] = struct.Struct(codes)
         for part in self._run:
             self._phase = self._phase.align(part.primitive.size).advance(part.size)
         self._run = []
@@ -325,7 +328,7 @@ class _Generator:
 
     def _fill(self, description: TypeDescription) -> None:
         """What a structure without fields is."""
-        if not description.fields and self._wire.empty:
+        if not description.fields and self._serialization.empty:
             self._run.append(_Part(_PADDING, 1, ""))
 
     def _stride(self, item: FieldType) -> int | None:
@@ -334,7 +337,7 @@ class _Generator:
         phase = _loop_phase(item, self._phase)
         if not _is_run(item) or _after(item, phase) != phase:
             return None
-        most = self._wire.alignment
+        most = self._serialization.alignment
         sizes = {_run_size(item, rest, most) for rest in range(phase.rest, 8, phase.modulus)}
         return sizes.pop() if len(sizes) == 1 else None
 
@@ -348,19 +351,19 @@ class _Decoder(_Generator):
 
     def __init__(
         self,
-        wire: Serialization,
+        serialization: Serialization,
         wanted: Selection | None,
         row: str = "[{1}]",
         *,
         has_budget: bool = False,
     ) -> None:
-        super().__init__(wire)
+        super().__init__(serialization)
         self._wanted = wanted
         self._row = row
         self._has_budget = has_budget
 
     def function(self, description: TypeDescription) -> str:
-        if self._wire.header:
+        if self._serialization.header:
             self._line("if b[:2] != LITTLE_ENDIAN: raise ValueError")
         value = self._value(description, "message")
         self._flush()
@@ -375,7 +378,7 @@ class _Decoder(_Generator):
             self._fill(type_)
             for field in type_.fields:
                 self._pass(field.type)
-        elif isinstance(item, Primitive) and count * item.size <= LONGEST_ROW:
+        elif isinstance(item, Primitive) and count * item.size <= MAX_INLINE_ITEMS:
             self._run.append(_Part(Primitive("passed", "x" * item.size, item.size), count, ""))
         elif isinstance(item, Primitive):
             self._flush()
@@ -439,7 +442,7 @@ class _Decoder(_Generator):
         names = [part.text for part in self._run if part.text]
         target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
         first_size = self._run[0].primitive.size
-        if min(first_size, self._wire.alignment) > self._phase.modulus:
+        if min(first_size, self._serialization.alignment) > self._phase.modulus:
             # Cheaper than as many layouts, and what follows has often but one.
             self._align(first_size, "1")
         position = self._position()
@@ -453,7 +456,7 @@ class _Decoder(_Generator):
             self._line(f"if {size} > {string.bound + 1}: raise ValueError")
         self._settle()
         name, end = self._name(hint), self._name("end")
-        if self._wire.terminator:
+        if self._serialization.terminator:
             self._line(f"{end} = q + {size} - 1")
             # Behind the message this is an IndexError. A string without even its NUL passes: the
             # byte looked at is then the last of its size, which is 0.
@@ -523,7 +526,7 @@ class _Decoder(_Generator):
 
     def _loop(self, item: ItemType, count: str, hint: str) -> str:
         if self._has_budget:
-            self._line(f"left -= {count} * {weight_of(item)}")
+            self._line(f"left -= {count} * {cost_of(item)}")
             self._line("if left < 0: raise OverBudgetError")
         self._align(_first_size(item), count)
         items = self._name(hint)
@@ -554,12 +557,12 @@ class _Decoder(_Generator):
 class _Encoder(_Generator):
     """Writes `encode(message)`: the message, in little endian."""
 
-    def __init__(self, wire: Serialization) -> None:
-        super().__init__(wire)
+    def __init__(self, serialization: Serialization) -> None:
+        super().__init__(serialization)
         # The header is the beginning of the first run.
-        if wire.header:
-            self._run = [_Part(PRIMITIVES["uint8"], len(wire.header), "HEADER")]
-        self._phase = self._phase.advance(-len(wire.header))
+        if serialization.header:
+            self._run = [_Part(PRIMITIVES["uint8"], len(serialization.header), "HEADER")]
+        self._phase = self._phase.advance(-len(serialization.header))
         self._offset = 0
         self._pieces: list[str] = []  # expressions for bytes
         self._spilled = False
@@ -621,7 +624,7 @@ class _Encoder(_Generator):
         name, layout = self._end_run("pack")
         self._pieces.append(f"{name}{layout}({texts})")
 
-    def _bytes(self, name: str, phase: Phase) -> None:
+    def _bytes(self, name: str, phase: Alignment) -> None:
         """Writes bytes, behind the run."""
         self._flush()
         self._pieces.append(name)
@@ -653,13 +656,13 @@ class _Encoder(_Generator):
 
     def _string(self, string: String, source: str, hint: str) -> None:
         name = self._assign(hint, f"{source}.encode()")
-        if self._wire.terminator:
+        if self._serialization.terminator:
             self._line(f"if 0 in {name}: raise ValueError")
         self._bound(f"len({name})", string.bound)
-        size = f"len({name}) + 1" if self._wire.terminator else f"len({name})"
+        size = f"len({name}) + 1" if self._serialization.terminator else f"len({name})"
         self._run.append(_Part(_COUNT, 1, size))
         self._bytes(name, self._phase.lost())
-        if self._wire.terminator:
+        if self._serialization.terminator:
             self._run.append(_Part(_PADDING, 1, ""))
 
     def _array(self, array: Array, source: str, hint: str) -> None:

@@ -33,14 +33,14 @@ import orjson
 
 from appliance.ros.payload.codegen import (
     MISFIT,
-    Binary,
+    BinaryDecoder,
     Checker,
     OverBudgetError,
     generate,
     generate_binary,
     generate_checker,
 )
-from appliance.ros.payload.cost import CAREFUL, ITEMS, too_much
+from appliance.ros.payload.cost import DEFAULT_ITEMS, FALLBACK_FACTOR, over_limit
 from appliance.ros.payload.definitions import (
     Bulk,
     TypeDescription,
@@ -84,7 +84,7 @@ class Converter:
             description, self._wanted
         )
         #: Made when they are first needed: few routes do.
-        self._binary: Binary | None = None
+        self._binary: BinaryDecoder | None = None
         self._checker: Checker | None = None
         self._has_float32_arrays = "read_float32" in self.source
 
@@ -106,7 +106,7 @@ class Converter:
             raise ConversionError("", f"not JSON: {error}") from None
         return self.from_values(value, len(payload))
 
-    def checked(self, cdr: bytes, most: int = ITEMS) -> bytes:
+    def checked(self, cdr: bytes, most: int = DEFAULT_ITEMS) -> bytes:
         """The serialized message, as it is safe to hand on: nodes end over one that cannot be read
         (rclpy's over text that is not UTF-16), and rclpy does not look.
 
@@ -118,11 +118,11 @@ class Converter:
         try:
             self._checker.check(cdr, most)
         except OverBudgetError:
-            raise TooLargeError("", too_much(most)) from None
+            raise TooLargeError("", over_limit(most)) from None
         except MISFIT:
             # Strings that are not UTF-8 take the careful way, which is ten times as long.
-            decode(self.description, cdr, strict=True, most=most // CAREFUL)
-        return cdr[:2] + b"\0\0" + cdr[4:] if self.description.wire.header else cdr
+            decode(self.description, cdr, strict=True, most=most // FALLBACK_FACTOR)
+        return cdr[:2] + b"\0\0" + cdr[4:] if self.description.serialization.header else cdr
 
     def to_dict(self, cdr: bytes) -> dict[str, Any]:
         """What `to_json` writes, as Python values: lists, floats (NaN among them), base64."""

@@ -20,51 +20,51 @@ from appliance.ros.payload.definitions import (
 )
 
 #: What a text, a list or an object weighs, and what is more with a tag on it, of a typed array.
-WEIGHT = 8
-TAG_WEIGHT = 16
+CONTAINER_COST = 8
+TAG_COST = 16
 
 #: What a message may weigh if nothing else is said, see `bridge.limits.items`.
-ITEMS = 100_000
+DEFAULT_ITEMS = 100_000
 
 #: Bytes of a text in CBOR that weigh 1: they are read, searched and written.
-TEXT_BYTES = 32
+TEXT_BYTES_PER_ITEM = 32
 
 #: The careful way (careful.py) takes so many times as long as the fast one.
-CAREFUL = 4
+FALLBACK_FACTOR = 4
 
 #: Lists and objects in one another: deeper than any message type.
-DEPTH = 64
+MAX_DEPTH = 64
 
 
-def too_much(most: int) -> str:
+def over_limit(most: int) -> str:
     """What is wrong with a message that weighs more than `most`."""
     return f"it has more texts, lists, objects and numbers than {most} (bridge.limits.items)"
 
 
-def weight_of(type_: FieldType) -> int:
+def cost_of(type_: FieldType) -> int:
     """What a value of that type weighs, with nothing in those of its arrays that may be empty."""
     if isinstance(type_, Primitive):
         return 1
     if isinstance(type_, (String, WideString, Sequence)):
-        return WEIGHT
+        return CONTAINER_COST
     if isinstance(type_, TypeDescription):
-        return WEIGHT + sum(weight_of(field.type) for field in type_.fields)
+        return CONTAINER_COST + sum(cost_of(field.type) for field in type_.fields)
     if isinstance(type_.item, Primitive):
-        return WEIGHT + (0 if type_.item.is_octet else type_.length)
+        return CONTAINER_COST + (0 if type_.item.is_octet else type_.length)
     assert isinstance(type_, Array)
-    return WEIGHT + type_.length * weight_of(type_.item)
+    return CONTAINER_COST + type_.length * cost_of(type_.item)
 
 
-def weigh_json(payload: bytes, most: int) -> int:
+def json_cost(payload: bytes, most: int) -> int:
     """What a JSON text weighs; something above `most` when it is more than that."""
-    if len(payload) * WEIGHT <= most:
-        return len(payload) * WEIGHT  # it cannot be more
+    if len(payload) * CONTAINER_COST <= most:
+        return len(payload) * CONTAINER_COST  # it cannot be more
     weight = _weigh_marks(payload, payload.count(b'"') // 2)
     if weight <= most:
         return weight
     # At least so many of the quotes begin and end something, and no more of that are names.
     strings = (payload.count(b'"') - payload.count(rb"\"")) // 2
-    weight = strings + (WEIGHT - 1) * (strings - payload.count(b":"))
+    weight = strings + (CONTAINER_COST - 1) * (strings - payload.count(b":"))
     if weight > most:
         return weight
     # What was counted may be names, or within texts, which are now taken out.
@@ -76,7 +76,7 @@ def weigh_json(payload: bytes, most: int) -> int:
 
 def _weigh_marks(payload: bytes, texts: int) -> int:
     containers = payload.count(b"[") + payload.count(b"{")
-    return payload.count(b",") + 1 + WEIGHT * (containers + texts)
+    return payload.count(b",") + 1 + CONTAINER_COST * (containers + texts)
 
 
 #: The bytes that one item of CBOR takes by its first byte, where that says all of it: numbers,
@@ -93,7 +93,7 @@ _SINGLE = bytes(first for first, size in _SIZES.items() if size == 1)
 #: The same with short strings, whose length is in their first byte; 0 for all else.
 _SHORT = {first: 1 + (first & 0x1F) for first in (*range(0x40, 0x58), *range(0x60, 0x78))}
 _STEPS = [_SIZES.get(first, _SHORT.get(first, 0)) for first in range(256)]
-_WEIGHTS = [WEIGHT if first in _SHORT else 1 for first in range(256)]
+_WEIGHTS = [CONTAINER_COST if first in _SHORT else 1 for first in range(256)]
 
 #: Items from which on it is tried whether all of them have the same size.
 _MANY = 16
@@ -104,11 +104,11 @@ _BREAK = 0xFF
 _ENDLESS = 1 << 62
 
 
-def weigh_cbor(payload: bytes, most: int) -> int:
+def cbor_cost(payload: bytes, most: int) -> int:
     """What an item of CBOR weighs; something above `most` when it is more than that. Of what is no
     CBOR, or deeper than DEPTH, nothing: the decoder stops there, and says so."""
-    if len(payload) * (WEIGHT + TAG_WEIGHT) <= most:
-        return len(payload) * (WEIGHT + TAG_WEIGHT)
+    if len(payload) * (CONTAINER_COST + TAG_COST) <= most:
+        return len(payload) * (CONTAINER_COST + TAG_COST)
     try:
         return _walk_cbor(payload, most)
     except IndexError:  # it ends before its end, which the decoder will say
@@ -142,12 +142,12 @@ def _walk_cbor(payload: bytes, most: int) -> int:
         kind = first >> 5
         count, at = _argument(payload, at)
         if kind == 6:
-            weight += TAG_WEIGHT
+            weight += TAG_COST
             left += 1  # what the tag is of
         elif kind > 3 or count == _ENDLESS:  # a list or an object; or a string in pieces
-            weight += WEIGHT
+            weight += CONTAINER_COST
             outside.append((left, is_object))
-            if len(outside) > DEPTH:
+            if len(outside) > MAX_DEPTH:
                 return 0  # which the decoder will say
             is_object = kind == 5
             left = count * 2 if is_object and count != _ENDLESS else count
@@ -156,9 +156,9 @@ def _walk_cbor(payload: bytes, most: int) -> int:
                 left, at = 0, end
         else:  # a string
             at += count
-            weight += 1 if is_name else WEIGHT
+            weight += 1 if is_name else CONTAINER_COST
             if kind == 3:
-                weight += count // TEXT_BYTES
+                weight += count // TEXT_BYTES_PER_ITEM
     return weight
 
 

@@ -25,7 +25,7 @@ _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv|action)/)?([A-Za-z]\w*)\Z", 
 TIME = "builtin_interfaces/msg/Time"
 
 #: Arrays of a fixed length up to this are read with a name for each of their numbers.
-LONGEST_ROW = 64
+MAX_INLINE_ITEMS = 64
 
 
 class UnknownTypeError(LookupError):
@@ -145,7 +145,7 @@ class TypeDescription:
 
     name: str
     fields: tuple[Field, ...]
-    wire: Serialization = CDR
+    serialization: Serialization = CDR
 
 
 ItemType = Primitive | String | WideString | TypeDescription
@@ -211,7 +211,9 @@ def least_size(type_: FieldType) -> int:
     if isinstance(type_, Array):
         return type_.length * least_size(type_.item)
     if isinstance(type_, TypeDescription):
-        return sum(least_size(field.type) for field in type_.fields) or len(type_.wire.empty)
+        return sum(least_size(field.type) for field in type_.fields) or len(
+            type_.serialization.empty
+        )
     return 4
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import pybase64
 
 from appliance.ros.payload.arrays import Numbers
-from appliance.ros.payload.cost import ITEMS, WEIGHT, too_much, weight_of
+from appliance.ros.payload.cost import CONTAINER_COST, DEFAULT_ITEMS, cost_of, over_limit
 from appliance.ros.payload.definitions import (
     TIME,
     Array,
@@ -75,14 +75,16 @@ def decode(
     more than `most` (weigh.py).
     """
     order = "<"
-    if description.wire.header:
+    if description.serialization.header:
         if len(cdr) < 4:
             raise ConversionError("", "truncated: not even CDR's header of four bytes")
         if cdr[0] != 0 or cdr[1] > 1:
             raise ConversionError("", f"not plain CDR: representation {cdr[0]:02x} {cdr[1]:02x}")
         order = "<" if cdr[1] else ">"
     budget = _Budget(most)
-    return _Reader(cdr, description.wire, order, binary, strict, budget).structure(description, "")
+    return _CdrReader(cdr, description.serialization, order, binary, strict, budget).structure(
+        description, ""
+    )
 
 
 def pick(value: Any, wanted: Selection) -> Any:
@@ -106,32 +108,32 @@ class _Budget:
         """Raises TooLargeError when that is too much."""
         self._left -= weight
         if self._left < 0:
-            raise TooLargeError("", too_much(int(self._most)))
+            raise TooLargeError("", over_limit(int(self._most)))
 
 
-class _Reader:
+class _CdrReader:
     """A position in the bytes of one message."""
 
     def __init__(
         self,
         cdr: bytes,
-        wire: Serialization,
+        serialization: Serialization,
         order: str,
         binary: bool,
         strict: bool,
         budget: _Budget,
     ) -> None:
         self._cdr = cdr
-        self._wire = wire
+        self._serialization = serialization
         self._order = order
         self._binary = binary
         self._strict = strict
         self._budget = budget
-        self._position = len(wire.header)
+        self._position = len(serialization.header)
 
     def structure(self, description: TypeDescription, path: str) -> dict[str, Any]:
         if not description.fields:
-            self._take(len(self._wire.empty), path)
+            self._take(len(self._serialization.empty), path)
         return {
             field.name: self._value(field.type, _join(path, field.name))
             for field in description.fields
@@ -164,7 +166,7 @@ class _Reader:
             if self._binary and item.name != "bool":
                 return Numbers(item, struct.pack(f"<{count}{item.code}", *numbers))
             return list(numbers)
-        self._budget.spend(count * weight_of(item))
+        self._budget.spend(count * cost_of(item))
         return [self._value(item, f"{path}[{i}]") for i in range(count)]
 
     def _numbers(self, primitive: Primitive, count: int, path: str) -> tuple[Any, ...]:
@@ -189,7 +191,7 @@ class _Reader:
     def _string(self, path: str) -> str:
         # The count includes the final NUL. Some senders leave both out of an empty string.
         chunk = self._take(self._count(1, path), path)
-        return chunk.removesuffix(self._wire.terminator).decode("utf-8", "replace")
+        return chunk.removesuffix(self._serialization.terminator).decode("utf-8", "replace")
 
     def _wide_string(self, path: str) -> str:
         # As every rmw writes it: 16-bit units, each in four bytes, without a final NUL.
@@ -205,8 +207,8 @@ class _Reader:
 
     def _align(self, size: int) -> None:
         # It counts from the end of the header.
-        past = self._position - len(self._wire.header)
-        self._position += -past % min(size, self._wire.alignment)
+        past = self._position - len(self._serialization.header)
+        self._position += -past % min(size, self._serialization.alignment)
 
     def _take(self, size: int, path: str) -> bytes:
         chunk = self._cdr[self._position : self._position + size]
@@ -223,7 +225,7 @@ _UNIT = Primitive("uint32", "I", 4)
 
 
 def accept(
-    description: TypeDescription, value: object, now: Callable[[], int], most: float = ITEMS
+    description: TypeDescription, value: object, now: Callable[[], int], most: float = DEFAULT_ITEMS
 ) -> dict[str, Any]:
     """`value` by the conventions' rules for input, complete and checked to the last item.
 
@@ -232,13 +234,17 @@ def accept(
     TooLargeError for what weighs more than `most` (weigh.py), defaults included: with these, a
     few bytes can be a large message.
     """
-    return _Checker(now, description.wire, _Budget(most)).structure(description, value, "")
+    return _InputChecker(now, description.serialization, _Budget(most)).structure(
+        description, value, ""
+    )
 
 
-class _Checker:
-    def __init__(self, now: Callable[[], int], wire: Serialization, budget: _Budget) -> None:
+class _InputChecker:
+    def __init__(
+        self, now: Callable[[], int], serialization: Serialization, budget: _Budget
+    ) -> None:
         self._now = now
-        self._wire = wire
+        self._serialization = serialization
         self._budget = budget
 
     def structure(self, description: TypeDescription, value: object, path: str) -> dict[str, Any]:
@@ -247,7 +253,7 @@ class _Checker:
             value = {"sec": sec, "nanosec": nanosec}
         if not isinstance(value, dict):
             raise ConversionError(path, f"expected an object, got {_say(value)}")
-        self._budget.spend(WEIGHT + len(description.fields))
+        self._budget.spend(CONTAINER_COST + len(description.fields))
         names = [field.name for field in description.fields]
         for name in value:
             if name not in names:
@@ -260,7 +266,7 @@ class _Checker:
         }
 
     def _default(self, field: Field) -> Any:
-        self._budget.spend(weight_of(field.type))
+        self._budget.spend(cost_of(field.type))
         return default(field)
 
     def _value(self, type_: FieldType, value: object, path: str) -> Any:
@@ -294,7 +300,7 @@ class _Checker:
         value = value.listed() if isinstance(value, Numbers) else value
         if not isinstance(value, (list, tuple)):
             raise ConversionError(path, f"expected an array, got {_say(value)}")
-        self._budget.spend(len(value) * (1 if isinstance(item, Primitive) else WEIGHT))
+        self._budget.spend(len(value) * (1 if isinstance(item, Primitive) else CONTAINER_COST))
         if isinstance(item, Primitive) and _all_fit(item, value):
             return list(value)
         return [self._value(item, x, f"{path}[{i}]") for i, x in enumerate(value)]
@@ -303,7 +309,7 @@ class _Checker:
         if not isinstance(value, str):
             raise ConversionError(path, f"expected a string, got {_say(value)}")
         _check_bound(type_, value, path)
-        is_ended = isinstance(type_, String) and self._wire.terminator
+        is_ended = isinstance(type_, String) and self._serialization.terminator
         if is_ended and "\0" in value:
             # What follows would be lost on the way: strings end at NUL in C, and in rclpy.
             raise ConversionError(path, "a ROS string cannot hold the character U+0000")

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from appliance.mqtt.codec import Properties, Property
 from appliance.ros.payload.converter import Converter
-from appliance.ros.payload.cost import ITEMS, too_much
+from appliance.ros.payload.cost import DEFAULT_ITEMS, over_limit
 from appliance.ros.payload.encodings.base import Encoding, EncodingName
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.fallback import ConversionError, TooLargeError
@@ -38,7 +38,7 @@ class InputLimits:
 
     payload: int = 1024 * 1024
     packet: int = 16 * 1024 * 1024
-    items: int = ITEMS
+    items: int = DEFAULT_ITEMS
 
     def largest(self, encoding: Encoding) -> int:
         """Bytes that a payload in that encoding may have, decompressed."""
@@ -56,7 +56,7 @@ class InputLimits:
         sees that before it decodes the payload."""
         self.check_size(len(payload), encoding)
         if encoding.cost(payload, self.items) > self.items:
-            raise TooLargeError("", too_much(self.items))
+            raise TooLargeError("", over_limit(self.items))
 
 
 def packer(
@@ -114,7 +114,7 @@ def unpacker(
     return unpack_compressed
 
 
-def claim(properties: Properties, name: str) -> str | None:
+def user_property(properties: Properties, name: str) -> str | None:
     """The value of a user property; None when there is none of that name."""
     pairs = properties.get(Property.USER_PROPERTY)
     for pair in pairs if isinstance(pairs, list) else ():

@@ -42,10 +42,10 @@ CANCEL = "action_msgs/srv/CancelGoal"
 STATUS = "action_msgs/msg/GoalStatusArray"
 
 #: Results that are kept for who asks late, of one action.
-RESULTS = 100
+MAX_RESULTS = 100
 
 #: Messages of status without a goal, after which its server does not know it.
-MISSED = 3
+MAX_MISSED = 3
 
 #: By the numbers of actionlib_msgs/GoalStatus, those of action_msgs/msg/GoalStatus: pending is
 #: accepted, rejected is aborted, recalled is canceled, lost is unknown.
@@ -128,7 +128,7 @@ def services_of(actions: dict[str, str]) -> dict[str, list[str]]:
     return found
 
 
-class Publisher(Protocol):
+class ActionPublisher(Protocol):
     """A publisher that knows who is connected."""
 
     def reaches(self, nodes: Iterable[str]) -> bool:
@@ -141,7 +141,7 @@ class Publisher(Protocol):
         """End it."""
 
 
-class Bus(Protocol):
+class ActionBus(Protocol):
     """What is needed of the node."""
 
     def now(self) -> int:
@@ -164,16 +164,16 @@ class Bus(Protocol):
     ) -> RosSubscription:
         """Call `callback` with each message."""
 
-    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Publisher:
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> ActionPublisher:
         """Make a publisher of serialized messages."""
 
 
-class Actions:
+class ActionClients:
     """The clients of actions, as clients of ROS 2's three services, and their two topics."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: ActionBus) -> None:
         self._bus = bus
-        self._servers: dict[str, _Server] = {}
+        self._servers: dict[str, _ActionServer] = {}
 
     def create_client(self, service: str, type_name: str) -> ActionClient:
         """A client of `/act/_action/send_goal` and its like. Raises BusError, UnknownTypeError."""
@@ -183,7 +183,7 @@ class Actions:
             action = self._bus.action_type(name)
             if action is None:
                 raise BusError(f"{name} has no server")
-            server = self._servers[name] = _Server(self._bus, name, action)
+            server = self._servers[name] = _ActionServer(self._bus, name, action)
         server.clients += 1
         ways = {
             "send_goal": server.send_goal,
@@ -192,7 +192,7 @@ class Actions:
         }
         return ActionClient(self, server, ways[verb])
 
-    def release(self, server: _Server) -> None:
+    def release(self, server: _ActionServer) -> None:
         """A client has ended."""
         server.clients -= 1
         if not server.clients:
@@ -230,8 +230,8 @@ class ActionClient:
 
     def __init__(
         self,
-        actions: Actions,
-        server: _Server,
+        actions: ActionClients,
+        server: _ActionServer,
         ask: Callable[[bytes, Callable[[bytes], None]], Callable[[], None]],
     ) -> None:
         self._actions = actions
@@ -259,15 +259,15 @@ _STATUS = "actionlib_msgs/msg/GoalStatusArray"
 
 # A call is asked for a response, given its goal, when something has come from the server: the
 # response, or None to go on waiting.
-_Look = Callable[["_Call"], bytes | None]
+_FindResponse = Callable[["_PendingCall"], bytes | None]
 
 
 @dataclass(eq=False, slots=True)
-class _Call:
+class _PendingCall:
     """A call under way; `missed` counts messages of status without its goal."""
 
     goal: str
-    look: _Look
+    look: _FindResponse
     done: Callable[[bytes], None]
     missed: int = 0
 
@@ -280,14 +280,14 @@ class _Results:
 
     def add(self, goal: str, status: int, result: bytes) -> None:
         self.kept[goal] = status, result
-        if len(self.kept) > RESULTS:
+        if len(self.kept) > MAX_RESULTS:
             self.kept.popitem(last=False)
 
 
-class _Server:
+class _ActionServer:
     """An action's server, as it is seen from here."""
 
-    def __init__(self, bus: Bus, name: str, type_name: str) -> None:
+    def __init__(self, bus: ActionBus, name: str, type_name: str) -> None:
         self.name = name
         self.clients = 0
         self._bus = bus
@@ -297,7 +297,7 @@ class _Server:
         self._goals: dict[str, tuple[int, bytes]] | None = None
         self._ids: dict[bytes, str] = {}
         self._results = _Results()
-        self._calls: list[_Call] = []
+        self._calls: list[_PendingCall] = []
         self._parts: list[Any] = []
         try:
             for topic, kind, handle in (
@@ -314,8 +314,8 @@ class _Server:
         except BaseException:
             self.close()
             raise
-        self._goal: Publisher = self._parts[2]
-        self._cancel: Publisher = self._parts[3]
+        self._goal: ActionPublisher = self._parts[2]
+        self._cancel: ActionPublisher = self._parts[3]
 
     def close(self) -> None:
         """End it."""
@@ -342,23 +342,23 @@ class _Server:
         stamp = _stamp(self._bus.now())
         self._goal.publish(struct.pack("<I", 0) + stamp + _text("") + stamp + _text(id_) + goal)
 
-        def look(call: _Call) -> bytes | None:
+        def look(call: _PendingCall) -> bytes | None:
             status = self._status(call.goal)
             return None if status is None else struct.pack("<?", status != _REJECTED) + stamp
 
-        return self._begin(_Call(id_, look, done))
+        return self._begin(_PendingCall(id_, look, done))
 
     def get_result(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
         """The result of a goal, when it has ended; that the server does not know it, when it keeps
         telling of others only."""
 
-        def look(call: _Call) -> bytes | None:
+        def look(call: _PendingCall) -> bytes | None:
             ended = self._results.kept.get(call.goal)
             if ended is not None:
                 return struct.pack("<b", _state(ended[0])) + ended[1]
-            return struct.pack("<b", 0) + self._no_result if call.missed >= MISSED else None
+            return struct.pack("<b", 0) + self._no_result if call.missed >= MAX_MISSED else None
 
-        return self._begin(_Call(self._text_of(request[:16]), look, done))
+        return self._begin(_PendingCall(self._text_of(request[:16]), look, done))
 
     def cancel(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
         """Cancel a goal; or for 16 zeros all up to a time, all there are for the time 0. It is
@@ -375,7 +375,7 @@ class _Server:
         is_meant = partial(_is_until, until)
         before = {goal for goal, (state, _) in (self._goals or {}).items() if state in _ENDED}
 
-        def look(call: _Call) -> bytes | None:
+        def look(call: _PendingCall) -> bytes | None:
             goals = self._goals or {}
             if is_all:
                 wanted = [
@@ -396,9 +396,9 @@ class _Server:
             infos = (_uuid(goal) + goals.get(goal, (0, bytes(8)))[1] for goal in wanted)
             return struct.pack("<bI", _NONE, len(wanted)) + b"".join(infos)
 
-        return self._begin(_Call(id_, look, done), is_new=True)
+        return self._begin(_PendingCall(id_, look, done), is_new=True)
 
-    def _begin(self, call: _Call, *, is_new: bool = False) -> Callable[[], None]:
+    def _begin(self, call: _PendingCall, *, is_new: bool = False) -> Callable[[], None]:
         """Wait for the server; what it has said already counts, unless the question `is_new`."""
         self._calls.append(call)
         if not is_new:
@@ -410,7 +410,7 @@ class _Server:
 
         return give_up
 
-    def _settle(self, calls: list[_Call]) -> None:
+    def _settle(self, calls: list[_PendingCall]) -> None:
         for call in calls:
             response = call.look(call) if call in self._calls else None
             if response is not None:
@@ -440,7 +440,7 @@ class _Server:
         self._settle(list(self._calls))
 
     def _on_result(self, data: bytes) -> None:
-        told = _if_readable(read_told, data)
+        told = _if_readable(read_goal_message, data)
         if told is not None:
             self._results.add(*told)
             self._settle(list(self._calls))
@@ -493,7 +493,7 @@ def read_status(data: bytes) -> list[tuple[str, int, bytes]]:
     return [cursor.status() for _ in range(cursor.number("I"))]
 
 
-def read_told(data: bytes) -> tuple[str, int, bytes]:
+def read_goal_message(data: bytes) -> tuple[str, int, bytes]:
     """What a feedback or result is of, the goal's status, and the message inside."""
     cursor = _Cursor(data)
     cursor.header()
@@ -511,7 +511,7 @@ def to_status(data: bytes) -> bytes:
 
 def to_feedback(data: bytes) -> bytes:
     """A `Name_FeedbackMessage` of a `NameActionFeedback`."""
-    goal, _, feedback = read_told(data)
+    goal, _, feedback = read_goal_message(data)
     return _uuid(goal) + feedback
 
 

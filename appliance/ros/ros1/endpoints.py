@@ -19,23 +19,23 @@ from appliance.ros.ros1.peers import ServiceCall
 from appliance.ros.ros1.types import Definition, ServiceDefinition
 
 #: Messages of a publisher that are held until it is seen to be latched.
-HELD = 10
+MAX_HELD = 10
 
 
-class Audience(Protocol):
+class LatchTracker(Protocol):
     """Who is told what publishers say of themselves."""
 
     def hear(self, topic: str, node: str, is_latched: bool) -> bool:
         """What a publisher says of itself; whether that is news."""
 
-    def hold(self, subscription: Subscription) -> None:
+    def hold(self, subscription: Ros1Subscription) -> None:
         """Have it release what it holds after the next look."""
 
-    def let_go(self, subscription: Subscription) -> None:
+    def let_go(self, subscription: Ros1Subscription) -> None:
         """It holds nothing any more."""
 
 
-class Caller(Protocol):
+class ClientNode(Protocol):
     """The node, as far as its clients need it."""
 
     name: str
@@ -95,7 +95,7 @@ def _serialized(message: Any) -> bytes:
     return buffer.getvalue()
 
 
-class Subscription:
+class Ros1Subscription:
     """A RosSubscription.
 
     What latched publishers send is retained on MQTT, and only with a message it is told that one
@@ -106,7 +106,7 @@ class Subscription:
     def __init__(
         self,
         rospy: Any,
-        audience: Audience,
+        audience: LatchTracker,
         topic: str,
         definition: Definition,
         is_latched: bool,
@@ -118,7 +118,7 @@ class Subscription:
         self._callback = callback
         self._lock = threading.Lock()
         self._is_over = False
-        self._held: deque[bytes] = deque(maxlen=HELD)
+        self._held: deque[bytes] = deque(maxlen=MAX_HELD)
         self._raw = rospy.AnyMsg
         kind = message_class(rospy, definition)
         self._own = rospy.Subscriber(topic, kind, self._on_message, tcp_nodelay=True)
@@ -161,7 +161,7 @@ class Subscription:
         self._own.unregister()
 
 
-class Publisher:
+class Ros1Publisher:
     """A RosPublisher."""
 
     def __init__(self, rospy: Any, topic: str, definition: Definition, qos: QosProfile) -> None:
@@ -194,10 +194,10 @@ class Publisher:
         self._own.unregister()
 
 
-class Client:
+class Ros1Client:
     """A RosClient: each call is a connection and a thread of its own."""
 
-    def __init__(self, node: Caller, service: str, definition: ServiceDefinition) -> None:
+    def __init__(self, node: ClientNode, service: str, definition: ServiceDefinition) -> None:
         self._node = node
         self._service = service
         self._definition = definition
@@ -236,7 +236,7 @@ class Client:
         self._calls.clear()
 
 
-class Service:
+class Ros1Service:
     """A RosService. rospy waits for each answer on a thread of its own."""
 
     def __init__(

@@ -36,10 +36,22 @@ from appliance.ros.node import (
     TakeBatch,
 )
 from appliance.ros.payload.definitions import PACKED, TypeDescription, UnknownTypeError
-from appliance.ros.ros1.actions import HIDDEN, Actions, describe_action, find_actions, services_of
-from appliance.ros.ros1.endpoints import Client, Publisher, Service, Subscription
-from appliance.ros.ros1.peers import Answers, Master, MasterParameters, ask_publisher, ask_service
-from appliance.ros.ros1.rospy_cleanup import Servers, bound_receiving, unload
+from appliance.ros.ros1.actions import (
+    HIDDEN,
+    ActionClients,
+    describe_action,
+    find_actions,
+    services_of,
+)
+from appliance.ros.ros1.endpoints import Ros1Client, Ros1Publisher, Ros1Service, Ros1Subscription
+from appliance.ros.ros1.peers import (
+    Master,
+    MasterParameters,
+    QueryCache,
+    fetch_definition,
+    fetch_service_type,
+)
+from appliance.ros.ros1.rospy_cleanup import ServerShutdown, limit_receive_size, unload
 from appliance.ros.ros1.types import Definition, describe, full_name, installed, installed_service
 
 log = logging.getLogger(__name__)
@@ -114,7 +126,7 @@ class Ros1Node(FaultContainment):
     Messages come on threads of rospy's, one at a time for each subscription.
     """
 
-    wire = PACKED
+    serialization = PACKED
 
     def __init__(
         self, name: str = "appliance", namespace: str = "/", arguments: Sequence[str] = ()
@@ -154,14 +166,14 @@ class Ros1Node(FaultContainment):
         self._types_asked = 0.0
         #: The types of the actions that have a server.
         self._actions: dict[str, str] = {}
-        self._action_clients = Actions(self)
+        self._action_clients = ActionClients(self)
         #: By topic and node, whether a publisher has said to be latched: it does in its messages.
         self._heard: dict[tuple[str, str], bool] = {}
         #: Definitions of types that are not installed, and the types of services.
-        self._definitions: Answers[Definition] = Answers()
-        self._service_types: Answers[str] = Answers()
+        self._definitions: QueryCache[Definition] = QueryCache()
+        self._service_types: QueryCache[str] = QueryCache()
         #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
-        self._holding: dict[Subscription, None] = {}
+        self._holding: dict[Ros1Subscription, None] = {}
 
     @property
     def obstacle(self) -> str | None:
@@ -235,8 +247,8 @@ class Ros1Node(FaultContainment):
             disable_rosout=True,
             disable_signals=True,
         )
-        Servers(rospy)
-        bound_receiving(rospy)
+        ServerShutdown(rospy)
+        limit_receive_size(rospy)
         self.name = rospy.get_name()
         self._uri = rospy.core.get_node_uri()
         self._master.caller = self.name
@@ -403,7 +415,7 @@ class Ros1Node(FaultContainment):
         found = services_of(self._actions)
         for service, nodes in self._servers.items():
             key = service, *nodes
-            ask = partial(ask_service, self._master.uri, self.name, service)
+            ask = partial(fetch_service_type, self._master.uri, self.name, service)
             try:
                 name = self._service_types.get(key, ask)
             except BusError as error:  # its node has ended without a word, most often
@@ -456,7 +468,7 @@ class Ros1Node(FaultContainment):
         with suppress(UnknownTypeError):
             self._definition(type_name)
             return True
-        ask = partial(ask_publisher, self._master.uri, self.name, node, topic)
+        ask = partial(fetch_definition, self._master.uri, self.name, node, topic)
         try:
             told = self._definitions.get((topic, node), ask)
         except BusError as error:
@@ -507,7 +519,7 @@ class Ros1Node(FaultContainment):
         definition = self._definition(type_name)
         topic = self._resolve(topic)
         contained = self._contained("ros.message", callback)
-        return Subscription(self._rospy, self, topic, definition, is_latched, contained)
+        return Ros1Subscription(self._rospy, self, topic, definition, is_latched, contained)
 
     def hear(self, topic: str, node: str, is_latched: bool) -> bool:
         """What a publisher says of itself; whether that is news."""
@@ -518,16 +530,16 @@ class Ros1Node(FaultContainment):
         self._heard[key] = is_latched
         return is_latched or before is not None
 
-    def hold(self, subscription: Subscription) -> None:
+    def hold(self, subscription: Ros1Subscription) -> None:
         """Have it release what it holds after the next look."""
         self._holding[subscription] = None
 
-    def let_go(self, subscription: Subscription) -> None:
+    def let_go(self, subscription: Ros1Subscription) -> None:
         """It holds nothing any more."""
         self._holding.pop(subscription, None)
 
-    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Publisher:
-        return Publisher(self._rospy, topic, self._definition(type_name), qos)
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Ros1Publisher:
+        return Ros1Publisher(self._rospy, topic, self._definition(type_name), qos)
 
     # Services
 
@@ -542,7 +554,7 @@ class Ros1Node(FaultContainment):
     def create_client(self, service: str, type_name: str) -> RosClient:
         if HIDDEN in service:
             return self._action_clients.create_client(service, type_name)
-        return Client(self, self._resolve(service), installed_service(type_name))
+        return Ros1Client(self, self._resolve(service), installed_service(type_name))
 
     @property
     def master_uri(self) -> str:
@@ -559,9 +571,9 @@ class Ros1Node(FaultContainment):
 
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
-    ) -> Service:
+    ) -> Ros1Service:
         definition = installed_service(type_name)
-        return Service(self._rospy, service, definition, callback, self.call_soon)
+        return Ros1Service(self._rospy, service, definition, callback, self.call_soon)
 
 
 @cache

@@ -27,17 +27,17 @@ from appliance.ros.node import BusError
 from appliance.ros.ros1.types import Definition, ServiceDefinition
 
 #: Seconds that the Master or a node may take to say something.
-PATIENCE = 2.0
+TIMEOUT = 2.0
 
 #: Seconds until a question is asked again that was not answered.
-RETRY = 5.0
+RETRY_INTERVAL = 5.0
 
 #: Questions that are asked at a time.
-ASKERS = 4
+QUERY_THREADS = 4
 
 #: Bytes of a header, which has a type's definition in it, and of a response.
-LARGEST_HEADER = 4 << 20
-LARGEST_RESPONSE = 64 << 20
+MAX_HEADER_SIZE = 4 << 20
+MAX_RESPONSE_SIZE = 64 << 20
 
 #: What comes of an answer that is none: a port may be another program's by now.
 _WRONG = (
@@ -50,13 +50,13 @@ _WRONG = (
     ValueError,
 )
 
-_Answer = TypeVar("_Answer")
+_Result = TypeVar("_Result")
 
 
 class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host: Any) -> Any:
         connection = super().make_connection(host)
-        connection.timeout = PATIENCE
+        connection.timeout = TIMEOUT
         return connection
 
 
@@ -137,7 +137,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, xmlrpc.client.DateTime) else value
 
 
-class Answers(Generic[_Answer]):
+class QueryCache(Generic[_Result]):
     """Answers to questions, which are asked on threads of their own; for one thread.
 
     An executor's threads would be waited for at the end of the process, and who is asked may take
@@ -146,26 +146,26 @@ class Answers(Generic[_Answer]):
 
     def __init__(self) -> None:
         self._askers: list[threading.Thread] = []
-        self._questions: queue.SimpleQueue[tuple[Future[_Answer], Callable[[], _Answer]] | None]
+        self._questions: queue.SimpleQueue[tuple[Future[_Result], Callable[[], _Result]] | None]
         self._questions = queue.SimpleQueue()
-        self._asked: dict[Any, tuple[Future[_Answer], float]] = {}
+        self._asked: dict[Any, tuple[Future[_Result], float]] = {}
         #: What was answered before, until it is answered anew.
-        self._before: dict[Any, _Answer] = {}
+        self._before: dict[Any, _Result] = {}
 
-    def get(self, key: Any, ask: Callable[[], _Answer]) -> _Answer | None:
+    def get(self, key: Any, ask: Callable[[], _Result]) -> _Result | None:
         """The answer of `ask`; None when it is not there yet. Raises BusError as `ask` did."""
         asked = self._asked.get(key)
         if asked is None or (asked[1] < monotonic() and asked[0].done() and asked[0].exception()):
-            asked = self._asked[key] = (self._ask(ask), monotonic() + RETRY)
+            asked = self._asked[key] = (self._ask(ask), monotonic() + RETRY_INTERVAL)
         if not asked[0].done():
             return self._before.get(key)
         self._before.pop(key, None)
         return asked[0].result()
 
-    def _ask(self, ask: Callable[[], _Answer]) -> Future[_Answer]:
-        answer: Future[_Answer] = Future()
+    def _ask(self, ask: Callable[[], _Result]) -> Future[_Result]:
+        answer: Future[_Result] = Future()
         self._questions.put((answer, ask))
-        if len(self._askers) < ASKERS:
+        if len(self._askers) < QUERY_THREADS:
             asker = threading.Thread(target=self._run, name="ros-ask", daemon=True)
             self._askers.append(asker)
             asker.start()
@@ -202,7 +202,7 @@ class Answers(Generic[_Answer]):
             self._questions.put(None)
 
 
-def ask_publisher(master_uri: str, caller: str, node: str, topic: str) -> Definition:
+def fetch_definition(master_uri: str, caller: str, node: str, topic: str) -> Definition:
     """The definition of a topic's type, as one of its publishers has it. Raises BusError."""
     uri = Master(master_uri, caller).call("lookupNode", node)
     protocol = Master(uri, caller).call("requestTopic", topic, [["TCPROS"]])
@@ -217,7 +217,7 @@ def ask_publisher(master_uri: str, caller: str, node: str, topic: str) -> Defini
         raise BusError(f"{node} does not tell the {error.args[0]} of {topic}") from None
 
 
-def ask_service(master_uri: str, caller: str, service: str) -> str:
+def fetch_service_type(master_uri: str, caller: str, service: str) -> str:
     """The type of a service, as ROS 1 calls it. Raises BusError."""
     address = _address(Master(master_uri, caller).call("lookupService", service), service)
     fields = {"callerid": caller, "service": service, "md5sum": "*", "probe": "1"}
@@ -293,7 +293,7 @@ class ServiceCall:
                 # How long a service may work is for who called it to decide.
                 peer.settimeout(None)
                 is_ok = _read(peer, 1, service) != b"\0"
-                response = _read_sized(peer, LARGEST_RESPONSE, service)
+                response = _read_sized(peer, MAX_RESPONSE_SIZE, service)
             finally:
                 with self._lock:
                     self._peer = None
@@ -313,7 +313,7 @@ def _address(uri: object, service: str) -> tuple[str, int]:
 def _connect(address: tuple[str, Any], who: str) -> socket.socket:
     host, port = address
     try:
-        peer = socket.create_connection((host, int(port)), PATIENCE)
+        peer = socket.create_connection((host, int(port)), TIMEOUT)
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     # What it tells may be no number, too large a one, or no name of a computer (UnicodeError).
     except (OSError, ValueError, TypeError, OverflowError) as error:
@@ -327,15 +327,15 @@ def _connect(address: tuple[str, Any], who: str) -> socket.socket:
 def _shake_hands(peer: socket.socket, fields: Mapping[str, str], who: str) -> dict[str, str]:
     """Send a header, and read the other's. Raises BusError, also for an error in it, and when the
     other takes longer than PATIENCE for all of it."""
-    until = monotonic() + PATIENCE
+    until = monotonic() + TIMEOUT
     lines = [f"{key}={value}".encode() for key, value in fields.items()]
     header = b"".join(struct.pack("<I", len(line)) + line for line in lines)
     try:
         peer.sendall(struct.pack("<I", len(header)) + header)
     except OSError as error:
         raise BusError(f"{who}: {error}") from error
-    found = parse_header(_read_sized(peer, LARGEST_HEADER, who, until))
-    peer.settimeout(PATIENCE)
+    found = parse_header(_read_sized(peer, MAX_HEADER_SIZE, who, until))
+    peer.settimeout(TIMEOUT)
     if "error" in found:
         raise BusError(f"{who} says: {found['error'][:500]}")
     return found

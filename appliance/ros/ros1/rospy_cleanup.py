@@ -17,15 +17,15 @@ from typing import Any
 from weakref import WeakSet
 
 from appliance.ros.ros1.endpoints import forget_classes
-from appliance.ros.ros1.peers import LARGEST_HEADER
-from appliance.ros.ros1.types import LARGEST_MESSAGE
+from appliance.ros.ros1.peers import MAX_HEADER_SIZE
+from appliance.ros.ros1.types import MAX_MESSAGE_SIZE
 
 log = logging.getLogger(__name__)
 
 #: Seconds that a caller of ours may take between two bytes of what it is for, and how many may do
 #: so at a time.
-CALLER_TIME = 5.0
-CALLERS = 200
+HANDSHAKE_TIMEOUT = 5.0
+MAX_HANDSHAKES = 200
 
 
 def unload() -> None:
@@ -42,7 +42,7 @@ def unload() -> None:
         del sys.modules[name]
 
 
-class Servers:
+class ServerShutdown:
     """The two servers of a node, to be ended with all their threads. rospy closes the sockets that
     these wait at, which they do not notice, and keeps the connections, and others their ends. And
     it hears one caller at a time out: one that says nothing would keep away all others."""
@@ -81,7 +81,7 @@ class Servers:
             finally:
                 self._callers.pop(caller, None)
 
-        if len(self._callers) >= CALLERS:
+        if len(self._callers) >= MAX_HANDSHAKES:
             caller.close()
             return
         self._callers[caller] = None
@@ -90,7 +90,7 @@ class Servers:
     def _read_header_in_time(self, connection: socket.socket, *more: Any) -> Any:
         if connection not in self._callers:  # one of our own
             return self._read_header(connection, *more)
-        connection.settimeout(CALLER_TIME)
+        connection.settimeout(HANDSHAKE_TIMEOUT)
         try:
             return self._read_header(connection, *more)
         finally:
@@ -123,7 +123,7 @@ class _HeaderBuffer(BytesIO):
         size = super().write(data)
         if not self._is_bounded and self.tell() >= 4:
             self._is_bounded = True
-            if _announced(self) > LARGEST_HEADER:
+            if _announced(self) > MAX_HEADER_SIZE:
                 raise ROSHandshakeException(f"a header of {_announced(self)} bytes")
         return size
 
@@ -134,7 +134,7 @@ def _announced(buffer: BytesIO) -> int:
         return int.from_bytes(data[:4], "little")
 
 
-def bound_receiving(rospy: Any) -> None:
+def limit_receive_size(rospy: Any) -> None:
     """Pass over what is announced to be larger than anything is: rospy keeps what has come of a
     message until it is complete, and a wrong length may say 4 GB."""
     base = rospy.impl.tcpros_base
@@ -143,10 +143,10 @@ def bound_receiving(rospy: Any) -> None:
     def receive_bounded(peer: socket.socket, buffer: BytesIO, size: int) -> int:
         count = int(receive(peer, buffer, size))
         announced = _announced(buffer)
-        if announced <= LARGEST_MESSAGE:
+        if announced <= MAX_MESSAGE_SIZE:
             return count
         log.warning(
-            "a message of %d bytes, the most are %d, is left out", announced, LARGEST_MESSAGE
+            "a message of %d bytes, the most are %d, is left out", announced, MAX_MESSAGE_SIZE
         )
         left = 4 + announced - buffer.tell()
         while left:

@@ -16,7 +16,7 @@ from importlib import import_module
 from typing import Any
 
 from appliance.ros.payload.definitions import (
-    LONGEST_ROW,
+    MAX_INLINE_ITEMS,
     PACKED,
     PRIMITIVES,
     TIME,
@@ -33,10 +33,10 @@ from appliance.ros.payload.definitions import (
 
 #: Bytes of a definition, fields that it comes to with all that is in it, types in types, and bytes
 #: of the smallest message: a stranger's definition is no reason to run out of memory.
-LARGEST_DEFINITION = 1 << 20
-MOST_FIELDS = 5_000
-DEEPEST = 16  # Python takes no more than 20 loops in loops
-LARGEST_MESSAGE = 64 << 20
+MAX_DEFINITION_SIZE = 1 << 20
+MAX_FIELDS = 5_000
+MAX_DEPTH = 16  # Python takes no more than 20 loops in loops
+MAX_MESSAGE_SIZE = 64 << 20
 
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv)/)?([A-Za-z]\w*)\Z", re.ASCII)
 _FIELD = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,9})\])?\s+([A-Za-z]\w*)\s*(=.*|#.*)?\Z", re.ASCII)
@@ -147,7 +147,7 @@ def describe(name: str, text: str) -> TypeDescription:
 
     Raises UnknownTypeError when the text is none, or is too large to be one.
     """
-    if len(text) > LARGEST_DEFINITION:
+    if len(text) > MAX_DEFINITION_SIZE:
         raise UnknownTypeError(f"no {name}: its definition has {len(text)} characters")
     own, *others = _SEPARATOR.split(text)
     sections = {}
@@ -155,7 +155,7 @@ def describe(name: str, text: str) -> TypeDescription:
         head, _, body = other.lstrip("\n").partition("\n")
         sections[head.removeprefix("MSG:").strip()] = body
     description = _Parser(name, sections).describe(name, ros1_name(name), own, ())
-    if least_size(description) > LARGEST_MESSAGE:
+    if least_size(description) > MAX_MESSAGE_SIZE:
         raise UnknownTypeError(f"no {name}: its smallest message has {least_size(description)} B")
     return description
 
@@ -169,8 +169,8 @@ class _Parser:
     def describe(self, name: str, ros1: str, text: str, above: tuple[str, ...]) -> TypeDescription:
         if ros1 in above:
             raise self._wrong(f"{ros1} contains itself")
-        if len(above) > DEEPEST:
-            raise self._wrong(f"it is too deep: more than {DEEPEST} types in types")
+        if len(above) > MAX_DEPTH:
+            raise self._wrong(f"it is too deep: more than {MAX_DEPTH} types in types")
         fields: list[Field] = []
         count = 1
         for line in text.split("\n"):
@@ -195,9 +195,9 @@ class _Parser:
                 count += self._known[item.name][1]
             else:
                 # Short arrays are read number by number.
-                count += min(int(length), LONGEST_ROW) if length else 1
-            if count > MOST_FIELDS:
-                raise self._wrong(f"it has more than {MOST_FIELDS} fields")
+                count += min(int(length), MAX_INLINE_ITEMS) if length else 1
+            if count > MAX_FIELDS:
+                raise self._wrong(f"it has more than {MAX_FIELDS} fields")
         description = TypeDescription(name, tuple(fields), PACKED)
         self._known[name] = description, count
         return description

@@ -20,12 +20,12 @@ from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, TakeBatch
 
 #: What the loop's thread takes before it lets others have their turn: a millisecond of work.
-LOT = 64
-LOT_BYTES = 2 * LARGE
+BATCH = 64
+BATCH_BYTES = 2 * LARGE
 
-#: Seconds in which there is always more than a lot until it is no burst any more: the loop cannot
+#: Seconds in which there is always more than a batch until it is no burst any more: the loop cannot
 #: keep up, and what it takes gets ever older.
-BEHIND = 0.5
+BEHIND_AFTER = 0.5
 
 #: So many small messages in a row it takes until a topic with a large one is thought small again.
 SMALL_IN_A_ROW = 16
@@ -130,7 +130,7 @@ class LoopSubscription:
         self._lost = 0
         #: How many small messages are missing until the topic is thought small.
         self._large_for = 0
-        #: Since when there is always more than a lot, by the loop's clock; None when there is not.
+        #: Since when there has always been more than a batch, by the loop's clock; else None.
         self._behind_since: float | None = None
         self._is_ended = False
         with handle:
@@ -174,9 +174,9 @@ class LoopSubscription:
         if self._large_for:
             self._hand_over([])
             return
-        lot, has_more = self._take()
+        batch, has_more = self._take()
         if self._large_for:
-            self._hand_over(lot)
+            self._hand_over(batch)
             return
         is_late = False
         if not has_more:
@@ -185,20 +185,20 @@ class LoopSubscription:
             now = self._loop.time()
             if self._behind_since is None:
                 self._behind_since = now
-            is_late = now > self._behind_since + BEHIND
+            is_late = now > self._behind_since + BEHIND_AFTER
             # Not by a callback of the loop's: with what comes meanwhile there would be two turns a
             # round, then three, and one that is left when the ROS thread has been given the rest.
             self._owed -= 1
             self._doorbell.ring()
         lost, self._lost = self._lost, 0
-        self._on_loop(lot, lost, is_late)
+        self._on_loop(batch, lost, is_late)
 
-    def _hand_over(self, lot: list[tuple[bytes, int]]) -> None:
+    def _hand_over(self, batch: list[tuple[bytes, int]]) -> None:
         """Let the ROS thread have these messages and what there is more; until it is done, the
         subscription is its own."""
         self._loop.remove_reader(self._doorbell.fd)
         with suppress(BusError):  # the bus is gone
-            self._call_soon(lambda: self._take_large(lot))
+            self._call_soon(lambda: self._take_large(batch))
 
     def _take_back(self, lost: int) -> None:
         if self._is_ended:
@@ -209,15 +209,15 @@ class LoopSubscription:
 
     # The ROS thread
 
-    def _take_large(self, lot: list[tuple[bytes, int]]) -> None:
+    def _take_large(self, batch: list[tuple[bytes, int]]) -> None:
         if self._is_ended:
             return
         has_more = False
         try:
-            for message in lot:
+            for message in batch:
                 self._callback(*message)
-            lot, has_more = self._take()
-            for message in lot:
+            batch, has_more = self._take()
+            for message in batch:
                 self._callback(*message)
         finally:
             if has_more:
@@ -232,20 +232,20 @@ class LoopSubscription:
     # The one that has the subscription
 
     def _take(self) -> tuple[list[tuple[bytes, int]], bool]:
-        """Up to a lot of what there is, and whether that may not be all."""
-        lot: list[tuple[bytes, int]] = []
+        """Up to a batch of what there is, and whether that may not be all."""
+        batch: list[tuple[bytes, int]] = []
         size = 0
         self._owed += self._doorbell.rings()
         take, message_class = self._take_message, self._message_class
         try:
             with self._handle:
-                while len(lot) < LOT and size < LOT_BYTES:
+                while len(batch) < BATCH and size < BATCH_BYTES:
                     taken = take(message_class, True)
                     if taken is None:
                         # What rang and is not there had to make room.
                         self._lost += max(self._owed, 0)
                         self._owed = min(self._owed, 0)
-                        return lot, False
+                        return batch, False
                     cdr, info = taken
                     self._owed -= 1
                     size += len(cdr)
@@ -254,10 +254,10 @@ class LoopSubscription:
                     elif self._large_for:
                         self._large_for -= 1
                     self._until_timed -= 1
-                    lot.append((cdr, 0 if self._until_timed else self._published_at(info)))
+                    batch.append((cdr, 0 if self._until_timed else self._published_at(info)))
         except RuntimeError:  # rclpy's InvalidHandle: it has been destroyed just now
-            return lot, False
-        return lot, True
+            return batch, False
+        return batch, True
 
     def _published_at(self, info: Any) -> int:
         self._timed += 1

@@ -32,7 +32,7 @@ class NetworkScope(IntEnum):
     NETWORK = 2
 
 
-def reach(environment: Mapping[str, str] | None = None) -> NetworkScope:
+def find_scope(environment: Mapping[str, str] | None = None) -> NetworkScope:
     """What there is now, as far as ROS may use it."""
     environment = os.environ if environment is None else environment
     found = NetworkScope.NOBODY
@@ -48,7 +48,7 @@ def reach(environment: Mapping[str, str] | None = None) -> NetworkScope:
     return min(found, NetworkScope.THIS_COMPUTER) if discovery.is_local(environment) else found
 
 
-def look_again() -> None:
+def refresh_fast_dds() -> None:
     """Let Fast DDS, where it is loaded already, look for the networks that there are now.
 
     It looks once a process, and for a participant that is made later remembers what it saw. What

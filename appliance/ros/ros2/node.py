@@ -45,7 +45,7 @@ from appliance.ros.ros2.loop_subscription import (
     UnavailableError,
     published_at,
 )
-from appliance.ros.ros2.network_scope import NetworkScope, look_again, reach
+from appliance.ros.ros2.network_scope import NetworkScope, find_scope, refresh_fast_dds
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ def _resources(kind: str) -> Iterator[str]:
 class Ros2Node(FaultContainment):
     """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
 
-    wire = CDR
+    serialization = CDR
     parameter_server: ParameterServer | None = None
     obstacle: str | None = None
 
@@ -188,8 +188,8 @@ class Ros2Node(FaultContainment):
         from rclpy.signals import SignalHandlerOptions
 
         # First: a network that comes meanwhile is not, or not for certain, among those it has.
-        self._reach = reach()
-        look_again()
+        self._reach = find_scope()
+        refresh_fast_dds()
         self._rclpy = rclpy
         self._context = Context()
         rclpy.init(
@@ -228,7 +228,7 @@ class Ros2Node(FaultContainment):
                 poll()
                 if self._reach < NetworkScope.NETWORK and time.monotonic() >= look_at:
                     look_at = time.monotonic() + NETWORK_INTERVAL
-                    if reach() > self._reach:
+                    if find_scope() > self._reach:
                         raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
@@ -359,7 +359,7 @@ class Ros2Node(FaultContainment):
         if timed and self._is_event_driven:
             own.__class__ = _timed_subscription()
             own.since = time.monotonic_ns()
-        return _Subscription(self._node, own, _Losses(own.handle))
+        return _Ros2Subscription(self._node, own, _Losses(own.handle))
 
     def _subscribe_on_loop(
         self,
@@ -395,28 +395,28 @@ class Ros2Node(FaultContainment):
         self._on_loop.add(own)
         return own
 
-    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Publisher:
+    def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> _Ros2Publisher:
         message_class = load_message(type_name)
         events = _event_callbacks().PublisherEventCallbacks(use_default_callbacks=False)
         with _as_bus_error():
             own = self._node.create_publisher(
                 message_class, topic, _to_rclpy(qos), event_callbacks=events
             )
-        return _Publisher(self._node, own)
+        return _Ros2Publisher(self._node, own)
 
     # Services
 
-    def create_client(self, service: str, type_name: str) -> _Client:
+    def create_client(self, service: str, type_name: str) -> _Ros2Client:
         service_class = import_service(type_name)
         with _as_bus_error():
             own = self._node.create_client(service_class, service, qos_profile=_to_rclpy(CALLS))
-        return _Client(self._node, own, service_class)
+        return _Ros2Client(self._node, own, service_class)
 
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]
-    ) -> _Service:
+    ) -> _Ros2Service:
         callback = self._contained("ros.request", callback)
-        return _Service(self._node, service, import_service(type_name), callback)
+        return _Ros2Service(self._node, service, import_service(type_name), callback)
 
 
 def _named(found: list[tuple[str, list[str]]]) -> dict[str, list[str]]:
@@ -459,7 +459,7 @@ class _Losses:
             self._event = None
 
 
-class _Subscription:
+class _Ros2Subscription:
     def __init__(self, node: Any, own: Any, losses: _Losses) -> None:
         self._node = node
         self._own = own
@@ -473,7 +473,7 @@ class _Subscription:
         self._node.destroy_subscription(self._own)
 
 
-class _Publisher:
+class _Ros2Publisher:
     def __init__(self, node: Any, own: Any) -> None:
         self._node = node
         self._own = own
@@ -490,7 +490,7 @@ class _Publisher:
         self._node.destroy_publisher(self._own)
 
 
-class _Client:
+class _Ros2Client:
     """rclpy takes and gives no serialized requests, so they are message objects on the way."""
 
     def __init__(self, node: Any, own: Any, service_class: Any) -> None:
@@ -532,7 +532,7 @@ class _Client:
         self._node.destroy_client(own)
 
 
-class _Service:
+class _Ros2Service:
     def __init__(
         self,
         node: Any,

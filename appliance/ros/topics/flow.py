@@ -140,10 +140,10 @@ class EchoFilter:
     the echo, and the echo in its place as the other's message: on MQTT nobody can tell.
     """
 
-    def __init__(self, wire: Serialization = CDR) -> None:
-        self._header = len(wire.header)
+    def __init__(self, serialization: Serialization = CDR) -> None:
+        self._header = len(serialization.header)
         #: In CDR, up to three bytes may have been added at the end.
-        self._padding = 3 if wire.header else 0
+        self._padding = 3 if serialization.header else 0
         self._lock = threading.Lock()
         self._sent: deque[tuple[float, bytes]] = deque(maxlen=ECHO_SAMPLES)
 

@@ -16,7 +16,7 @@ from appliance.net.callbacks import Entries
 from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.encodings.registry import ENCODINGS
-from appliance.ros.payload.payloads import claim, unpacker
+from appliance.ros.payload.payloads import unpacker, user_property
 from appliance.ros.qos import publisher_qos
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
@@ -257,7 +257,7 @@ class ToRos(Flow):
         if properties is None:
             return convert(message.payload)
         wanted = self._wanted
-        claimed = claim(properties, "ros-type")
+        claimed = user_property(properties, "ros-type")
         if wanted is not None and claimed is not None and claimed != wanted[0]:
             problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
             raise ConversionError("", problem)

@@ -21,7 +21,7 @@ from appliance.ros.payload.converter import (
     Converters,
     compile_converter,
 )
-from appliance.ros.payload.cost import ITEMS
+from appliance.ros.payload.cost import DEFAULT_ITEMS
 from appliance.ros.payload.definitions import (
     PRIMITIVES,
     TIME,
@@ -597,7 +597,7 @@ def test_only_a_lone_data_field_goes_as_text() -> None:
         with pytest.raises(UnknownTypeError, match="cannot go as text"):
             text.encoder(converter)
         with pytest.raises(UnknownTypeError, match="cannot go as text"):
-            text.decoder(converter, ITEMS)
+            text.decoder(converter, DEFAULT_ITEMS)
 
 
 # --- descriptions ---------------------------------------------------------------------------

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from appliance.ros.payload.arrays import Numbers
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.cost import (
-    TAG_WEIGHT,
-    TEXT_BYTES,
-    WEIGHT,
+    CONTAINER_COST,
+    TAG_COST,
+    TEXT_BYTES_PER_ITEM,
     _walk_cbor,
-    weigh_cbor,
-    weigh_json,
+    cbor_cost,
+    json_cost,
 )
 from appliance.ros.payload.definitions import PRIMITIVES, load_description
 from appliance.ros.payload.fallback import ConversionError, TooLargeError
@@ -43,15 +43,15 @@ def weight(value, text=lambda text: 0):
     """The same, by definition."""
     if isinstance(value, dict):
         names = sum(1 + text(name) for name in value)
-        return WEIGHT + names + sum(weight(item, text) for item in value.values())
+        return CONTAINER_COST + names + sum(weight(item, text) for item in value.values())
     if isinstance(value, list):
-        return WEIGHT + sum(weight(item, text) for item in value)
+        return CONTAINER_COST + sum(weight(item, text) for item in value)
     if isinstance(value, str):
-        return WEIGHT + text(value)
+        return CONTAINER_COST + text(value)
     if isinstance(value, bytes):
-        return WEIGHT
+        return CONTAINER_COST
     if isinstance(value, cbor2.CBORTag):
-        return TAG_WEIGHT + weight(value.value, text)
+        return TAG_COST + weight(value.value, text)
     return 1
 
 
@@ -82,7 +82,7 @@ def test_json_weighs_what_is_in_it(value, most):
     """Within 1 for each list and object: commas are counted, one less than there are values."""
     payload = json.dumps(value).encode()
     exactly, near = weight(value), containers(value) + 1
-    found = weigh_json(payload, most)
+    found = json_cost(payload, most)
     assert (found <= most) or exactly + near > most
     assert (found > most) or exactly - near <= most
 
@@ -90,24 +90,29 @@ def test_json_weighs_what_is_in_it(value, most):
 @given(for_cbor, st.integers(0, 2000))
 def test_cbor_weighs_what_is_in_it(value, most):
     payload = cbor2.dumps(value)
-    exactly = weight(value, lambda text: len(text.encode()) // TEXT_BYTES)
+    exactly = weight(value, lambda text: len(text.encode()) // TEXT_BYTES_PER_ITEM)
     assert _walk_cbor(payload, 1 << 40) == exactly
-    found = weigh_cbor(payload, most)
-    assert (found <= most) == (exactly <= most) or len(payload) * (WEIGHT + TAG_WEIGHT) <= most
+    found = cbor_cost(payload, most)
+    assert (found <= most) == (exactly <= most) or len(payload) * (
+        CONTAINER_COST + TAG_COST
+    ) <= most
 
 
 @pytest.mark.parametrize(
     ("payload", "exactly"),
     [
-        (b"\x9f\x01\x02\xff", WEIGHT + 2),
-        (b"\xbf\x61a\x01\x61b\x9f\xff\xff", WEIGHT + 2 + 1 + WEIGHT),
-        (b"\x5f\x41a\x41b\xff", 3 * WEIGHT),  # bytes in pieces
-        (b"\x7f\x61a\xff", 2 * WEIGHT),
-        (b"\x98\x20" + b"\xfb" + bytes(8) + b"\x00" * 31, WEIGHT + 32),  # not all of one size
-        (b"\x98\x20" + b"\x80" * 32, WEIGHT + 32 * WEIGHT),
-        (b"\x83\x01\xd8\x40\x40\x02", WEIGHT + 2 + TAG_WEIGHT + WEIGHT),
+        (b"\x9f\x01\x02\xff", CONTAINER_COST + 2),
+        (b"\xbf\x61a\x01\x61b\x9f\xff\xff", CONTAINER_COST + 2 + 1 + CONTAINER_COST),
+        (b"\x5f\x41a\x41b\xff", 3 * CONTAINER_COST),  # bytes in pieces
+        (b"\x7f\x61a\xff", 2 * CONTAINER_COST),
+        (
+            b"\x98\x20" + b"\xfb" + bytes(8) + b"\x00" * 31,
+            CONTAINER_COST + 32,
+        ),  # not all of one size
+        (b"\x98\x20" + b"\x80" * 32, CONTAINER_COST + 32 * CONTAINER_COST),
+        (b"\x83\x01\xd8\x40\x40\x02", CONTAINER_COST + 2 + TAG_COST + CONTAINER_COST),
         (b"\x9a" + b"\xff" * 4 + b"\x00", 0),  # more than there are: no CBOR
-        (b"\x5b" + b"\xff" * 8, WEIGHT),
+        (b"\x5b" + b"\xff" * 8, CONTAINER_COST),
         (b"\x1c", 0),
         (b"", 0),
     ],

@@ -95,7 +95,7 @@ def run(appliance: Ros1Appliance) -> Run:
         login = {"APPLIANCE_PASSWORD": appliance.passwords["alice"]}
         done = subprocess.run(
             [appliance.python, "-m", "appliance", *arguments, "-c", appliance.config],
-            env={**os.environ, **appliance.host.environment, **login, **environment},
+            env={**os.environ, **appliance.environment, **login, **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

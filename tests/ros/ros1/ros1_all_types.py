@@ -26,7 +26,7 @@ import rospy
 
 from appliance.ros.payload.codegen import MISFIT
 from appliance.ros.payload.converter import ConversionError, Converters
-from appliance.ros.payload.cost import ITEMS
+from appliance.ros.payload.cost import DEFAULT_ITEMS
 from appliance.ros.payload.encodings.cbor import Cbor
 from appliance.ros.payload.fallback import decode as careful_decode
 from appliance.ros.payload.schema import json_schema
@@ -203,7 +203,7 @@ def check(name, message_class, seed, mutations):
     converter = converters.get(name)
     json_schema(converter.description)
     decode = converter._decode
-    to_cbor, from_cbor = CBOR.encoder(converter), CBOR.decoder(converter, ITEMS)
+    to_cbor, from_cbor = CBOR.encoder(converter), CBOR.decoder(converter, DEFAULT_ITEMS)
     rng = random.Random(zlib.crc32(f"{name} {seed}".encode()))
     checked = 0
     for variant in VARIANTS:

@@ -288,7 +288,7 @@ def test_parameters(world: World, appliance: Ros1Appliance) -> None:
 def test_the_commands_show_what_is_bridged(robot: Node, appliance: Ros1Appliance) -> None:
     out = subprocess.run(
         [appliance.python, "-m", "appliance", "routes", "-c", appliance.config],
-        env={**os.environ, **appliance.host.environment},
+        env={**os.environ, **appliance.environment},
         capture_output=True,
         text=True,
         check=True,

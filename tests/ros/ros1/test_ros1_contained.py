@@ -51,7 +51,7 @@ async def test_a_message_is_taken_behind_one_that_failed(
 ) -> None:
     made: list[Any] = []
     monkeypatch.setattr(
-        "appliance.ros.ros1.node.Subscription", lambda *arguments: made.append(arguments[-1])
+        "appliance.ros.ros1.node.Ros1Subscription", lambda *arguments: made.append(arguments[-1])
     )
     monkeypatch.setattr(node, "_definition", lambda type_name: None)
     qos: Any = SimpleNamespace(durability=None)
@@ -71,7 +71,7 @@ async def test_who_asks_is_answered_when_its_request_fails(
     monkeypatch.setattr(ros1_ends, "_service_class", lambda rospy, definition: None)
     rospy = SimpleNamespace(ServiceException=ServiceError, Service=lambda *_: None)
     definition: Any = SimpleNamespace(response=None)
-    service = ros1_ends.Service(rospy, "/srv", definition, fail, node.call_soon)
+    service = ros1_ends.Ros1Service(rospy, "/srv", definition, fail, node.call_soon)
     told: list[str] = []
 
     def ask() -> None:

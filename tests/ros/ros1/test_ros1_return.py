@@ -20,7 +20,7 @@ from waiting import eventually
 
 from appliance.ros.node import BusError
 from appliance.ros.ros1.node import POLL_INTERVAL
-from appliance.ros.ros1.peers import ask_publisher
+from appliance.ros.ros1.peers import fetch_definition
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -88,7 +88,7 @@ def test_a_publisher_whose_port_is_none_is_left_out(port: object) -> None:
         thread.start()
         try:
             with pytest.raises(BusError, match="/other cannot be reached"):
-                ask_publisher(uri, "/me", "/other", "/odd")
+                fetch_definition(uri, "/me", "/other", "/odd")
         finally:
             server.shutdown()
             thread.join()
@@ -129,9 +129,9 @@ def test_it_joins_again_and_leaves_another_its_name(
 JOIN_AGAIN = """\
 import gc, types
 from importlib import import_module
-from appliance.ros.ros1_ends import message_class
-from appliance.ros.ros1_rospy import unload
-from appliance.ros.ros1_types import installed
+from appliance.ros.ros1.endpoints import message_class
+from appliance.ros.ros1.rospy_cleanup import unload
+from appliance.ros.ros1.types import installed
 for _ in range(3):
     unload()
     message_class(import_module("rospy"), installed("std_msgs/msg/String"))

@@ -20,7 +20,7 @@ import pytest
 from ros1_world import SYSTEM_PYTHON, Mqtt, Python, Ros1Appliance, World, end, is_installed
 from waiting import PATIENCE, eventually
 
-from appliance.ros.ros1.types import LARGEST_MESSAGE
+from appliance.ros.ros1.types import MAX_MESSAGE_SIZE
 
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="needs ROS 1: apt install python3-roslaunch python3-rospy …"
@@ -168,8 +168,8 @@ def test_what_is_too_large_is_passed_over(world: World, appliance: Ros1Appliance
 
     def behave(peer: socket.socket) -> None:
         peer.sendall(begin("/odd/large") + string(b"one"))
-        peer.sendall(struct.pack("<I", LARGEST_MESSAGE + 7))
-        for _ in range(LARGEST_MESSAGE >> 20):
+        peer.sendall(struct.pack("<I", MAX_MESSAGE_SIZE + 7))
+        for _ in range(MAX_MESSAGE_SIZE >> 20):
             peer.sendall(bytes(1 << 20))
         peer.sendall(bytes(7) + string(b"two")[:3])
         time.sleep(0.1)  # so that it comes in two pieces, most often
@@ -178,8 +178,8 @@ def test_what_is_too_large_is_passed_over(world: World, appliance: Ros1Appliance
     with Mqtt(appliance, "r2d2/odd/large") as client, Stranger(world, "/odd/large", behave):
         client.next("r2d2/odd/large", {"data": "two"})
         assert [m.payload for m in client.received] == [b'{"data":"one"}']
-    appliance.wait_for_log(f"a message of {LARGEST_MESSAGE + 7} bytes")
-    assert process.memory_info().rss < before + LARGEST_MESSAGE // 2
+    appliance.wait_for_log(f"a message of {MAX_MESSAGE_SIZE + 7} bytes")
+    assert process.memory_info().rss < before + MAX_MESSAGE_SIZE // 2
 
 
 def test_callers_with_a_header_of_4_gb(world: World, appliance: Ros1Appliance) -> None:

@@ -13,7 +13,7 @@ from waiting import until
 
 from appliance.host.environment import for_other_programs
 from appliance.ros.ros2 import discovery, fastdds
-from appliance.ros.ros2.network_scope import NetworkScope, reach
+from appliance.ros.ros2.network_scope import NetworkScope, find_scope
 
 RANGE = discovery.RANGE
 
@@ -32,7 +32,7 @@ def test_localhost_is_a_profile_without_a_socket_on_the_network():
     assert "<address>127.0.0.1</address>" in profile and "FILTER_DIFFERENT_HOST" in profile
     assert "SHM" in profile
     assert discovery.is_local(environment)
-    assert reach(environment) <= NetworkScope.THIS_COMPUTER
+    assert find_scope(environment) <= NetworkScope.THIS_COMPUTER
     before = dict(environment)
     assert discovery.use("localhost", environment) == ""  # the node is started anew
     assert environment == before

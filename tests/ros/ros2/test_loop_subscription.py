@@ -41,7 +41,7 @@ class Taker:
     def __init__(self, type_name=STRING, depth=1000):
         self.node = ros2.Ros2Node()
         self.taken = []
-        self.lots = []
+        self.batches = []
         self.lost = 0
         self.failures = []
         self._type = type_name
@@ -55,16 +55,16 @@ class Taker:
     def _look(self):
         if self.subscription is None:
             self.subscription = self.node.subscribe_raw(
-                "/a", self._type, self._qos, self._on_message, on_loop=self._on_lot
+                "/a", self._type, self._qos, self._on_message, on_loop=self._on_batch
             )
 
     def _on_message(self, cdr, published_at=0):
         self.taken.append((threading.current_thread().name, cdr))
 
-    def _on_lot(self, lot, lost, is_late):
-        self.lots.append(len(lot))
+    def _on_batch(self, batch, lost, is_late):
+        self.batches.append(len(batch))
         self.lost += lost
-        for cdr, _ in lot:
+        for cdr, _ in batch:
             self._on_message(cdr)
 
     async def advertised(self, peer):
@@ -83,7 +83,7 @@ class Taker:
             await asyncio.sleep(0.05)
         await asyncio.sleep(0.1)
         self.taken.clear()
-        self.lots.clear()
+        self.batches.clear()
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_fo
     await taker.advertised(peer)
     await peer.do_beside_a_busy_loop("publish", "/a", string("one").hex(), 300, 2000)
     await until(lambda: len(taker.taken) == 300, "all")
-    assert max(taker.lots) == ros2_loop.LOT
+    assert max(taker.batches) == ros2_loop.BATCH
     assert taker.lost == 0
 
 
@@ -145,9 +145,9 @@ async def test_others_have_their_turn_between_two_lots(taker, peer):
     publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 1500, 10_000))
     turns = []
     while len(taker.taken) < 1500:
-        before = len(taker.lots)
+        before = len(taker.batches)
         await asyncio.sleep(0)
-        turns.append(len(taker.lots) - before)
+        turns.append(len(taker.batches) - before)
         if not publishing.done():
             time.sleep(0.05)  # noqa: ASYNC251 - the loop has other things to do
     await publishing
@@ -163,9 +163,9 @@ async def test_two_threads_never_take_at_the_same_time(monkeypatch, taker, peer)
         getattr(ros2_loop.LoopSubscription, name) for name in ("_hand_over", "_take_back")
     )
 
-    def count_over(self, lot):
+    def count_over(self, batch):
         given.append(+1)
-        hand_over(self, lot)
+        hand_over(self, batch)
 
     def count_back(self, lost):
         given.append(-1)
@@ -211,7 +211,7 @@ async def test_a_burst_of_the_states_of_joints_is_carried_whole(harness, peer):
 
 
 async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, harness, peer):
-    monkeypatch.setattr(ros2_loop, "BEHIND", 0.2)
+    monkeypatch.setattr(ros2_loop, "BEHIND_AFTER", 0.2)
     ages, stamps = [], [0.0]
 
     def slow(batch):
@@ -288,4 +288,4 @@ async def test_the_ros_thread_takes_all_where_it_cannot_be_otherwise(monkeypatch
     await peer.do("publish", "/a", string("one").hex())
     await until(lambda: taker.taken, "the message")
     assert taker.taken == [("ros", string("one"))]
-    assert taker.lots == []
+    assert taker.batches == []

@@ -342,15 +342,15 @@ async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
     node, failures, taken, dropped, lost = ros2.Ros2Node(), [], [], [], []
     subscription = None
 
-    def on_lot(lot, had_to_go, is_late):
-        taken.extend(cdr for cdr, _ in lot)
+    def on_batch(batch, had_to_go, is_late):
+        taken.extend(cdr for cdr, _ in batch)
         dropped.append(had_to_go)
 
     def look():
         nonlocal subscription
         if subscription is None:
             qos = QosProfile(Reliability.BEST_EFFORT, depth=1000)
-            on_loop = on_lot if takes_on_loop else None
+            on_loop = on_batch if takes_on_loop else None
             subscription = node.subscribe_raw("/image", BYTES, qos, on_message, on_loop=on_loop)
         lost.append(subscription.take_lost())
 

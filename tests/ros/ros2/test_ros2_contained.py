@@ -41,13 +41,17 @@ class Node:
         if self._subscription is None:
             qos = QosProfile(depth=1000)
             self._subscription = self.node.subscribe_raw(
-                "/loop", STRING, qos, lambda cdr, at=0: self.on_loop.append(cdr), on_loop=self._lot
+                "/loop",
+                STRING,
+                qos,
+                lambda cdr, at=0: self.on_loop.append(cdr),
+                on_loop=self._on_batch,
             )
             self.node.subscribe_raw("/thread", STRING, qos, lambda cdr: self.on_thread.append(cdr))
             self.node.create_service("/ask", TRIGGER, self._answer)
 
-    def _lot(self, lot: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
-        self.on_loop += [cdr for cdr, _ in lot]
+    def _on_batch(self, batch: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
+        self.on_loop += [cdr for cdr, _ in batch]
 
     def _answer(self, request: bytes, respond) -> None:
         self.asked += 1

@@ -31,7 +31,7 @@ from appliance.ros.calls.routes import CallRoutes, ServiceSettings
 from appliance.ros.diagnostics import TYPE
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
-from appliance.ros.ros2.network_scope import NetworkScope, reach
+from appliance.ros.ros2.network_scope import NetworkScope, find_scope
 
 pytestmark = pytest.mark.usefixtures("isolated_domain")
 
@@ -207,7 +207,7 @@ async def test_a_bus_that_goes_and_comes_back(start, peer, monkeypatch):
 async def test_a_network_that_comes_after_the_start_is_used(start, peer, monkeypatch):
     monkeypatch.setattr("appliance.ros.bridge.RETRY", 0.05)
     monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
-    monkeypatch.setattr(ros2, "reach", lambda: found)
+    monkeypatch.setattr(ros2, "find_scope", lambda: found)
     found = NetworkScope.THIS_COMPUTER
     harness = start(route("/a", "mqtt", "text"))
     await until(lambda: harness.bridge.peers == 1, "the peer")
@@ -225,11 +225,11 @@ async def test_a_network_that_comes_while_the_bus_is_joined_is_used(start, peer,
     monkeypatch.setattr(ros2, "NETWORK_INTERVAL", 0.1)
     houses = []
 
-    def reach():
+    def find_scope():
         is_joined = bool(houses) and houses[0].node._executor is not None
         return NetworkScope.NETWORK if is_joined else NetworkScope.THIS_COMPUTER
 
-    monkeypatch.setattr(ros2, "reach", reach)
+    monkeypatch.setattr(ros2, "find_scope", find_scope)
     houses.append(start(route("/a", "mqtt", "text")))
     await until(lambda: houses[0].bridge.problem is not None, "the new start")
     assert houses[0].bridge.problem == "there was no network yet when it was joined, and is now"
@@ -244,12 +244,12 @@ def test_how_far_one_can_be_heard(monkeypatch):
     }
     monkeypatch.setattr(psutil, "net_if_stats", lambda: states)
     monkeypatch.setattr(psutil, "net_if_addrs", lambda: ends)
-    assert reach({}) is NetworkScope.THIS_COMPUTER
+    assert find_scope({}) is NetworkScope.THIS_COMPUTER
     states["eth0"] = up
-    assert reach({}) is NetworkScope.NETWORK
-    assert reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is NetworkScope.THIS_COMPUTER
+    assert find_scope({}) is NetworkScope.NETWORK
+    assert find_scope({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}) is NetworkScope.THIS_COMPUTER
     states["lo"] = states["eth0"] = down
-    assert reach({}) is NetworkScope.NOBODY
+    assert find_scope({}) is NetworkScope.NOBODY
 
 
 @pytest.mark.parametrize(

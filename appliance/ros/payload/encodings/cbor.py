@@ -15,7 +15,7 @@ import cbor2
 
 from appliance.ros.payload.arrays import Numbers, unpack_numbers
 from appliance.ros.payload.converter import Converter
-from appliance.ros.payload.cost import DEPTH, weigh_cbor
+from appliance.ros.payload.cost import MAX_DEPTH, cbor_cost
 from appliance.ros.payload.definitions import PRIMITIVES
 from appliance.ros.payload.encodings.base import Decode, Encode, ValueEncoding
 from appliance.ros.payload.fallback import ConversionError
@@ -97,7 +97,7 @@ class Cbor(ValueEncoding):
         return decode
 
     def cost(self, payload: bytes, most: int) -> int:
-        return weigh_cbor(payload, most)
+        return cbor_cost(payload, most)
 
     def dumps(self, value: object) -> bytes:
         return cbor2.dumps(value, default=_encode_numbers)
@@ -150,7 +150,7 @@ def loads(payload: bytes, *, as_numbers: bool = False) -> Any:
         file,
         tag_hook=_read_numbers if as_numbers else _read_list,
         semantic_decoders=_REFUSED,
-        max_depth=DEPTH,
+        max_depth=MAX_DEPTH,
         strict_hashable_types=True,
     )
     try:

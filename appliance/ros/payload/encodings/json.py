@@ -7,7 +7,7 @@ from typing import Any
 import orjson
 
 from appliance.ros.payload.converter import Converter
-from appliance.ros.payload.cost import weigh_json
+from appliance.ros.payload.cost import json_cost
 from appliance.ros.payload.encodings.base import Decode, Encode, ValueEncoding
 from appliance.ros.payload.fallback import ConversionError
 
@@ -26,7 +26,7 @@ class Json(ValueEncoding):
         return converter.from_json
 
     def cost(self, payload: bytes, most: int) -> int:
-        return weigh_json(payload, most)
+        return json_cost(payload, most)
 
     def dumps(self, value: object) -> bytes:
         return orjson.dumps(value)
