@@ -171,7 +171,7 @@ class ActionSubscriptions:
         self._put(self._status_lane, f"{self._base}/_status", payload, STATUS, retain=True)
 
     def _on_feedback(self, type_name: str, cdr: bytes) -> None:
-        id_, feedback = goals.split_id(cdr, self._node.wire)
+        id_, feedback = goals.split_id(cdr, self._node.serialization)
         try:
             payload = from_ros(self._converters, type_name, feedback, self._encoding)
         except (ConversionError, UnknownTypeError) as error:
