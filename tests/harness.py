@@ -63,7 +63,7 @@ class Harness:
         self.listeners = Listeners(
             self.broker,
             self._ask,
-            lambda method, address: None,
+            lambda method, address, tls: None,
             Admission(connections, connect_timeout, **limits),
         )
         return self.listeners

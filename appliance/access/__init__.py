@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from appliance.access.acl import Acl, Explanation, Verdict
 from appliance.access.files import Changes, FileAccess, Rules
+from appliance.access.login import LoginPlugins, LoginPolicy, no_user
 from appliance.access.passwords import Passwords, check_password, check_username
 from appliance.access.problems import AccessFileError, Problem
 from appliance.access.rules import Permission, Rule
@@ -15,6 +16,8 @@ __all__ = [
     "Changes",
     "Explanation",
     "FileAccess",
+    "LoginPlugins",
+    "LoginPolicy",
     "Passwords",
     "Permission",
     "Problem",
@@ -24,4 +27,5 @@ __all__ = [
     "Verdict",
     "check_password",
     "check_username",
+    "no_user",
 ]

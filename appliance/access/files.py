@@ -199,6 +199,10 @@ class FileAccess:
         """The names of all users, sorted."""
         return self._passwords.users()
 
+    def knows(self, username: str | None) -> bool:
+        """Whether the users file has a line for this user."""
+        return username is not None and self._passwords.hash_of(username) is not None
+
     def exchange(self, method: str, address: str | None) -> Exchange | None:
         """Begins an enhanced authentication; None when the method is not offered.
 
@@ -206,8 +210,7 @@ class FileAccess:
         whom the guesses of others must not throw out.
 
         SCRAM-SHA-256 is, where there is a users file. The exchange knows the users as they are at
-        each of its steps, a reload between them included. amqtt's plugins are not asked: they
-        judge a user name and a password, and here is no password to show them.
+        each of its steps, a reload between them included.
         """
         if method != METHOD or self._in_force.users_path is None:
             return None

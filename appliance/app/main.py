@@ -18,7 +18,7 @@ from importlib.metadata import version
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, FileAccess
+from appliance.access import AccessFileError, FileAccess, LoginPolicy, no_user
 from appliance.app import status, wiring
 from appliance.app.reload import Reload, ReloadError, ReloadParts
 from appliance.broker.broker import Broker
@@ -35,8 +35,8 @@ from appliance.config import (
     OPEN_WITH_SECRETS,
     Settings,
     is_open_with_secrets,
-    secrets_in,
 )
+from appliance.config.plugins import PluginSettingsError
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
 from appliance.net.callbacks import Entries, contained_proxy
@@ -46,13 +46,6 @@ from appliance.ops.control import Control, ControlError
 from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier
 from appliance.ops.watchdog import Pulse
-from appliance.plugins import (
-    Answers,
-    ApplianceBroker,
-    PluginSettingsError,
-    configuration,
-    plugin_kinds,
-)
 from appliance.ros import settings as ros_settings
 from appliance.ros.bridge import Bridge
 from appliance.ros.node import RosNode
@@ -142,7 +135,6 @@ class App:
         broker_settings = settings.broker
         if is_open_with_secrets(settings):
             log.warning("%s %s", settings.file, OPEN_WITH_SECRETS)
-        authenticating, _ = plugin_kinds(broker_settings.plugins)
         tls = tls_contexts(broker_settings)
         access = FileAccess(
             *wiring.access_files(settings),
@@ -179,38 +171,24 @@ class App:
             wanted = wiring.listener_settings(settings, tls)
             self.addresses = await listeners.start(wanted)
 
-        config = configuration(
-            [(str(listener.bind), listener.tls) for listener in broker_settings.listeners],
-            limits.connections,
-            broker_settings.plugins,
-        )
-        answers = broker_settings.plugin_answers
-        # In less than the listeners' time limit, so that a client is told when plugins hang.
-        frame = ApplianceBroker(
-            broker,
+        plugins = wiring.plugins(settings, broker, access, listen, lambda: listeners.stop())
+        login = LoginPolicy(
             access,
-            config,
-            listen,
-            lambda: listeners.stop(),
-            min(answers.timeout, 0.8 * limits.connect_timeout),
-            answers=Answers(answers.keep, answers.keep_refusals, answers.size),
-            secrets=secrets_in(broker_settings.plugins),
-            patience=0.2 * limits.connect_timeout,
-            certificate_user=tls.username if tls is not None else lambda _: None,
+            tls.username if tls is not None else no_user,
+            plugins.logins if plugins is not None else None,
         )
         self._listeners = listeners = Listeners(
-            broker,
-            frame.authenticate,
-            # It would pass by plugins that refuse clients.
-            access.exchange if not authenticating else lambda method, address: None,
-            limits.build(Admission),
-            tls,
+            broker, login.authenticate, login.exchange, limits.build(Admission), tls
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", InsideLink())
         self._start_clock(loop)
-        await frame.start()
-        self._stack.push_async_callback(frame.shutdown)
+        if plugins is None:
+            await listen()
+            self._stack.push_async_callback(listeners.stop)
+        else:  # they are notified before and after the listeners start, and stop
+            await plugins.start()
+            self._stack.push_async_callback(plugins.shutdown)
         self._start_bridge(loop)
         self._reload = Reload(
             ReloadParts(settings, access, tls, broker, listeners, self.bridge, self.audit)

@@ -724,19 +724,9 @@ class ClientConnection:
         self._broker.flush()
 
     def exchange(self, method: str) -> Exchange | None:
-        """Begin an enhanced authentication; None when the method is not offered.
-
-        None is to a client whose certificate says who it is: it could only say something else.
-        """
-        certificates, tls_object = self._scheduler.certificates, self._tls
-        if certificates is not None and tls_object is not None:
-            try:
-                if certificates.username(tls_object) is not None:
-                    return None
-            except ValueError:
-                return None
-        stranger = self._client.session is None
-        return self._scheduler.exchange(method, self.address if stranger else None)
+        """Begin an enhanced authentication; None when the method is not offered."""
+        is_guest = self._client.session is None
+        return self._scheduler.exchange(method, self.address if is_guest else None, self._tls)
 
     def now(self) -> float:
         """Seconds of the event loop's clock."""

@@ -15,13 +15,13 @@ from typing import Literal, cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Exchange
 from appliance.host.addresses import network_prefix
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.connection import ClientConnection
 from appliance.net.scheduler import (
     LINGERING_CLOSES,
     Authenticate,
+    BeginExchange,
     CertificatePolicy,
     ScheduledConnection,
     Scheduler,
@@ -108,7 +108,7 @@ class Listeners:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str | None], Exchange | None],
+        exchange: BeginExchange,
         admission: Admission,
         certificates: CertificatePolicy | None = None,
     ) -> None:

@@ -47,15 +47,16 @@ Authenticate: TypeAlias = Callable[
     [Connect, str, "ssl.SSLObject | None", "bool | None"], Awaitable["Identity | Refusal"]
 ]
 
+#: Begins an enhanced authentication by this method; None when it is not offered. There is no
+#: address of a client that has logged in and authenticates again.
+BeginExchange: TypeAlias = Callable[[str, "str | None", "ssl.SSLObject | None"], "Exchange | None"]
+
 
 class CertificatePolicy(Protocol):
     """What is to be known of a client's certificate, of a connection with TLS."""
 
     def refusal(self, tls: ssl.SSLObject) -> str:
         """Why the client is not, or no longer, let in with it; empty when it is."""
-
-    def username(self, tls: ssl.SSLObject) -> str | None:
-        """The user that it names; None when that is not asked for. ValueError: it names none."""
 
 
 class ScheduledConnection(Schedulable, Protocol):
@@ -102,7 +103,7 @@ class Scheduler:
         self,
         broker: Broker,
         authenticate: Authenticate,
-        exchange: Callable[[str, str | None], Exchange | None],
+        exchange: BeginExchange,
         admission_policy: AdmissionPolicy,
         *,
         connect_timeout: float,

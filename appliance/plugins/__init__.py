@@ -23,10 +23,10 @@ for it run unchanged. Its listeners, sessions and broadcast loop are not used: w
 
 from __future__ import annotations
 
+from appliance.config.plugins import PluginSettingsError
 from appliance.plugins.broker import (
     ApplianceBroker,
     Files,
-    PluginSettingsError,
     check_plugin_settings,
     configuration,
     plugin_kinds,

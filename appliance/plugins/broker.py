@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import difflib
 import logging
-import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -27,16 +26,16 @@ from transitions import MachineError
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Access, Identity, InsideLink, Refusal
+from appliance.broker.ports import Access, InsideLink
 from appliance.broker.session import Session
+from appliance.config.plugins import PluginSettingsError
 from appliance.config.redaction import redacted
-from appliance.mqtt.codec import quote
-from appliance.mqtt.packets import Connect, Subscription
+from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 from appliance.net.callbacks import Entries, PeriodicCallback, contained_proxy
 from appliance.plugins.access import PluginAccess
-from appliance.plugins.adapters import RetainedMessages, Sessions, Unclaimed, login_of
+from appliance.plugins.adapters import RetainedMessages, Sessions, Unclaimed
 from appliance.plugins.events import PluginEvents
 from appliance.plugins.guard import PLUGIN_TIMEOUT, Guard, name
 from appliance.plugins.logins import Answers, Guesses, PluginLogins
@@ -49,29 +48,12 @@ log = logging.getLogger(__name__)
 _ANSWERS = Answers(keep=0.0, keep_refusals=0.0)
 
 
-class PluginSettingsError(ValueError):
-    """A plugin named in `broker.plugins` cannot be loaded, or not with these settings."""
-
-
 class Files(Access, Protocol):
     """The users file and the ACL file, as far as the plugins stand beside them."""
 
     @property
     def guesses(self) -> Guesses:
         """How long logins have to wait because others were wrong."""
-
-    def users(self) -> list[str]:
-        """The names of all users."""
-
-    async def authenticate(
-        self,
-        username: str | None,
-        password: bytes | None,
-        client_id: str,
-        address: str,
-        anonymous: bool | None = None,
-    ) -> Identity | Refusal:
-        """Who the client is, or why it is refused."""
 
 
 def plugin_kinds(plugins: Iterable[str]) -> tuple[bool, bool]:
@@ -167,8 +149,7 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     `listen` and `hang_up` start and stop the listeners, where amqtt would its own. `files` stay
     in force: plugins can admit clients that the files do not know, and refuse what these allow.
-    `plugin_timeout` is in seconds. `certificate_user` is the user that a client's certificate
-    names, None for none; its ValueError refuses the client.
+    `plugin_timeout` is in seconds. `logins` is their part in a login.
     """
 
     def __init__(
@@ -183,7 +164,6 @@ class ApplianceBroker(amqtt.broker.Broker):
         answers: Answers = _ANSWERS,
         secrets: Iterable[str] = (),
         patience: float = PLUGIN_TIMEOUT,
-        certificate_user: Callable[[ssl.SSLObject], str | None] = lambda tls: None,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
 
@@ -200,7 +180,6 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._guard = Guard(plugin_timeout, secrets)
         self._threads = Threads()
         self._answers = answers
-        self._certificate_user = certificate_user
         self._views = Sessions(broker)
         self._inside: Session | None = None
         self._timer: PeriodicCallback | None = None
@@ -217,8 +196,11 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._access = PluginAccess(
             files, broker, manager, self._views, self._guard, self._threads, answers
         )
-        self._logins = PluginLogins(
+        self.logins = PluginLogins(
+            broker,
             manager,
+            self._views,
+            self._events,
             self._guard,
             self._threads,
             files.guesses,
@@ -285,7 +267,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         if self._timer is not None:
             self._timer.cancel()
         self._access.close()
-        self._logins.close()
+        self.logins.close()
         self._threads.close()
         await self._finish("close", self.plugins_manager.close())
         self.broker.observer = None
@@ -308,89 +290,6 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._views.purge()
         if self.plugins_manager._topic_plugins:
             self._access.changed()
-
-    @property
-    def _keeps_sessions(self) -> bool:
-        """Whether plugins meet a session again after its login."""
-        return self._events.about_clients or bool(self.plugins_manager._topic_plugins)
-
-    # --- logins --------------------------------------------------------------------------------
-
-    async def authenticate(
-        self,
-        connect: Connect,
-        address: str,
-        ssl_object: ssl.SSLObject | None = None,
-        anonymous: bool | None = None,
-    ) -> Identity | Refusal:
-        """Who sent the CONNECT, or why it is refused.
-
-        Who shows a certificate that names a user is that one, without a password, and may not say
-        to be another one. Who has a line in the users file is decided by that file alone, and who
-        needs none, as anonymous clients are let in, comes in. Others come in when at least one
-        plugin says yes and none says no, under the user name that they gave if a plugin vouches
-        for it. With a yes of `AnonymousAuthPlugin` alone they are anonymous for the ACL file.
-        `anonymous` is what its listener says of such clients, None for nothing.
-        """
-        username, password = connect.username, connect.password
-        plugins = self.plugins_manager
-        if plugins.plugins:
-            self._events.connect_received(connect)
-        try:
-            owner = self._certificate_user(ssl_object) if ssl_object is not None else None
-        except ValueError as error:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, str(error))
-        if owner is not None:
-            return self._by_certificate(owner, connect, address, ssl_object)
-        known = not plugins._auth_plugins or username in self._files.users()
-        if known or username is None:
-            who = await self._files.authenticate(
-                username, password, connect.client_id, address, anonymous
-            )
-            if isinstance(who, Identity):
-                # The password is none of the plugins' business here.
-                self._admit(who, address, lambda: login_of(connect, address, None, ssl_object))
-                return who
-            if known or anonymous is False:  # its listener has the last word about that
-                return who
-        try:
-            text = None if password is None else password.decode()
-        except UnicodeDecodeError:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8")
-        login = login_of(connect, address, text, ssl_object)
-        who = await self._logins.ask(login, address)
-        if anonymous is False and isinstance(who, Identity) and who.username is None:
-            return Refusal(ReasonCode.NOT_AUTHORIZED, "no plugin knows the user, nor do the files")
-        if isinstance(who, Identity):
-            self._admit(who, address, lambda: login)
-        return who
-
-    def _by_certificate(
-        self, owner: str, connect: Connect, address: str, ssl_object: ssl.SSLObject | None
-    ) -> Identity | Refusal:
-        if connect.username not in (None, "", owner):
-            # Two names are one too many to guess whose rights are meant.
-            reason = f"its certificate is of user {quote(owner)}, and it says to be another one"
-            return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
-
-        def login() -> AmqttSession:
-            shown = login_of(connect, address, None, ssl_object)
-            shown.username = owner
-            return shown
-
-        who = Identity(owner, connect.client_id)
-        self._admit(who, address, login)
-        return who
-
-    def _admit(self, identity: Identity, address: str, login: Callable[[], AmqttSession]) -> None:
-        """Remember the login for its connection, and hand an unclaimed session to its owner."""
-        if self._keeps_sessions:
-            self._views.expect(address, login())
-        session = self.broker.sessions.get(identity.client_id)
-        if session is not None and isinstance(session.identity, Unclaimed):
-            log.info("the session that a plugin made is taken over by %s", identity)
-            self.broker.claim(session, identity)
-            self.broker.rules_changed()
 
     # --- what BrokerContext does ---------------------------------------------------------------
 

@@ -5,22 +5,30 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
+import logging
 import secrets
+import ssl
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias, cast
 
 from amqtt.broker import BrokerContext
 from amqtt.plugins.authentication import AnonymousAuthPlugin
 from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
+from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity, Refusal
 from appliance.config.redaction import redacted
+from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
+from appliance.plugins.adapters import Sessions, Unclaimed, login_of
+from appliance.plugins.events import PluginEvents
 from appliance.plugins.guard import Guard, name
 from appliance.plugins.threads import Threads
+
+log = logging.getLogger(__name__)
 
 #: Logins that plugins are asked about at one time; others wait, as long as they may.
 LOGINS: Final = 64
@@ -78,7 +86,10 @@ class PluginLogins:
 
     def __init__(
         self,
+        broker: Broker,
         plugins: PluginManager[BrokerContext],
+        sessions: Sessions,
+        events: PluginEvents,
         guard: Guard,
         threads: Threads,
         guesses: Guesses,
@@ -86,7 +97,10 @@ class PluginLogins:
         answers: Answers,
         patience: float,
     ) -> None:
+        self._broker = broker
         self._plugins = plugins
+        self._sessions = sessions
+        self._events = events
         self._guard = guard
         self._threads = threads
         self._guesses = guesses
@@ -97,6 +111,53 @@ class PluginLogins:
         self._known: OrderedDict[bytes, tuple[_Outcome, float, int]] = OrderedDict()
         self._asking: dict[tuple[bytes, int], asyncio.Task[_Outcome]] = {}
         self._free = asyncio.Semaphore(LOGINS)
+
+    @property
+    def authenticates(self) -> bool:
+        """Whether one of the plugins authenticates clients."""
+        return bool(self._plugins._auth_plugins)
+
+    def connect_received(self, connect: Connect) -> None:
+        """Fire the event of a CONNECT, where a plugin handles it."""
+        if self._plugins.plugins:
+            self._events.connect_received(connect)
+
+    async def authenticate(
+        self, connect: Connect, address: str, tls: ssl.SSLObject | None
+    ) -> tuple[Identity | Refusal, object]:
+        """Who the plugins say that it is, and the session object in which they noted things.
+
+        It comes in when at least one plugin says yes and none says no, under the user name that it
+        gave if a plugin vouches for it. With a yes of `AnonymousAuthPlugin` alone it is anonymous
+        for the ACL file.
+        """
+        try:
+            text = None if connect.password is None else connect.password.decode()
+        except UnicodeDecodeError:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8"), None
+        login = login_of(connect, address, text, tls)
+        return await self.ask(login, address), login
+
+    def admitted(
+        self,
+        identity: Identity,
+        connect: Connect,
+        address: str,
+        tls: ssl.SSLObject | None,
+        noted: object,
+    ) -> None:
+        """Remember the login for its connection, and hand an unclaimed session to its owner."""
+        if self._events.about_clients or self._plugins._topic_plugins:
+            login = cast("AmqttSession | None", noted)
+            if login is None:  # its password is none of the plugins' business
+                login = login_of(connect, address, None, tls)
+                login.username = identity.username
+            self._sessions.expect(address, login)
+        session = self._broker.sessions.get(identity.client_id)
+        if session is not None and isinstance(session.identity, Unclaimed):
+            log.info("the session that a plugin made is taken over by %s", identity)
+            self._broker.claim(session, identity)
+            self._broker.rules_changed()
 
     async def ask(self, login: AmqttSession, address: str) -> Identity | Refusal:
         """Who it is, or why it does not come in; what plugins noted is in `login` then.

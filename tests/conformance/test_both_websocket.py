@@ -123,7 +123,9 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
     async def let_in(connect: Connect, *_: object) -> Identity:
         return Identity(connect.username, connect.client_id)
 
-    listeners = Listeners(broker, let_in, lambda method, address: None, Admission(10, PATIENCE))
+    listeners = Listeners(
+        broker, let_in, lambda method, address, tls: None, Admission(10, PATIENCE)
+    )
     settings = ListenerSettings("127.0.0.1", 0, None, protocol="websocket")
     ((host, port),) = await listeners.start([settings])
     async with contextlib.AsyncExitStack() as stack:

@@ -29,7 +29,7 @@ from transitions import MachineError
 from waiting import PATIENCE, until
 
 from appliance import certs
-from appliance.access import AccessFileError, FileAccess, Passwords
+from appliance.access import AccessFileError, FileAccess, LoginPolicy, Passwords
 from appliance.app.main import App
 from appliance.broker import client as network_client
 from appliance.broker.broker import Broker
@@ -217,6 +217,7 @@ class Rig:
     frame: ApplianceBroker
     broker: Broker
     files: FileAccess
+    login: LoginPolicy
     port: int = 0
     clients: list[MQTTClient] = field(default_factory=list)
 
@@ -278,13 +279,14 @@ async def running(
         answers=answers,
         secrets=secrets,
     )
+    login = LoginPolicy(files, plugins=frame.logins)
     listeners = Listeners(
         broker,
-        frame.authenticate,
-        files.exchange,
+        login.authenticate,
+        login.exchange,
         Admission(100, PATIENCE),
     )
-    rig = Rig(frame, broker, files)
+    rig = Rig(frame, broker, files, login)
     try:
         await frame.start()
         yield rig
@@ -418,13 +420,13 @@ async def test_the_users_file_decides_about_its_users(
 ) -> None:
     both = {**amqtt_users, own(Login): {"answer": "yes"}}
     async with running(both, users=users) as rig:
-        who = await rig.frame.authenticate(connect_of("ann", b"file"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of("ann", b"file"), "127.0.0.1:1")
         assert who == Identity("ann", "c1")
         assert Login.seen == []
-        wrong = await rig.frame.authenticate(connect_of("ann", b"x"), "127.0.0.1:1")
+        wrong = await rig.login.authenticate(connect_of("ann", b"x"), "127.0.0.1:1")
         assert isinstance(wrong, Refusal) and wrong.code == ReasonCode.NOT_AUTHORIZED
         assert Login.seen == []
-        who = await rig.frame.authenticate(connect_of("bob", b"secret"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of("bob", b"secret"), "127.0.0.1:1")
         assert who == Identity("bob", "c1")
 
 
@@ -454,7 +456,7 @@ async def test_without_plugins_the_files_decide(users: Path) -> None:
 )
 async def test_who_answers(user: str | None, anonymous: bool, answer: str, admitted: bool) -> None:
     async with running({own(Login): {"answer": answer}}, anonymous=anonymous) as rig:
-        who = await rig.frame.authenticate(connect_of(user, b"x"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of(user, b"x"), "127.0.0.1:1")
         if admitted:
             assert who == Identity(user, "c1")
         else:
@@ -476,7 +478,7 @@ async def test_anonymous_plugin(
     settings: dict[str, Any], user: str | None, identity: Identity | None
 ) -> None:
     async with running({ANONYMOUS: settings}) as rig:
-        who = await rig.frame.authenticate(connect_of(user, b"x"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of(user, b"x"), "127.0.0.1:1")
         if identity is None:
             assert isinstance(who, Refusal) and who.code == ReasonCode.NOT_AUTHORIZED
         else:
@@ -485,7 +487,7 @@ async def test_anonymous_plugin(
 
 async def test_a_password_beside_the_anonymous_plugin(amqtt_users: dict[str, Any]) -> None:
     async with running({**OPEN, **amqtt_users}) as rig:
-        ask = rig.frame.authenticate
+        ask = rig.login.authenticate
         assert await ask(connect_of("bob", b"secret"), "127.0.0.1:1") == Identity("bob", "c1")
         assert await ask(connect_of(None), "127.0.0.1:1") == Identity(None, "c1")
         assert isinstance(await ask(connect_of("bob", b"no"), "127.0.0.1:1"), Refusal)
@@ -497,8 +499,8 @@ async def test_what_a_plugin_sees_of_a_login() -> None:
         tls.getpeercert = lambda binary_form=False: None  # type: ignore[method-assign]
         will = Will("bob/state", b"gone", 1, True)
         connect = connect_of("bob", b"secret", keep_alive=7, version=4, will=will)
-        await rig.frame.authenticate(connect, "[::1]:1234", tls)
-        await rig.frame.authenticate(
+        await rig.login.authenticate(connect, "[::1]:1234", tls)
+        await rig.login.authenticate(
             connect_of("bob", None, properties={Property.SESSION_EXPIRY_INTERVAL: 9}), "[::1]:1"
         )
         seen, other = Login.seen
@@ -512,7 +514,7 @@ async def test_what_a_plugin_sees_of_a_login() -> None:
 
 async def test_a_password_that_is_not_text() -> None:
     async with running({own(Login): {}}) as rig:
-        who = await rig.frame.authenticate(connect_of("bob", b"\xff"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of("bob", b"\xff"), "127.0.0.1:1")
         assert isinstance(who, Refusal) and "UTF-8" in who.reason
 
 
@@ -528,7 +530,7 @@ async def test_a_plugin_that_raises(caplog: pytest.LogCaptureFixture) -> None:
 async def test_a_plugin_that_hangs() -> None:
     plugins = {own(Login): {"answer": "hang"}}
     async with running(plugins, plugin_timeout=SHORT) as rig:
-        who = await rig.frame.authenticate(connect_of("bob", b"x"), "127.0.0.1:1")
+        who = await rig.login.authenticate(connect_of("bob", b"x"), "127.0.0.1:1")
         assert isinstance(who, Refusal)
         assert who == Refusal(ReasonCode.SERVER_UNAVAILABLE, "Login said nothing within 0.1 s")
         assert await refused(rig.connect("bob:x")) == 3

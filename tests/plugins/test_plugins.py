@@ -80,7 +80,7 @@ async def test_jwt() -> None:
             token(exp=int(time.time()) - 10),
             b"no token",
         ):
-            answer = await rig.frame.authenticate(connect_of("bob", wrong), HOST)
+            answer = await rig.login.authenticate(connect_of("bob", wrong), HOST)
             assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
         bob = Identity("bob", "b1")
         assert await decided(rig, bob, Action.PUBLISH, "a/x")
@@ -149,9 +149,9 @@ def bob(client_id: str = "c1", password: str = PASSWORD) -> Connect:
 async def test_http(backend: Backend) -> None:
     topics = {"amqtt.contrib.http.TopicAuthHttpPlugin": next(iter(backend.plugins().values()))}
     async with running(backend.plugins() | topics) as rig:
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         assert backend.asked[-1] == {"username": "bob", "password": PASSWORD, "client_id": "c1"}
-        wrong = await rig.frame.authenticate(bob(password="wrong"), HOST)
+        wrong = await rig.login.authenticate(bob(password="wrong"), HOST)
         assert wrong == Refusal(ReasonCode.NOT_AUTHORIZED, "refused by UserAuthHttpPlugin")
         who = Identity("bob", "c1")
         assert await decided(rig, who, Action.RECEIVE, "b/c")
@@ -163,20 +163,20 @@ async def test_a_server_that_hangs_holds_up_nobody_else(backend: Backend, tmp_pa
     async with running(backend.plugins(), plugin_timeout=0.5) as rig:
         slow = [
             asyncio.ensure_future(
-                rig.frame.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
+                rig.login.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
             )
             for n in range(20)
         ]
         await until(lambda: backend.logins.count("slow") == 20)
         began = time.monotonic()
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         assert time.monotonic() - began < 0.4
         answers = await asyncio.gather(*slow)
         assert {code_of(answer) for answer in answers} == {ReasonCode.SERVER_UNAVAILABLE}
         assert time.monotonic() - began < 2
         # That is not remembered, and no guess.
         backend.hangs.set()
-        answer = await rig.frame.authenticate(connect_of("slow", b"1"), "10.0.0.1:1")
+        answer = await rig.login.authenticate(connect_of("slow", b"1"), "10.0.0.1:1")
         assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
 
 
@@ -186,7 +186,7 @@ async def test_so_many_at_once_and_no_more(
     monkeypatch.setattr(logins_module, "LOGINS", 3)
     async with running(backend.plugins(), plugin_timeout=1.5) as rig:
         asks = [
-            rig.frame.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
+            rig.login.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
             for n in range(10)
         ]
         answers = await asyncio.gather(*asks)
@@ -205,7 +205,7 @@ async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
     async with running(backend.plugins(), users=users, answers=Answers(600, 200)) as rig:
 
         async def ask(password: str = PASSWORD, client_id: str = "c1") -> ReasonCode:
-            return code_of(await rig.frame.authenticate(bob(client_id, password), HOST))
+            return code_of(await rig.login.authenticate(bob(client_id, password), HOST))
 
         for _ in range(3):
             assert await ask() == ReasonCode.SUCCESS
@@ -226,16 +226,16 @@ async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
 
 async def test_what_is_kept_is_bounded_and_holds_no_password(backend: Backend) -> None:
     async with running(backend.plugins(), answers=Answers(60, 60, size=10)) as rig:
-        asks = [rig.frame.authenticate(bob(f"c{number}"), HOST) for number in range(30)]
+        asks = [rig.login.authenticate(bob(f"c{number}"), HOST) for number in range(30)]
         await asyncio.gather(*asks)
-        logins = rig.frame._logins
+        logins = rig.frame.logins
         assert len(logins._known) == 10 and not logins._asking
         assert PASSWORD not in repr(logins._known)
 
 
 async def test_the_same_login_many_times_at_once_is_one_question(backend: Backend) -> None:
     async with running(backend.plugins()) as rig:
-        answers = await asyncio.gather(*(rig.frame.authenticate(bob(), HOST) for _ in range(50)))
+        answers = await asyncio.gather(*(rig.login.authenticate(bob(), HOST) for _ in range(50)))
         assert set(answers) == {Identity("bob", "c1")}
         assert len(backend.asked) == 1
 
@@ -244,23 +244,23 @@ async def test_wrong_passwords_for_plugins_are_guesses_too(backend: Backend) -> 
     async with running(backend.plugins()) as rig:
         rig.files.guesses._allowed = 5
         answers = [
-            await rig.frame.authenticate(bob(password=str(number)), f"{HOST}{number}")
+            await rig.login.authenticate(bob(password=str(number)), f"{HOST}{number}")
             for number in range(8)
         ]
         assert [code_of(answer) for answer in answers[:5]] == [ReasonCode.NOT_AUTHORIZED] * 5
         while rig.files.guesses.turn(HOST, logins_module.LINE, patience=60.0) is not None:
             pass
         asked = len(backend.asked)
-        assert code_of(await rig.frame.authenticate(bob(), HOST)) == ReasonCode.SERVER_BUSY
+        assert code_of(await rig.login.authenticate(bob(), HOST)) == ReasonCode.SERVER_BUSY
         assert len(backend.asked) == asked
-        assert code_of(await rig.frame.authenticate(bob(), "10.0.0.9:1")) == ReasonCode.SUCCESS
+        assert code_of(await rig.login.authenticate(bob(), "10.0.0.9:1")) == ReasonCode.SUCCESS
 
 
 async def test_what_plugins_noted_of_a_login_is_there_again() -> None:
     async with running({own(Login): {}}, answers=Answers()) as rig:
         for client_id in ("c1", "c1"):
             connect = bob(client_id)
-            assert isinstance(await rig.frame.authenticate(connect, HOST), Identity)
+            assert isinstance(await rig.login.authenticate(connect, HOST), Identity)
         first = Login.seen
         assert len(first) == 1
         shown = rig.frame._views._logins.get(HOST)
@@ -277,7 +277,7 @@ async def test_a_password_is_in_no_error(
     backend.answer = lambda ok: web.Response(text="<html>", content_type="text/html")
 
     async with running(backend.plugins(**settings)) as rig:
-        answer = await rig.frame.authenticate(bob(), HOST)
+        answer = await rig.login.authenticate(bob(), HOST)
         assert code_of(answer) == ReasonCode.SERVER_UNAVAILABLE
         assert isinstance(answer, Refusal)
     for text in (answer.reason, caplog.text):
@@ -321,9 +321,9 @@ async def test_sql(tmp_path: Path) -> None:
             await users.create_user_auth("bob", PASSWORD)
             await topics.create_topic_auth("bob")
             await topics.add_allowed_topic("bob", "a/b", AmqttAction.PUBLISH)
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         for wrong in (bob(password="wrong"), connect_of("eve", b"x")):
-            answer = await rig.frame.authenticate(wrong, HOST)
+            answer = await rig.login.authenticate(wrong, HOST)
             assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
         assert await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/b")
         assert not await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/c")
@@ -401,9 +401,9 @@ async def test_ldap(directory: Directory) -> None:
         "amqtt.contrib.ldap.TopicAuthLdapPlugin": LDAP | attributes,
     }
     async with running(plugins) as rig:
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         for wrong in (bob(password="wrong"), connect_of("eve", b"x")):
-            answer = await rig.frame.authenticate(wrong, HOST)
+            answer = await rig.login.authenticate(wrong, HOST)
             assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
         assert await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/b")
         assert not await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "b/c")
@@ -415,7 +415,7 @@ async def test_a_directory_that_hangs_does_not_stop_the_loop(directory: Director
     async with running(plugins, plugin_timeout=0.3) as rig:
         directory.gate.clear()
         asks = asyncio.gather(
-            *(rig.frame.authenticate(bob(f"c{number}"), HOST) for number in range(10))
+            *(rig.login.authenticate(bob(f"c{number}"), HOST) for number in range(10))
         )
         longest, last = 0.0, time.monotonic()
         while not asks.done():
@@ -427,7 +427,7 @@ async def test_a_directory_that_hangs_does_not_stop_the_loop(directory: Director
         assert directory.searches == 1
         directory.gate.set()
         await until(lambda: directory.searches >= 1)
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         # Those who had stopped waiting are not asked about any more.
         assert directory.searches == 2
 
@@ -448,5 +448,5 @@ async def test_amqtts_password_file_is_hashed_in_a_thread(tmp_path: Path) -> Non
             return await authenticate(**arguments)
 
         plugin.authenticate = noted  # type: ignore[method-assign]
-        assert await rig.frame.authenticate(bob(), HOST) == Identity("bob", "c1")
+        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         assert threads == ["FileAuthPlugin"]

@@ -1,0 +1,146 @@
+"""The order in which a login is decided.
+
+The first of these that applies decides about a CONNECT:
+
+1. **The client's certificate**, where `broker.tls.username_from` takes the user from it: no
+   password is asked for, and a CONNECT that names another user is refused.
+2. **The users file**, for a user that has a line in it; without plugins that authenticate,
+   for every user.
+3. **Anonymous access**, for a client without a user name, as `broker.anonymous` or the client's
+   listener says. A listener that says no has the last word, plugins or not.
+4. **amqtt's plugins**, where some that authenticate are configured.
+
+SCRAM (enhanced authentication) is step 2 with a proof in the place of the password. It is not
+offered where step 1 has decided already, nor beside plugins that authenticate: it would bypass
+those that refuse the client.
+"""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Callable
+from typing import Protocol
+
+from appliance.access.files import FileAccess
+from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.mqtt.codec import quote
+from appliance.mqtt.packets import Connect
+from appliance.mqtt.reason import ReasonCode
+
+
+class LoginPlugins(Protocol):
+    """Plugins as far as a login is concerned; there are none where none is configured."""
+
+    @property
+    def authenticates(self) -> bool:
+        """Whether one of them authenticates clients; others only observe, or rule topics."""
+
+    def connect_received(self, connect: Connect) -> None:
+        """Notify them of a CONNECT, before anything is decided."""
+
+    async def authenticate(
+        self, connect: Connect, address: str, tls: ssl.SSLObject | None
+    ) -> tuple[Identity | Refusal, object]:
+        """Who the client is by what they say, and what they noted meanwhile, for `admitted`."""
+
+    def admitted(
+        self,
+        identity: Identity,
+        connect: Connect,
+        address: str,
+        tls: ssl.SSLObject | None,
+        noted: object,
+    ) -> None:
+        """The client comes in, whoever decided so; `noted` is None when it was not them."""
+
+
+def no_user(tls: ssl.SSLObject) -> str | None:
+    """No certificate names a user."""
+    return None
+
+
+class LoginPolicy:
+    """Decides who a client is; see the module for the order.
+
+    `certificate_user` is the user that a client's certificate names, None for none; its ValueError
+    refuses the client.
+    """
+
+    def __init__(
+        self,
+        files: FileAccess,
+        certificate_user: Callable[[ssl.SSLObject], str | None] = no_user,
+        plugins: LoginPlugins | None = None,
+    ) -> None:
+        self._files = files
+        self._certificate_user = certificate_user
+        self._plugins = plugins
+
+    async def authenticate(
+        self,
+        connect: Connect,
+        address: str,
+        tls: ssl.SSLObject | None = None,
+        anonymous: bool | None = None,
+    ) -> Identity | Refusal:
+        """Who sent the CONNECT, or why it is refused.
+
+        `anonymous` is whether its listener admits clients without a user name, None where it does
+        not say.
+        """
+        plugins = self._plugins
+        if plugins is not None:
+            plugins.connect_received(connect)
+        who, noted = await self._decide(connect, address, tls, anonymous)
+        if plugins is not None and isinstance(who, Identity):
+            plugins.admitted(who, connect, address, tls, noted)
+        return who
+
+    async def _decide(
+        self, connect: Connect, address: str, tls: ssl.SSLObject | None, anonymous: bool | None
+    ) -> tuple[Identity | Refusal, object]:
+        try:
+            owner = self._certificate_user(tls) if tls is not None else None
+        except ValueError as error:
+            return Refusal(ReasonCode.NOT_AUTHORIZED, str(error)), None
+        if owner is not None:
+            return _by_certificate(owner, connect), None
+        plugins, files, username = self._plugins, self._files, connect.username
+        is_known = plugins is None or not plugins.authenticates or files.knows(username)
+        if is_known or username is None:
+            who = await files.authenticate(
+                username, connect.password, connect.client_id, address, anonymous
+            )
+            if is_known or anonymous is False or isinstance(who, Identity):
+                return who, None
+        assert plugins is not None
+        who, noted = await plugins.authenticate(connect, address, tls)
+        if anonymous is False and isinstance(who, Identity) and who.username is None:
+            reason = "no plugin knows the user, nor do the files"
+            return Refusal(ReasonCode.NOT_AUTHORIZED, reason), None
+        return who, noted
+
+    def exchange(
+        self, method: str, address: str | None, tls: ssl.SSLObject | None
+    ) -> Exchange | None:
+        """Begin an enhanced authentication; None when the method is not offered to this client.
+
+        `address` is None for a client that has logged in and authenticates again.
+        """
+        if self._plugins is not None and self._plugins.authenticates:
+            return None
+        if tls is not None:
+            try:
+                if self._certificate_user(tls) is not None:
+                    return None
+            except ValueError:
+                return None
+        return self._files.exchange(method, address)
+
+
+def _by_certificate(owner: str, connect: Connect) -> Identity | Refusal:
+    if connect.username not in (None, "", owner):
+        # Of two names nobody can tell whose rights are meant.
+        reason = f"its certificate is of user {quote(owner)}, and it says to be another one"
+        return Refusal(ReasonCode.NOT_AUTHORIZED, reason)
+    return Identity(owner, connect.client_id)
