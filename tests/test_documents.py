@@ -117,6 +117,27 @@ def test_links_lead_somewhere(page: Page) -> None:
     assert broken == []
 
 
+#: Pages about the code: what they name is there.
+ABOUT_CODE = [page for page in PAGES if page.name in ("docs/architecture.md", "docs/adding.md")]
+
+
+@pytest.mark.parametrize("page", ABOUT_CODE, ids=[page.name for page in ABOUT_CODE])
+def test_files_and_names_of_the_code_are_there(page: Page) -> None:
+    """`appliance/net/tls.py`, `net/tls.py`, `Broker.publish_to`; NAME is the reader's own."""
+    code = "\n".join(file.read_text() for file in PROJECT.glob("appliance/**/*.py"))
+    missing = []
+    for quoted in page.quoted():
+        is_path = re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?", quoted) and "NAME" not in quoted
+        if is_path and not any(
+            (root / quoted).exists() for root in (PROJECT, PROJECT / "appliance")
+        ):
+            missing.append(quoted)
+        name = re.fullmatch(r"([A-Z][a-z]\w+)\.(\w+)", quoted)
+        if name and not re.search(rf"^class {name[1]}\b.*?^    def {name[2]}\b", code, re.M | re.S):
+            missing.append(quoted)
+    assert missing == []
+
+
 @pytest.mark.parametrize("page", PAGES[1:], ids=NAMES[1:])
 def test_a_page_begins_with_its_contents(page: Page) -> None:
     start = page.text.partition("\n## ")[0]
