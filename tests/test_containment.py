@@ -61,7 +61,7 @@ from appliance.ros.bridge import Bridge, TopicSettings
 from appliance.ros.calls.routes import CallRoutes, ParameterSettings, ServiceSettings
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules, OnSilence
-from appliance.store import sqlite
+from appliance.store import committer, sqlite
 
 #: How often an entry is reached for, in PATIENCE: a fault may strike who reaches for it.
 ATTEMPTS = 3
@@ -477,9 +477,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         (lingering, "TIMEOUT", 0.2),
         (listeners, "ACCEPT_PAUSE", 0.05),
         (listeners, "HANDSHAKE_STALL", 0.05),
-        (sqlite, "LINGER", 0.05),
+        (committer, "LINGER", 0.05),
         (sqlite, "CLOCK_CHECK", 0.2),
-        (sqlite, "RETRY", 0.05),
+        (committer, "RETRY", 0.05),
         (bridge_module, "METER_INTERVAL", 0.1),
         (bridge_module, "RETRY", 0.05),
         (bridge_module, "LONGEST_RETRY", 0.1),
@@ -634,7 +634,7 @@ async def _store_fails(site: Site, patch: pytest.MonkeyPatch) -> None:
         def write(batch: object) -> None:
             raise OSError("no space left")
 
-        broken.setattr(store._writer, "_write", write)
+        broken.setattr(store._committer._writer, "_write", write)
         lasting = {Property.SESSION_EXPIRY_INTERVAL: 60}
         other = await site.dial()
         site.hands.append(other)

@@ -52,7 +52,7 @@ from appliance.ros.node import RosNode
 from appliance.ros.ros1.node import Ros1Node
 from appliance.ros.ros2 import discovery
 from appliance.ros.ros2.node import Ros2Node
-from appliance.store import MemoryStore, SqliteStore, StoreError
+from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
 
 log = logging.getLogger(__name__)
 
@@ -148,7 +148,7 @@ class App:
         store = self._open_store()
         self.broker = broker = Broker(
             access,
-            store or MemoryStore(),
+            store,
             limits.of_broker(),
             broker_settings.features(),
         )
@@ -164,8 +164,7 @@ class App:
             self.audit.began()
             self._stack.callback(self.audit.ended)
         broker.tick(loop.time())
-        if store is not None:
-            store.restore(broker)
+        store.restore(broker)
 
         async def listen() -> None:
             wanted = wiring.listener_settings(settings, tls)
@@ -213,11 +212,13 @@ class App:
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
 
-    def _open_store(self) -> SqliteStore | None:
+    def _open_store(self) -> SessionStore:
         wanted = self.settings.broker.store
+        store: SessionStore
         if wanted.durability == "off":
-            return None
-        store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
+            store = MemoryStore()
+        else:
+            store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
         store.open()
         self._stack.push_async_callback(store.close)
         return store

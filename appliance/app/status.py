@@ -25,7 +25,7 @@ from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
 from appliance.ros.metrics import Meter
 from appliance.ros.status import RouteStatus
-from appliance.store import SqliteStore
+from appliance.store import SessionStore
 
 #: The part of a limit from which on it is told that little is left, and who has most.
 NEARLY_FULL = 0.8
@@ -41,7 +41,7 @@ class StatusParts:
     version: str
     broker: Broker
     listeners: Listeners
-    store: SqliteStore | None
+    store: SessionStore
     bridge: Bridge | None
     reload: Reload
     warnings: Callable[[], list[str]]
@@ -169,7 +169,7 @@ class Status:
 
     def _store(self) -> dict[str, Any] | None:
         store = self._parts.store
-        if store is None:
+        if store.path is None:
             return None
         return {
             "path": str(store.path),

@@ -1,4 +1,4 @@
-"""Reading the database at the start, whatever state it is in."""
+"""The database's files: locked, read at the start whatever state they are in, and salvaged."""
 
 from __future__ import annotations
 
@@ -14,57 +14,138 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
 
-from appliance.store.schema import (
-    DamagedError,
-    Durability,
-    Row,
-    StoreError,
-    Table,
-    connect,
-    select,
-)
+from appliance.store.rows import Rows, Table
+from appliance.store.schema import DamagedError, Durability, StoreError, connect, read_table
 
 log = logging.getLogger("appliance.store")
 
-#: What SQLite keeps beside a database: the write-ahead log, and an index to it that it makes anew.
+#: The suffixes of SQLite's files beside a database: the write-ahead log, and the index to it, which
+#: SQLite rebuilds.
 _LOG, _INDEX = "-wal", "-shm"
 
-#: Of SQLite's errors, those that say that the file is wrong and not the world around it.
+#: Parts of SQLite's messages that say that the file is damaged. The others are about its
+#: surroundings: the disk is full or read-only, the file is locked.
 _DAMAGE = ("malformed", "not a database", "no such table", "no such column", "corrupt")
-
-#: Rows of every table by their keys.
-Rows: TypeAlias = "list[dict[int, Row]]"
 
 
 @dataclass(slots=True)
 class Contents:
     """What was in the database."""
 
-    rows: Rows = field(default_factory=lambda: [{} for _ in Table])
-    #: The connection that it was read with; None where there is none that can be written with.
+    rows: Rows = field(default_factory=Rows)
+    #: The connection that read it; None when the database cannot be written.
     connection: sqlite3.Connection | None = None
-    #: Why there is none.
+    #: Why it cannot be written.
     problem: str = ""
-    #: The rows are in no database yet: they are what was saved of a damaged one.
-    rescued: bool = False
+    #: The rows were salvaged from a damaged database and are in no database yet.
+    salvaged: bool = False
+
+
+class Database:
+    """The files of one database, locked against other appliances from `open` to `close`."""
+
+    def __init__(self, path: Path, durability: Durability) -> None:
+        self.path = path
+        self._durability: Durability = durability
+        self._lock: int | None = None
+        self._contents: Contents | None = None
+
+    def open(self) -> None:
+        """Lock the database and read all of it.
+
+        Raises:
+            StoreError: another appliance uses it, a newer one made it, or it cannot be read.
+        """
+        try:
+            # The folder is for the appliance's user only when it is created here.
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._take_lock()
+        except OSError as error:
+            try:
+                exists = self.path.exists()
+            except PermissionError:
+                raise StoreError(_belongs_to_another(self.path)) from None
+            if not exists:
+                raise StoreError(
+                    f"{error.filename or self.path}: {error.strerror} (broker.store.path)"
+                ) from None
+            log.warning("%s: %s", error.filename, error.strerror)
+        try:
+            self._contents = read(self.path, self._durability)
+        except BaseException:
+            self.close()
+            raise
+
+    def take_contents(self) -> Contents:
+        """What `open` has read; its connection is the caller's from now on."""
+        contents, self._contents = self._contents, None
+        assert contents is not None
+        return contents
+
+    def close(self) -> None:
+        """Release the lock, and what was read and not taken; may be called twice."""
+        contents, self._contents = self._contents, None
+        if contents is not None and contents.connection is not None:
+            contents.connection.close()
+        descriptor, self._lock = self._lock, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def _take_lock(self) -> None:
+        self._lock = lock(self.path)
+        if self._lock is None:
+            raise StoreError(
+                f"{self.path} is in use by another appliance: stop that one, or set another "
+                "broker.store.path"
+            )
+
+
+def lock(path: Path) -> int | None:
+    """Lock the database until the descriptor is closed; None when another process has locked it.
+
+    Raises:
+        OSError: the lock file cannot be created.
+    """
+    descriptor = os.open(_beside(path, ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def size_on_disk(path: Path) -> int:
+    """Bytes of the database's files."""
+    total = 0
+    for suffix in ("", _LOG):
+        with contextlib.suppress(OSError):
+            total += os.stat(_beside(path, suffix)).st_size  # noqa: PTH116
+    return total
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
+
+
+# --- reading -------------------------------------------------------------------------------------
 
 
 def read(path: Path, durability: Durability) -> Contents:
-    """Open the database and read all of it; a damaged one is set aside, and what can be is saved.
+    """Open the database and read all of it. A damaged one is set aside, and its rows are salvaged.
 
     Raises:
-        StoreError: a newer appliance made it, or another program has it locked, or neither it nor
-            its directory can be read.
+        StoreError: a newer appliance made it, another program has locked it, or neither it nor its
+            folder can be read.
     """
     try:
         return _read(path, durability)
     except DamagedError as error:
-        return _rescue(path, str(error))
+        return _set_aside(path, str(error))
     except (sqlite3.Error, OSError) as error:
         if _is_damage(error):
-            return _rescue(path, str(error))
+            return _set_aside(path, str(error))
         if "locked" in str(error):
             raise StoreError(
                 f"{path} is locked by another program: end that, or move the file away"
@@ -89,13 +170,14 @@ def _read_all(connection: sqlite3.Connection) -> Rows:
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
         raise DamagedError(verdict.replace("\n", " "))
-    return [
-        {row[0]: row for row in connection.execute(select(table, connection))} for table in Table
-    ]
+    rows = Rows()
+    for table in Table:
+        rows.of(table).update(read_table(connection, table))
+    return rows
 
 
 def _read_copy(path: Path, error: Exception) -> Contents:
-    """The disk is full, or read-only, so that not even reading works where the database lies."""
+    """Read a copy: the disk is full or read-only, so SQLite cannot even read where the file is."""
     problem = str(error)
     if not path.exists():
         return Contents(problem=problem)
@@ -106,20 +188,20 @@ def _read_copy(path: Path, error: Exception) -> Contents:
             if _beside(path, _LOG).exists():
                 shutil.copyfile(_beside(path, _LOG), _beside(copy, _LOG))
         except PermissionError:
-            raise StoreError(belongs_to_another(path)) from None
+            raise StoreError(_belongs_to_another(path)) from None
         except OSError as failed:
             raise StoreError(f"{path} cannot be read: {problem}; nor copied: {failed}") from None
         try:
             contents = _read(copy, "process")
         except (DamagedError, sqlite3.Error, UnicodeError) as damage:
-            return _rescue(path, str(damage))
+            return _set_aside(path, str(damage))
         assert contents.connection is not None
         contents.connection.close()
         return Contents(contents.rows, problem=problem)
 
 
-def belongs_to_another(path: Path) -> str:
-    """What to do when an appliance has run here as another user, such as once with sudo."""
+def _belongs_to_another(path: Path) -> str:
+    """What to do after the appliance has run as another user, such as once with sudo."""
     try:
         owner = path.stat().st_uid
     except PermissionError:
@@ -139,8 +221,11 @@ def _user(uid: int) -> str:
         return str(uid)
 
 
-def _rescue(path: Path, damage: str) -> Contents:
-    """Set the database aside, under a name with the date, and read of it what can be read."""
+# --- salvaging -----------------------------------------------------------------------------------
+
+
+def _set_aside(path: Path, damage: str) -> Contents:
+    """Rename the damaged database to a name with the date, and salvage its rows."""
     aside = path.with_name(f"{path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}")
     try:
         for suffix in ("", _LOG):
@@ -152,7 +237,7 @@ def _rescue(path: Path, damage: str) -> Contents:
             f"{path} is damaged ({damage}) and cannot be set aside: {error.strerror}"
         ) from None
     rows = salvage(aside)
-    found = ", ".join(f"{len(rows[table])} {table.name.lower()}" for table in Table)
+    found = ", ".join(f"{len(rows.of(table))} {table.name.lower()}" for table in Table)
     log.error(
         "%s IS DAMAGED (%s). It was set aside as %s; what could be read of it is kept (%s), what "
         "could not is lost",
@@ -161,12 +246,12 @@ def _rescue(path: Path, damage: str) -> Contents:
         aside,
         found,
     )
-    return Contents(rows, rescued=True)
+    return Contents(rows, salvaged=True)
 
 
 def salvage(path: Path) -> Rows:
     """All rows that can be read from a damaged database, which is not changed."""
-    best: Rows = [{} for _ in Table]
+    rows = Rows()
     with tempfile.TemporaryDirectory(prefix="appliance-store-") as directory:
         for with_log in (True, False):
             copy = Path(directory) / f"{with_log}.db"
@@ -174,62 +259,25 @@ def salvage(path: Path) -> Rows:
                 shutil.copyfile(path, copy)
                 if with_log and _beside(path, _LOG).exists():
                     shutil.copyfile(_beside(path, _LOG), _beside(copy, _LOG))
-            for table, rows in zip(Table, _salvage(copy), strict=True):
-                if len(rows) > len(best[table]):
-                    best[table] = rows
-            if any(best):
-                break  # without its log an older state would be mixed in
-    return best
+            rows = _salvage(copy)
+            if any(map(rows.of, Table)):
+                break  # reading it without its log as well would mix in an older state
+    return rows
 
 
 def _salvage(path: Path) -> Rows:
-    rows: Rows = [{} for _ in Table]
+    rows = Rows()
     try:
         connection = sqlite3.connect(path)
     except sqlite3.Error:
         return rows
     with contextlib.closing(connection):
-        with contextlib.suppress(sqlite3.Error):  # so that what is damaged is not taken for rows
+        with contextlib.suppress(sqlite3.Error):  # so that damaged cells are not taken for rows
             connection.execute("PRAGMA cell_size_check = ON")
         for table in Table:
-            # From both ends, up to what cannot be read.
+            # From both ends, up to the damage.
             for order in ("ASC", "DESC"):
-                with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError):
-                    for row in connection.execute(
-                        f"{select(table, connection)} ORDER BY id {order}"
-                    ):
-                        rows[table].setdefault(row[0], row)
+                with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError, DamagedError):
+                    for key, row in read_table(connection, table, order):
+                        rows.of(table).setdefault(key, row)
     return rows
-
-
-def make_directory(path: Path) -> None:
-    """The directory of the database, for its user only when it is made here. Raises OSError."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-
-
-def lock(path: Path) -> int | None:
-    """Take hold of the database, until the descriptor is closed; None when another process has it.
-
-    Raises:
-        OSError: the lock's file cannot be made.
-    """
-    descriptor = os.open(_beside(path, ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
-    return descriptor
-
-
-def _beside(path: Path, suffix: str) -> Path:
-    return path.with_name(path.name + suffix)
-
-
-def size_on_disk(path: Path) -> int:
-    """Bytes of the database's files."""
-    total = 0
-    for suffix in ("", _LOG):
-        with contextlib.suppress(OSError):
-            total += os.stat(_beside(path, suffix)).st_size  # noqa: PTH116
-    return total

@@ -11,34 +11,33 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
-from appliance.store.clock import KEY, Clocks, boot_id, stamp_of
-from appliance.store.database import Rows
+from appliance.store.clock import Clocks, boot_id, stamp_of
+from appliance.store.rows import OwedRow, ReceivedRow, Rows, SubscriptionRow, Table, Value
 from appliance.store.schema import (
     DamagedError,
-    Row,
     StoreError,
-    Table,
-    Value,
     connect,
     connect_to_read,
-    select,
+    read_table,
     version,
 )
 from appliance.store.writer import Batch, write
 
+_OfSession = TypeVar("_OfSession", SubscriptionRow, OwedRow, ReceivedRow)
+
 
 @dataclass(frozen=True, slots=True)
 class SessionSummary:
-    """One session; times are of the wall clock, None for a client that is connected."""
+    """One session; `ends_at`, by the wall clock, is None while its client is connected."""
 
     client_id: str
     username: str | None
     subscriptions: int
-    #: Messages that wait for it or are on their way, their payloads' bytes, and since when.
+    #: Messages queued or inflight, the bytes of their payloads, and the time of the oldest.
     messages: int
     size: int
     oldest: float | None
@@ -47,7 +46,7 @@ class SessionSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What is kept; sizes in bytes."""
+    """What is stored; sizes in bytes."""
 
     sessions: list[SessionSummary]
     messages: int
@@ -71,120 +70,127 @@ def read(path: Path) -> Rows:
     _require(path)
     try:
         with contextlib.closing(connect_to_read(path)) as connection:
-            # What an older appliance wrote has fewer tables until this one runs.
+            # The database of an older appliance has fewer tables until this one runs.
             tables = [*Table] if version(connection) > 1 else [*Table][: Table.CLOCK]
             connection.execute("BEGIN")
-            rows: Rows = [{} for _ in Table]
+            rows = Rows()
             for table in tables:
-                rows[table] = {row[0]: row for row in connection.execute(select(table, connection))}
+                rows.of(table).update(read_table(connection, table))
             return rows
     except (sqlite3.Error, DamagedError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from None
 
 
 def summarise(path: Path) -> Summary:
-    """What is kept in the database. Raises StoreError."""
+    """What is stored in the database. Raises StoreError."""
     rows = read(path)
-    messages = rows[Table.MESSAGE]
-    dated = _dates(rows)
+    to_date = _wall_clock(rows)
 
-    def payload_size(key: object) -> int:
-        row = messages.get(cast(int, key))
-        return len(cast(bytes, row[2])) if row is not None else 0
+    def payload_size(key: Value) -> int:
+        row = rows.message.get(cast(int, key))
+        return len(cast(bytes, row.payload)) if row is not None else 0
 
-    subscriptions = _by_session(rows, Table.SUBSCRIPTION)
-    owed_to = _by_session(rows, Table.OWED)
+    subscriptions = _by_session(rows.subscription)
+    owed = _by_session(rows.owed)
     sessions = []
-    for key, client_id, username, expiry, ends_at, *_ in rows[Table.SESSION].values():
-        if not expiry:
+    for session in rows.session.values():
+        if not session.expiry:
             continue
-        owed = [row[2] for row in owed_to[key]]
-        stored = [cast(float, messages[cast(int, m)][8]) for m in owed if m in messages]
+        keys = [row.message for row in owed[session.id]]
+        found = (rows.message.get(cast(int, key)) for key in keys)
+        stored = [cast(float, row.stored_at) for row in found if row is not None]
         sessions.append(
             SessionSummary(
-                str(client_id),
-                cast("str | None", username),
-                len(subscriptions[key]),
-                len(owed),
-                sum(map(payload_size, owed)),
-                dated(min(stored, default=None)),
-                dated(ends_at),
+                str(session.client_id),
+                cast("str | None", session.username),
+                len(subscriptions[session.id]),
+                len(keys),
+                sum(map(payload_size, keys)),
+                to_date(min(stored, default=None)),
+                to_date(session.ends_at),
             )
         )
-    retained = [row[1] for row in rows[Table.RETAINED].values()]
     return Summary(
         sorted(sessions, key=lambda session: session.client_id),
-        len(messages),
-        sum(map(payload_size, messages)),
-        len(retained),
-        sum(map(payload_size, retained)),
+        len(rows.message),
+        sum(map(payload_size, rows.message)),
+        len(rows.retained),
+        sum(payload_size(row.message) for row in rows.retained.values()),
         database.size_on_disk(path),
     )
 
 
-def _dates(rows: Rows) -> Callable[[Value], float | None]:
-    """What makes a time of the wall clock out of one of the store's."""
-    stamp = stamp_of(rows[Table.CLOCK].get(KEY))
+def _wall_clock(rows: Rows) -> Callable[[Value], float | None]:
+    """A function that converts a time of the store's clock to one of the wall clock."""
+    stamp = stamp_of(rows.clock)
     shift = stamp.shift if stamp is not None else 0.0
     return lambda moment: moment + shift if isinstance(moment, float) else None
 
 
-def _by_session(rows: Rows, table: Table) -> defaultdict[object, list[Row]]:
-    """The rows of a table that belongs to sessions, by the session's key."""
-    found: defaultdict[object, list[Row]] = defaultdict(list)
-    for row in rows[table].values():
-        found[row[1]].append(row)
+def _by_session(rows: dict[int, _OfSession]) -> defaultdict[Value, list[_OfSession]]:
+    """The rows of a table that belong to sessions, by the session's key."""
+    found: defaultdict[Value, list[_OfSession]] = defaultdict(list)
+    for row in rows.values():
+        found[row.session].append(row)
     return found
 
 
 def export(path: Path) -> Iterator[dict[str, object]]:
-    """Every session and every retained message as what JSON can say. Raises StoreError."""
+    """Every session and every retained message as plain values for JSON. Raises StoreError."""
     rows = read(path)
-    dated = _dates(rows)
+    to_date = _wall_clock(rows)
 
-    def message(key: object) -> dict[str, object]:
-        row = rows[Table.MESSAGE].get(cast(int, key))
+    def message(key: Value) -> dict[str, object]:
+        row = rows.message.get(cast(int, key))
         if row is None:
             return {}
-        _, topic, payload, qos, retain, _, _, expires_at, stored_at = row
-        told: dict[str, object] = {"topic": topic, "qos": qos, "retain": bool(retain)}
-        told |= {"stored_at": dated(stored_at), "expires_at": dated(expires_at)}
+        exported: dict[str, object] = {
+            "topic": row.topic,
+            "qos": row.qos,
+            "retain": bool(row.retain),
+            "stored_at": to_date(row.stored_at),
+            "expires_at": to_date(row.expires_at),
+        }
+        payload = cast(bytes, row.payload)
         try:
-            told["payload"] = cast(bytes, payload).decode()
+            exported["payload"] = payload.decode()
         except UnicodeDecodeError:
-            told["payload_base64"] = base64.b64encode(cast(bytes, payload)).decode()
-        return told
+            exported["payload_base64"] = base64.b64encode(payload).decode()
+        return exported
 
-    subscriptions = _by_session(rows, Table.SUBSCRIPTION)
-    owed_to = _by_session(rows, Table.OWED)
-    received = _by_session(rows, Table.RECEIVED)
-    for row in rows[Table.SESSION].values():
-        key, client_id, username, expiry, ends_at, will, will_delay, will_at = row
+    subscriptions = _by_session(rows.subscription)
+    owed = _by_session(rows.owed)
+    received = _by_session(rows.received)
+    for session in rows.session.values():
+        will = None
+        if session.will:
+            due = {"delay": session.will_delay, "due_at": to_date(session.will_at)}
+            will = message(session.will) | due
         yield {
-            "session": client_id,
-            "user": username,
-            "expiry": expiry,
-            "ends_at": dated(ends_at),
-            "will": message(will) | {"delay": will_delay, "due_at": dated(will_at)}
-            if will
-            else None,
+            "session": session.client_id,
+            "user": session.username,
+            "expiry": session.expiry,
+            "ends_at": to_date(session.ends_at),
+            "will": will,
             "subscriptions": [
-                {"filter": row[2], "qos": row[3], "identifier": row[7]}
-                for row in subscriptions[key]
+                {"filter": row.filter, "qos": row.qos, "identifier": row.identifier}
+                for row in subscriptions[session.id]
             ],
             "messages": [
-                message(row[2]) | {"qos": row[3], "packet_id": row[7]}
-                for row in sorted(owed_to[key], key=lambda row: cast(int, row[0]))
+                message(row.message) | {"qos": row.qos, "packet_id": row.packet_id}
+                for row in sorted(owed[session.id], key=lambda row: row.id)
             ],
-            "unreleased": [message(row[3]) | {"packet_id": row[2]} for row in received[key]],
+            "unreleased": [
+                message(row.message) | {"packet_id": row.packet_id} for row in received[session.id]
+            ],
         }
-    for row in rows[Table.RETAINED].values():
-        yield {"retained": message(row[1])}
+    for row in rows.retained.values():
+        yield {"retained": message(row.message)}
 
 
 def _now(rows: Rows) -> float:
     """The store's time."""
-    stamp = stamp_of(rows[Table.CLOCK].get(KEY))
+    stamp = stamp_of(rows.clock)
     clocks = Clocks(time.time(), time.monotonic(), boot_id())
     return clocks.wall if stamp is None else stamp.later(clocks)
 
@@ -200,39 +206,41 @@ def prune_retained(path: Path, filters: list[str]) -> int:
     for topic_filter in filters:
         check_filter(topic_filter)
     with _changing(path) as (rows, batch):
-        topics = {key: cast(str, row[1]) for key, row in rows[Table.MESSAGE].items()}
-        for key, row in rows[Table.RETAINED].items():
-            topic = topics.get(cast(int, row[1]), "")
+        for key, row in rows.retained.items():
+            message = rows.message.get(cast(int, row.message))
+            topic = cast(str, message.topic) if message is not None else ""
             if any(matches(each, topic) for each in filters):
                 batch.remove(Table.RETAINED, key)
         return len(batch.deleted[Table.RETAINED])
 
 
-#: What refers to messages, and in which column.
-_REFERRING = ((Table.SESSION, 5), (Table.OWED, 2), (Table.RECEIVED, 3), (Table.RETAINED, 1))
-
-
 @contextlib.contextmanager
 def _changing(path: Path) -> Iterator[tuple[Rows, Batch]]:
-    """All rows, and what is to be done with them, which is written at the end.
+    """All rows, and a batch of changes that is written at the end.
 
-    Messages that nothing refers to any more go with it, and what room they had in the file.
+    Messages that nothing refers to any more are deleted as well, and the file shrinks.
     """
     _require(path)
     with _locked(path):
         rows, batch = read(path), Batch(0, 1 << 62)
         yield rows, batch
+        references = (
+            (Table.SESSION, ((row.id, row.will) for row in rows.session.values())),
+            (Table.OWED, ((row.id, row.message) for row in rows.owed.values())),
+            (Table.RECEIVED, ((row.id, row.message) for row in rows.received.values())),
+            (Table.RETAINED, ((row.id, row.message) for row in rows.retained.values())),
+        )
         used = {
-            row[column]
-            for table, column in _REFERRING
-            for key, row in rows[table].items()
+            message
+            for table, pairs in references
+            for key, message in pairs
             if key not in batch.deleted[table]
         }
-        for key in rows[Table.MESSAGE].keys() - used:
+        for key in rows.message.keys() - used:
             batch.remove(Table.MESSAGE, key)
         with contextlib.closing(connect(path)) as connection:
             write(connection, batch)
-            # It takes as much room again for a moment; without that the file stays as large.
+            # VACUUM needs as much disk again for a moment; without that the file stays large.
             with contextlib.suppress(sqlite3.Error):
                 connection.execute("VACUUM")
 
@@ -249,9 +257,10 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[int, int]:
-    """Delete what waits for sessions for longer than so many seconds; without that, sessions.
+    """Delete messages that have waited for sessions for longer than `older_than` seconds.
 
-    With `client_ids` of theirs only. Returns how many sessions and messages are gone.
+    Without `older_than`, delete the sessions. With `client_ids`, only those of these clients.
+    Returns the numbers of sessions and messages that were deleted.
 
     Raises:
         StoreError: an appliance is running, there is no database, or no such client.
@@ -260,25 +269,26 @@ def prune(path: Path, older_than: float | None, client_ids: list[str]) -> tuple[
     with _changing(path) as (rows, batch):
         chosen = {
             key: row
-            for key, row in rows[Table.SESSION].items()
-            if not client_ids or row[1] in client_ids
+            for key, row in rows.session.items()
+            if not client_ids or row.client_id in client_ids
         }
-        missing = set(client_ids) - {row[1] for row in chosen.values()}
+        missing = set(client_ids) - {row.client_id for row in chosen.values()}
         if missing:
             raise StoreError(f"no session of {', '.join(map(repr, sorted(missing)))} is kept")
-        messages = rows[Table.MESSAGE]
         limit = None if older_than is None else _now(rows) - older_than
-        for key, row in rows[Table.OWED].items():
-            stored = messages.get(cast(int, row[2])) if row[2] is not None else None
-            if row[1] in chosen and (
-                limit is None or (stored is not None and cast(float, stored[8]) < limit)
+        for key, row in rows.owed.items():
+            stored = rows.message.get(cast(int, row.message)) if row.message is not None else None
+            if row.session in chosen and (
+                limit is None or (stored is not None and cast(float, stored.stored_at) < limit)
             ):
                 batch.remove(Table.OWED, key)
         if limit is None:
             for key in chosen:
                 batch.remove(Table.SESSION, key)
-            for table in (Table.SUBSCRIPTION, Table.RECEIVED):
-                for key, row in rows[table].items():
-                    if row[1] in chosen:
-                        batch.remove(table, key)
+            for key, subscription in rows.subscription.items():
+                if subscription.session in chosen:
+                    batch.remove(Table.SUBSCRIPTION, key)
+            for key, received in rows.received.items():
+                if received.session in chosen:
+                    batch.remove(Table.RECEIVED, key)
         return len(batch.deleted[Table.SESSION]), len(batch.deleted[Table.OWED])

@@ -1,4 +1,8 @@
-"""Rows and what they stand for: messages, sessions and what is owed to them."""
+"""Turns the rows of the database into messages, sessions and their pending deliveries.
+
+A row may be damaged, so every value is checked before it is used. A row that is wrong, or refers to
+a row that is missing, is left out, counted in the log, and deleted with the first batch.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, cast
 
-from appliance.broker.accounts import Account
 from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.saved_sessions import PendingDelivery, SavedSession
-from appliance.broker.session import Delivery, PendingWill, Session, UnreleasedPublish
-from appliance.broker.shared import Share
+from appliance.broker.session import PendingWill
 from appliance.mqtt.codec import (
     MAXIMUM_PAIRS,
     NO_PROPERTIES,
@@ -21,142 +23,48 @@ from appliance.mqtt.codec import (
     PacketType,
     Property,
     check_properties,
-    decode_varint,
-    encode_property_list,
     encode_varint,
 )
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError
 from appliance.mqtt.topics import check_filter, check_topic, parse_shared
-from appliance.store.database import Rows
-from appliance.store.schema import Row, Table
+from appliance.store.rows import (
+    MessageRow,
+    OwedRow,
+    ReceivedRow,
+    RetainedRow,
+    Rows,
+    SessionRow,
+    SubscriptionRow,
+    Table,
+)
 
 log = logging.getLogger("appliance.store")
 
 _T = TypeVar("_T")
+_RowT = TypeVar("_RowT")
 
-#: A key beyond this was not given out by us, who could not count so far.
+#: Keys are given out from 1 on and never reach this one: a larger key is damage.
 LARGEST_KEY = 1 << 53
 
-#: Seconds since 1970 that are beyond every date that was stored; nor is it infinity, or no number.
+#: Seconds since 1970, later than every time that is stored: a larger number is damage.
 LATEST = 1e12
-
-
-# --- to rows: `offset` is what the store's time is ahead of the broker's, in seconds --------------
-
-
-def message_row(
-    key: int, message: Message, offset: float, now: float, expiry: int | None = None
-) -> Row:
-    """The row of a message that is stored at `now`, by the store's time.
-
-    `expiry` is that of a will, in seconds from its being published.
-    """
-    properties = message.properties_wire
-    if expiry is not None:
-        own = properties[decode_varint(properties, 0)[1] :]
-        own += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: expiry})
-        properties = encode_varint(len(own)) + own
-    return (
-        key,
-        message.topic,
-        message.payload,
-        message.qos,
-        int(message.retain),
-        properties if properties != NO_PROPERTIES else None,
-        None,
-        None if message.expires_at is None else message.expires_at + offset,
-        now,
-    )
-
-
-def session_row(key: int, session: Session, will: int | None, offset: float) -> Row:
-    """The row of a session; `will` is the key of its message."""
-    identity = session.identity
-    assert identity is not None
-    return (
-        key,
-        session.client_id,
-        identity.username,
-        session.expiry,
-        None if session.ends_at is None else session.ends_at + offset,
-        will,
-        session.will.delay if session.will is not None else 0,
-        None if session.will_at is None else session.will_at + offset,
-    )
-
-
-def subscription_row(key: int, session: int, subscription: Subscription, *, replaying: bool) -> Row:
-    """The row of a subscription, `replaying` while its retained messages are being sent."""
-    return (
-        key,
-        session,
-        subscription.filter,
-        int(subscription.qos),
-        int(subscription.no_local),
-        int(subscription.retain_as_published),
-        int(subscription.retain_handling),
-        subscription.identifier,
-        int(replaying),
-    )
-
-
-def owed_row(
-    key: int,
-    session: int,
-    message: int | None,
-    delivery: Delivery,
-    packet_id: int | None,
-    sent: int | None,
-) -> Row:
-    """The row of what is owed to a session; `sent` grows in the order of sending."""
-    _, qos, retain, subscription_ids, share = delivery
-    return (
-        key,
-        session,
-        message,
-        qos,
-        int(retain),
-        json.dumps(subscription_ids) if subscription_ids else None,
-        share.filter if share is not None else None,
-        packet_id,
-        sent,
-    )
-
-
-def retained_row(key: int, message: int, owner: Account) -> Row:
-    """The row of a retained message in the owner's account."""
-    return key, message, owner.username, int(owner.is_inside)
-
-
-def received_row(
-    key: int, session: int, packet_id: int, message: int, held: UnreleasedPublish, full: list[int]
-) -> Row:
-    """The row of a QoS 2 message that waits for PUBREL; `full` are the sessions without room."""
-    no_room = None
-    if held.full:
-        shares = [receiver.filter for receiver in held.full if isinstance(receiver, Share)]
-        no_room = json.dumps([full, shares])
-    return key, session, packet_id, message, no_room
-
-
-# --- and back ------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
 class LoadedSession:
-    """A session, and the keys of its rows, in the same order as what they stand for."""
+    """A session, and the keys of its rows in the same order as what they stand for."""
 
     key: int
-    kept: SavedSession
+    saved: SavedSession
     filters: dict[str, int] = field(default_factory=dict)
     inflight: list[int] = field(default_factory=list)
     queue: list[int] = field(default_factory=list)
     received: dict[int, int] = field(default_factory=dict)
 
 
-class Owned(NamedTuple):
-    """A retained message and whose client has published it: a user's, or the appliance itself."""
+class OwnedMessage(NamedTuple):
+    """A retained message and whose client published it: a user's, or the appliance itself."""
 
     message: Message
     username: str | None
@@ -165,13 +73,13 @@ class Owned(NamedTuple):
 
 @dataclass(slots=True)
 class Loaded:
-    """All that was kept; `useless` are rows that nothing refers to, or that mean nothing."""
+    """All that the rows stand for; `useless` are rows to delete."""
 
     sessions: dict[int, LoadedSession] = field(default_factory=dict)
     messages: dict[int, Message] = field(default_factory=dict)
-    #: By the key of a message that was stored as a will: the seconds that it is good for.
+    #: The message expiry intervals of wills, by the keys of their messages.
     expiries: dict[int, int] = field(default_factory=dict)
-    retained: dict[int, Owned] = field(default_factory=dict)
+    retained: dict[int, OwnedMessage] = field(default_factory=dict)
     useless: list[tuple[Table, int]] = field(default_factory=list)
     last_key: int = 0
 
@@ -181,19 +89,19 @@ class _WrongRowError(Exception):
 
 
 def load(rows: Rows, offset: float) -> Loaded:
-    """What the rows stand for; those that are wrong are left out, and counted in the log."""
+    """What the rows stand for, with times of the broker's clock; `offset` is as in `rows`."""
     loaded = Loaded()
-    keys = [key for table in rows for key in table if key < LARGEST_KEY]
-    orders = [row[8] for row in rows[Table.OWED].values() if isinstance(row[8], int)]
-    loaded.last_key = max(0, *keys, *(order for order in orders if order < LARGEST_KEY), 0)
+    keys = [key for table in Table for key in rows.of(table)]
+    orders = [row.sent for row in rows.owed.values() if isinstance(row.sent, int)]
+    loaded.last_key = max((key for key in (*keys, *orders) if 0 < key < LARGEST_KEY), default=0)
     wrong = 0
 
-    def each(table: Table, take: Callable[[Row], None]) -> None:
+    def each(table: Table, found: dict[int, _RowT], take: Callable[[_RowT], None]) -> None:
         nonlocal wrong
-        for key in sorted(rows[table]):
+        for key in sorted(found):
             try:
                 _within(key, 1, LARGEST_KEY)
-                take(rows[table][key])
+                take(found[key])
             except (
                 _WrongRowError,
                 TypeError,
@@ -206,46 +114,45 @@ def load(rows: Rows, offset: float) -> Loaded:
                 wrong += 1
                 loaded.useless.append((table, key))
 
-    def take_message(row: Row) -> None:
-        key = cast(int, row[0])
-        loaded.messages[key], expiry = _message(row, offset)
+    def take_message(row: MessageRow) -> None:
+        loaded.messages[row.id], expiry = _message(row, offset)
         if expiry is not None:
-            loaded.expiries[key] = expiry
+            loaded.expiries[row.id] = expiry
 
-    def take_session(row: Row) -> None:
-        session = _session(row, offset, loaded)
-        loaded.sessions[session.key] = session
+    def take_session(row: SessionRow) -> None:
+        loaded.sessions[row.id] = _session(row, offset, loaded)
 
-    each(Table.MESSAGE, take_message)
-    each(Table.SESSION, take_session)
-    _drop_doubles(loaded)
-    each(Table.SUBSCRIPTION, lambda row: _take_subscription(row, loaded))
-    each(Table.OWED, lambda row: _take_owed(row, loaded))
-    _put_in_order(loaded, rows)
-    each(Table.RECEIVED, lambda row: _take_received(row, loaded))
-    each(Table.RETAINED, lambda row: _take_retained(row, loaded))
+    each(Table.MESSAGE, rows.message, take_message)
+    each(Table.SESSION, rows.session, take_session)
+    _drop_duplicates(loaded)
+    each(Table.SUBSCRIPTION, rows.subscription, lambda row: _take_subscription(row, loaded))
+    each(Table.OWED, rows.owed, lambda row: _take_owed(row, loaded))
+    _sort_inflight(loaded, rows)
+    each(Table.RECEIVED, rows.received, lambda row: _take_received(row, loaded))
+    each(Table.RETAINED, rows.retained, lambda row: _take_retained(row, loaded))
     if wrong:
         log.warning("%d rows of the store mean nothing, and were left out", wrong)
     return loaded
 
 
-def _drop_doubles(loaded: Loaded) -> None:
+def _drop_duplicates(loaded: Loaded) -> None:
+    """Keep the newest of several sessions with one client id."""
     newest: dict[str, int] = {}
     for key, session in list(loaded.sessions.items()):
-        client_id = session.kept.identity.client_id
+        client_id = session.saved.identity.client_id
         if client_id in newest:
             del loaded.sessions[newest[client_id]]
             loaded.useless.append((Table.SESSION, newest[client_id]))
         newest[client_id] = key
 
 
-def _put_in_order(loaded: Loaded, rows: Rows) -> None:
-    """What is in flight, in the order in which it was sent."""
+def _sort_inflight(loaded: Loaded, rows: Rows) -> None:
+    """Sort what is inflight in the order of sending."""
     for session in loaded.sessions.values():
-        flying = zip(session.inflight, session.kept.inflight.items(), strict=True)
-        ordered = sorted(flying, key=lambda each: cast(int, rows[Table.OWED][each[0]][8]))
+        inflight = zip(session.inflight, session.saved.inflight.items(), strict=True)
+        ordered = sorted(inflight, key=lambda each: cast(int, rows.owed[each[0]].sent))
         session.inflight = [key for key, _ in ordered]
-        session.kept.inflight = dict(item for _, item in ordered)
+        session.saved.inflight = dict(item for _, item in ordered)
 
 
 def _of(kind: type[_T], value: object) -> _T:
@@ -270,26 +177,26 @@ def _time(value: object, offset: float) -> float | None:
     return moment - offset
 
 
-def _message(row: Row, offset: float) -> tuple[Message, int | None]:
-    """The message, and the seconds that it is good for if it is a will."""
-    _, topic, payload, qos, retain, properties, passed_on, expires_at, stored_at = row
-    check_topic(_of(str, topic))
+def _message(row: MessageRow, offset: float) -> tuple[Message, int | None]:
+    """The message, and its message expiry interval if it was stored as a will."""
+    topic = _of(str, row.topic)
+    check_topic(topic)
     wire, expiry = NO_PROPERTIES, None
-    if properties is not None:
-        checked = _properties(_of(bytes, properties))
+    if row.properties is not None:
+        checked = _properties(_of(bytes, row.properties))
         wire = checked.passed_on
         expiry = cast("int | None", checked.values.get(Property.MESSAGE_EXPIRY_INTERVAL))
-    if passed_on is not None:  # an older appliance kept their order here
-        wire = encode_varint(len(_of(bytes, passed_on))) + _of(bytes, passed_on)
-        wire = _properties(wire).passed_on
-    _of(float, stored_at)
+    if row.passed_on is not None:  # an older appliance stored the publisher's order here
+        passed_on = _of(bytes, row.passed_on)
+        wire = _properties(encode_varint(len(passed_on)) + passed_on).passed_on
+    _of(float, row.stored_at)
     message = Message(
-        _of(str, topic),
-        _of(bytes, payload),
-        _within(qos, 0, 2),
-        _within(retain, 0, 1) == 1,
+        topic,
+        _of(bytes, row.payload),
+        _within(row.qos, 0, 2),
+        _within(row.retain, 0, 1) == 1,
         None,
-        _time(expires_at, offset),
+        _time(row.expires_at, offset),
         properties_wire=wire,
     )
     return message, expiry
@@ -298,99 +205,95 @@ def _message(row: Row, offset: float) -> tuple[Message, int | None]:
 def _properties(wire: bytes) -> CheckedProperties:
     checked, end = check_properties(wire, 0, len(wire), PacketType.PUBLISH, MAXIMUM_PAIRS)
     if end != len(wire):
-        raise _WrongRowError("properties with something behind them")
+        raise _WrongRowError("bytes after the properties")
     return checked or CheckedProperties({}, NO_PROPERTIES, 0)
 
 
-def _session(row: Row, offset: float, loaded: Loaded) -> LoadedSession:
-    key, client_id, username, expiry, ends_at, will, will_delay, will_at = row
-    pending = None
-    if will is not None:
-        message = loaded.messages[_of(int, will)]
-        delay = _within(will_delay, 0, 0xFFFF_FFFF)
-        pending = PendingWill(message, delay, loaded.expiries.get(_of(int, will)))
-    identity = Identity(None if username is None else _of(str, username), _of(str, client_id))
-    kept = SavedSession(
-        identity,
-        _within(expiry, 0, 0xFFFF_FFFF),
-        _time(ends_at, offset),
-        pending,
-        _time(will_at, offset),
+def _session(row: SessionRow, offset: float, loaded: Loaded) -> LoadedSession:
+    will = None
+    if row.will is not None:
+        key = _of(int, row.will)
+        delay = _within(row.will_delay, 0, 0xFFFF_FFFF)
+        will = PendingWill(loaded.messages[key], delay, loaded.expiries.get(key))
+    username = None if row.username is None else _of(str, row.username)
+    saved = SavedSession(
+        Identity(username, _of(str, row.client_id)),
+        _within(row.expiry, 0, 0xFFFF_FFFF),
+        _time(row.ends_at, offset),
+        will,
+        _time(row.will_at, offset),
     )
-    return LoadedSession(_of(int, key), kept)
+    return LoadedSession(row.id, saved)
 
 
-def _take_subscription(row: Row, loaded: Loaded) -> None:
-    key, owner, topic_filter, qos, no_local, as_published, handling, identifier, *replaying = row
-    session = loaded.sessions[_of(int, owner)]
-    check_filter(_of(str, topic_filter))
-    parse_shared(_of(str, topic_filter))
+def _take_subscription(row: SubscriptionRow, loaded: Loaded) -> None:
+    session = loaded.sessions[_of(int, row.session)]
+    topic_filter = _of(str, row.filter)
+    check_filter(topic_filter)
+    parse_shared(topic_filter)
     subscription = Subscription(
-        _of(str, topic_filter),
-        _within(qos, 0, 2),
-        _within(no_local, 0, 1) == 1,
-        _within(as_published, 0, 1) == 1,
-        _within(handling, 0, 2),
-        _within(identifier, 0, 268_435_455),
+        topic_filter,
+        _within(row.qos, 0, 2),
+        _within(row.no_local, 0, 1) == 1,
+        _within(row.retain_as_published, 0, 1) == 1,
+        _within(row.retain_handling, 0, 2),
+        _within(row.identifier, 0, 268_435_455),
     )
-    if subscription.filter in session.filters:
+    if topic_filter in session.filters:
         raise _WrongRowError("a second subscription with one filter")
-    session.filters[subscription.filter] = _of(int, key)
-    session.kept.subscriptions.append(subscription)
-    if replaying and _within(replaying[0], 0, 1):
-        session.kept.replaying.append(subscription)
+    session.filters[topic_filter] = row.id
+    session.saved.subscriptions.append(subscription)
+    if _within(row.replaying, 0, 1):
+        session.saved.replaying.append(subscription)
 
 
-def _take_owed(row: Row, loaded: Loaded) -> None:
-    key, owner, message, qos, retain, subscription_ids, share, packet_id, sent = row
-    session = loaded.sessions[_of(int, owner)]
-    kept = session.kept
-    if packet_id is not None and _within(packet_id, 1, 0xFFFF) in kept.inflight:
-        raise _WrongRowError("a second message with one packet id")
+def _take_owed(row: OwedRow, loaded: Loaded) -> None:
+    session = loaded.sessions[_of(int, row.session)]
+    saved = session.saved
+    packet_id = None if row.packet_id is None else _within(row.packet_id, 1, 0xFFFF)
     if packet_id is not None:
-        _within(sent, 1, LARGEST_KEY)
-    if message is None:
-        kept.inflight[_within(packet_id, 1, 0xFFFF)] = None
-        session.inflight.append(_of(int, key))
+        if packet_id in saved.inflight:
+            raise _WrongRowError("a second message with one packet id")
+        _within(row.sent, 1, LARGEST_KEY)
+    if row.message is None:
+        saved.inflight[_within(packet_id, 1, 0xFFFF)] = None
+        session.inflight.append(row.id)
         return
-    ids = None if subscription_ids is None else json.loads(_of(str, subscription_ids))
+    ids = None if row.subscription_ids is None else json.loads(_of(str, row.subscription_ids))
     if ids is not None:
         ids = [_within(number, 1, 268_435_455) for number in _of(list, ids)]
-    owed = PendingDelivery(
-        loaded.messages[_of(int, message)],
-        _within(qos, 1, 2),
-        _within(retain, 0, 1) == 1,
+    pending = PendingDelivery(
+        loaded.messages[_of(int, row.message)],
+        _within(row.qos, 1, 2),
+        _within(row.retain, 0, 1) == 1,
         ids,
-        None if share is None else _of(str, share),
+        None if row.share is None else _of(str, row.share),
     )
     if packet_id is None:
-        kept.queue.append(owed)
-        session.queue.append(_of(int, key))
+        saved.queue.append(pending)
+        session.queue.append(row.id)
     else:
-        kept.inflight[_of(int, packet_id)] = owed
-        session.inflight.append(_of(int, key))
+        saved.inflight[packet_id] = pending
+        session.inflight.append(row.id)
 
 
-def _take_received(row: Row, loaded: Loaded) -> None:
-    key, owner, packet_id, message, no_room = row
-    session = loaded.sessions[_of(int, owner)]
-    number = _within(packet_id, 1, 0xFFFF)
-    if number in session.received:
+def _take_received(row: ReceivedRow, loaded: Loaded) -> None:
+    session = loaded.sessions[_of(int, row.session)]
+    packet_id = _within(row.packet_id, 1, 0xFFFF)
+    if packet_id in session.received:
         raise _WrongRowError("a second message with one packet id")
-    sessions, shares = json.loads(_of(str, no_room)) if no_room is not None else ([], [])
+    no_room = json.loads(_of(str, row.no_room)) if row.no_room is not None else ([], [])
+    sessions, shares = no_room
     full = [loaded.sessions[key] for key in _of(list, sessions) if key in loaded.sessions]
-    names = [each.kept.identity.client_id for each in full]
+    names = [each.saved.identity.client_id for each in full]
     filters = [_of(str, name) for name in _of(list, shares)]
-    session.kept.received[number] = (loaded.messages[_of(int, message)], names, filters)
-    session.received[number] = _of(int, key)
+    session.saved.received[packet_id] = (loaded.messages[_of(int, row.message)], names, filters)
+    session.received[packet_id] = row.id
 
 
-def _take_retained(row: Row, loaded: Loaded) -> None:
-    key, number, *owner = row
-    message = loaded.messages[_of(int, number)]
-    username, is_inside = owner or (None, 0)  # an older appliance has not kept whose it is
-    loaded.retained[_of(int, key)] = Owned(
-        message,
-        None if username is None else _of(str, username),
-        _within(is_inside, 0, 1) == 1,
+def _take_retained(row: RetainedRow, loaded: Loaded) -> None:
+    loaded.retained[row.id] = OwnedMessage(
+        loaded.messages[_of(int, row.message)],
+        None if row.username is None else _of(str, row.username),
+        _within(row.inside, 0, 1) == 1,
     )

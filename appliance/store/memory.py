@@ -1,65 +1,73 @@
-"""The store that keeps nothing."""
+"""The store for `broker.store.durability: off`: sessions and messages end with the process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from appliance.broker.accounts import Account
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.mqtt.packets import Subscription
+from appliance.store.state import StoreState
 
 
-class MemoryStore:
-    """The `Store` that keeps nothing beyond the broker's own memory, so that nothing is staged."""
+class MemoryStore(StoreState):
+    """A `SessionStore` that stores nothing: the broker has all in memory, and nothing is staged."""
+
+    path = None
+    failing = False
 
     def __init__(self) -> None:
-        self.staged = False
-        self.fresh = False
-        self.batch = 1
-        self.committed = 0
-        self.bytes = 0
-        #: The broker's own limits are all there are.
-        self.size = 1 << 62
+        super().__init__(size=1 << 62)  # only the broker's own limits apply
+
+    def open(self) -> None:
+        """See `SessionStore`; there is nothing to read."""
+
+    def restore(self, broker: Broker) -> None:
+        """See `SessionStore`; nothing was stored."""
+
+    async def close(self) -> None:
+        """See `SessionStore`; there is nothing to release."""
 
     def listen(self, callback: Callable[[bool], None]) -> None:
-        """There is nothing to tell."""
+        """See `Store`; no batch is ever committed."""
 
     def hurry(self) -> None:
-        """Nothing is staged."""
+        """See `Store`."""
 
     def session_saved(self, session: Session) -> None:
-        """The broker has it."""
+        """See `Store`."""
 
     def session_removed(self, session: Session) -> None:
-        """The broker has forgotten it."""
+        """See `Store`."""
 
     def subscribed(self, session: Session, subscription: Subscription) -> None:
-        """The session has it."""
+        """See `Store`."""
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
-        """The session has forgotten it."""
+        """See `Store`."""
 
     def retained(self, message: Message, owner: Account) -> None:
-        """The broker has it."""
+        """See `Store`."""
 
     def queued(self, session: Session, delivery: Delivery) -> None:
-        """The session has it."""
+        """See `Store`."""
 
     def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
-        """The session knows."""
+        """See `Store`."""
 
     def settled(self, session: Session, delivery: Delivery) -> None:
-        """The session has forgotten it."""
+        """See `Store`."""
 
     def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
-        """The session knows."""
+        """See `Store`."""
 
     def completed(self, session: Session, packet_id: int) -> None:
-        """The session has forgotten it."""
+        """See `Store`."""
 
     def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
-        """The session has it."""
+        """See `Store`."""
 
     def unheld(self, session: Session, packet_id: int) -> None:
-        """The session has forgotten it."""
+        """See `Store`."""

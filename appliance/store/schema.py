@@ -1,8 +1,8 @@
-"""The database: its tables, its versions, and how it is opened.
+"""The database's schema: tables, versions and migrations, and how the database is opened.
 
-Every table has an integer key that is given out once and never again; rows refer to each other by
-it. There are no indices and no foreign keys: all is read at the start, and then found in memory.
-Times are seconds of the store's own clock, see `clock`.
+Every table has an integer key that is given out once and never again, by which rows refer to each
+other. There are no indices and no foreign keys, because all rows are read at the start and are then
+found in memory. Times are seconds of the store's own clock, see `clock`.
 """
 
 from __future__ import annotations
@@ -10,15 +10,13 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from enum import IntEnum
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-Durability: TypeAlias = Literal["power", "process", "off"]
+from appliance.store.rows import COLUMNS, ROW_TYPES, Row, Table
 
-Value: TypeAlias = "int | float | str | bytes | None"
-#: The row's key comes first.
-Row: TypeAlias = "tuple[Value, ...]"
+Durability: TypeAlias = Literal["power", "process", "off"]
 
 
 class StoreError(Exception):
@@ -26,44 +24,10 @@ class StoreError(Exception):
 
 
 class DamagedError(Exception):
-    """The database is not what was written to it."""
+    """The database does not contain what was written to it."""
 
 
-class Table(IntEnum):
-    """The tables, in the order in which they are written."""
-
-    MESSAGE = 0
-    SESSION = 1
-    SUBSCRIPTION = 2
-    OWED = 3
-    RECEIVED = 4
-    RETAINED = 5
-    CLOCK = 6
-
-
-COLUMNS: dict[Table, tuple[str, ...]] = {
-    Table.MESSAGE: (
-        *("id", "topic", "payload", "qos", "retain", "properties", "passed_on"),
-        *("expires_at", "stored_at"),
-    ),
-    Table.SESSION: (
-        *("id", "client_id", "username", "expiry", "ends_at"),
-        *("will", "will_delay", "will_at"),
-    ),
-    Table.SUBSCRIPTION: (
-        *("id", "session", "filter", "qos", "no_local", "retain_as_published"),
-        *("retain_handling", "identifier", "replaying"),
-    ),
-    Table.OWED: (
-        *("id", "session", "message", "qos", "retain", "subscription_ids", "share"),
-        *("packet_id", "sent"),
-    ),
-    Table.RECEIVED: ("id", "session", "packet_id", "message", "no_room"),
-    Table.RETAINED: ("id", "message", "username", "inside"),
-    Table.CLOCK: ("id", "time", "wall", "counted", "boot"),
-}
-
-#: What makes each version out of the one before; a database of an older version gets the rest.
+#: The script that makes each version out of the one before it.
 MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE about (version INTEGER NOT NULL);
@@ -143,11 +107,12 @@ MIGRATIONS: tuple[str, ...] = (
     """,
 )
 
-#: Bytes of the database file, "MQTA": so that another program's database is not taken for ours.
+#: "MQTA" in the header of the database file, so that another program's database is not taken for
+#: ours.
 APPLICATION_ID = 0x4D515441
 
-#: Pages of the write-ahead log after which it is moved into the database: 4 MB. It is then written
-#: from its beginning again, which is faster than to let it grow.
+#: Pages of the write-ahead log after which SQLite moves it into the database: 4 MB. The log is then
+#: overwritten from its beginning, which is faster than to let it grow.
 CHECKPOINT_PAGES = 1000
 
 #: Seconds to wait for another program that has the database locked, such as a backup.
@@ -157,16 +122,16 @@ _SYNCHRONOUS = {"power": "FULL", "process": "NORMAL"}
 
 
 def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
-    """Open the database, making it when there is none; only its user may read it.
+    """Open the database, or create it, so that only its user may read it.
 
-    That of an older appliance is in a transaction then, see `_migrate`.
+    The database of an older appliance is then within a transaction, see `_migrate`.
 
     Raises:
         sqlite3.Error, OSError: it cannot be opened.
         DamagedError: it is a database, but not ours.
         StoreError: a newer appliance made it.
     """
-    # SQLite would make it, and what lies beside it, as open as the umask has it.
+    # SQLite would give the file, and those beside it, whatever mode the umask leaves.
     os.close(os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600))
     connection = sqlite3.connect(
         path,
@@ -189,17 +154,19 @@ def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
     """Open the database to read it, while the appliance may be running. Raises sqlite3.Error."""
-    # SQLite would make the files beside it that a database in use has, and leave them there.
+    # Without `immutable` SQLite would create the log and its index beside a database that is not in
+    # use, and leave them there.
     in_use = path.with_name(f"{path.name}-wal").exists()
     mode = "mode=ro" if in_use else "mode=ro&immutable=1"
     return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, timeout=BUSY_TIMEOUT)
 
 
 def _migrate(connection: sqlite3.Connection, path: Path) -> None:
-    """Bring the tables up to date, in a transaction that the first write goes on with and commits.
+    """Bring the tables up to date in a transaction that the first batch commits.
 
-    So a start that fails leaves the database to the older appliance that takes over again. A new
-    one has its tables at once: it may be looked at before anything is written.
+    So a start that fails leaves the database to the older appliance that replaces this one again.
+    The tables of a new database are committed at once, so that it can be read before anything is
+    written.
     """
     found = version(connection)
     if found > len(MIGRATIONS):
@@ -227,22 +194,22 @@ def version(connection: sqlite3.Connection) -> int:
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
     if not tables and not number and not owner:
         return 0
-    # It is written down twice: a bit that flipped in one is not a newer version.
-    told = connection.execute("SELECT version FROM about").fetchall() if "about" in tables else []
-    if told != [(number,)] or owner != APPLICATION_ID:
+    # The version is stored twice, so that a flipped bit is not taken for a newer version.
+    about = connection.execute("SELECT version FROM about").fetchall() if "about" in tables else []
+    if about != [(number,)] or owner != APPLICATION_ID:
         raise DamagedError("its version is not readable")
     return int(number)
 
 
 def roll_back(connection: sqlite3.Connection) -> None:
-    """Undo what was begun, if anything was."""
+    """End the transaction, if there is one, without its changes."""
     with contextlib.suppress(sqlite3.Error):
         if connection.in_transaction:
             connection.execute("ROLLBACK")
 
 
 def insert(table: Table, count: int) -> str:
-    """The statement that writes so many rows at once, in the place of those with the same keys."""
+    """The statement that writes `count` rows, replacing those with the same keys."""
     columns = COLUMNS[table]
     row = f"({','.join('?' * len(columns))})"
     return (
@@ -252,12 +219,28 @@ def insert(table: Table, count: int) -> str:
 
 
 def delete(table: Table, count: int) -> str:
-    """The statement that deletes so many rows at once, by their keys."""
+    """The statement that deletes `count` rows by their keys."""
     return f"DELETE FROM {table.name.lower()} WHERE id IN ({','.join('?' * count)})"
 
 
-def select(table: Table, connection: sqlite3.Connection) -> str:
-    """The statement that reads a whole table; what an older appliance made has fewer columns."""
+def read_table(
+    connection: sqlite3.Connection, table: Table, order: str = ""
+) -> Iterator[tuple[int, Row]]:
+    """All rows of a table, as named tuples, with their keys; `order` is ASC or DESC, by key.
+
+    Raises:
+        sqlite3.Error, UnicodeError, OverflowError: it cannot be read.
+        DamagedError: a column is missing that every version of the table has.
+    """
     name = table.name.lower()
-    there = {column for _, column, *_ in connection.execute(f"PRAGMA table_info({name})")}
-    return f"SELECT {','.join(filter(there.__contains__, COLUMNS[table]))} FROM {name}"
+    present = {column for _, column, *_ in connection.execute(f"PRAGMA table_info({name})")}
+    # Tables of an older appliance have fewer columns; the named tuple has defaults for these.
+    columns = ",".join(filter(present.__contains__, COLUMNS[table]))
+    make = ROW_TYPES[table]
+    try:
+        for row in connection.execute(
+            f"SELECT {columns} FROM {name}" + (f" ORDER BY id {order}" if order else "")
+        ):
+            yield row[0], make(*row)
+    except TypeError:
+        raise DamagedError(f"the table {name} has lost columns") from None

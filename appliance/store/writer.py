@@ -1,49 +1,56 @@
-"""Batches of changes, and the one thread that writes them."""
+"""Batches of changes, and the thread that writes them to the database."""
 
 from __future__ import annotations
 
 import queue
 import sqlite3
 import threading
-import time
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
-from appliance.store.schema import (
-    Durability,
-    Row,
-    Table,
-    connect,
-    delete,
-    insert,
-    roll_back,
-)
+from appliance.store.rows import Row, Table
+from appliance.store.schema import Durability, connect, delete, insert, roll_back
 
-#: Rows that one statement writes: the fewer statements the quicker, and each lets go of Python's
-#: lock and takes it again, for which it may wait as long as the event loop is busy.
+#: Numbers of rows that one statement writes. Fewer statements are faster: each releases Python's
+#: global lock, and may wait to acquire it again for as long as the event loop is busy.
 _CHUNKS = (64, 32, 16, 8, 4, 2, 1)
 
 _Item = TypeVar("_Item")
 
 
 class Batch:
-    """Changes that are committed together: rows as they shall be, and keys of those to be deleted.
+    """Changes that are committed together: rows to write, and keys of rows to delete.
 
-    A row that is made and deleted inside one batch leaves no trace. `first_id` is the first key
-    that is given out in the batch: rows from there on are in no database yet.
+    A row that is written and deleted within one batch leaves no trace. `first_id` is the first key
+    that was given out for the batch: rows from there on are in no database yet.
     """
 
-    __slots__ = ("deleted", "first_id", "messages", "number", "rows")
+    __slots__ = (
+        "deleted",
+        "first_id",
+        "has_dependents",
+        "is_awaited",
+        "is_changed",
+        "messages",
+        "number",
+        "rows",
+    )
 
     def __init__(self, number: int, first_id: int) -> None:
         self.number = number
         self.first_id = first_id
         self.rows: list[dict[int, Row]] = [{} for _ in Table]
         self.deleted: list[dict[int, None]] = [{} for _ in Table]
-        #: Messages that were staged, those among them that are gone again included.
+        #: Messages that were staged, including those that were deleted again.
         self.messages = 0
+        #: Something was staged, beside what the start itself has changed.
+        self.is_changed = False
+        #: Packets may depend on it: they are sent when it is committed.
+        self.has_dependents = False
+        #: Somebody waits for its commit.
+        self.is_awaited = False
 
     def __bool__(self) -> bool:
         return any(self.rows) or any(self.deleted)
@@ -52,7 +59,7 @@ class Batch:
         return sum(map(len, self.rows)) + sum(map(len, self.deleted))
 
     def put(self, table: Table, key: int, row: Row) -> None:
-        """Make the row, or change it."""
+        """Create the row, or replace it."""
         self.rows[table][key] = row
 
     def remove(self, table: Table, key: int) -> None:
@@ -62,7 +69,7 @@ class Batch:
             self.deleted[table][key] = None
 
     def absorb(self, newer: Batch) -> None:
-        """Take in a later batch, as this one could not be written before it."""
+        """Take over the changes of a later batch, because this one could not be written first."""
         for table in Table:
             for key in newer.deleted[table]:
                 self.remove(table, key)
@@ -71,46 +78,45 @@ class Batch:
         self.messages += newer.messages
 
 
-#: Told on the writer's thread of each batch: the error, if any, and the seconds that it took.
-Done: TypeAlias = "Callable[[Batch, Exception | None, float], None]"
+#: Called on the writer's thread after each batch, with the error, if any.
+Written: TypeAlias = "Callable[[Batch, Exception | None], None]"
 
 
 class Writer:
     """Writes one batch after the other, each in one transaction, on a thread of its own."""
 
-    def __init__(self, path: Path, durability: Durability, done: Done) -> None:
+    def __init__(self, path: Path, durability: Durability, written: Written) -> None:
         self._path = path
         self._durability = durability
-        self._done = done
+        self._written = written
         self._batches: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self._connection: sqlite3.Connection | None = None
 
     def start(self, connection: sqlite3.Connection | None) -> None:
-        """Begin, with the connection that the database was read with, if it could be opened."""
+        """Start the thread, with the connection that has read the database, if there is one."""
         self._connection = connection
         self._thread.start()
 
     def write(self, batch: Batch) -> None:
-        """Write the batch as soon as those before it are done with."""
+        """Write the batch after those before it."""
         self._batches.put(batch)
 
     def stop(self) -> None:
-        """Write what was handed over, and end; returns when that is done."""
+        """End the thread after the batches that it was given; blocks until then."""
         self._batches.put(None)
         self._thread.join()
 
     def _run(self) -> None:
         while (batch := self._batches.get()) is not None:
-            began = time.perf_counter()
             error: Exception | None = None
             try:
                 self._write(batch)
-            except Exception as problem:  # whatever it is, the thread has to go on
+            except Exception as problem:  # whatever it is, the thread has to continue
                 error = problem
-                # What is wrong may be the file that was opened: the next attempt opens it anew.
+                # The open file may be the reason, so the next attempt opens it again.
                 self._close()
-            self._done(batch, error, time.perf_counter() - began)
+            self._written(batch, error)
         self._close()
 
     def _write(self, batch: Batch) -> None:
@@ -126,8 +132,8 @@ class Writer:
 
 
 def write(connection: sqlite3.Connection, batch: Batch) -> None:
-    """Write a batch in one transaction. Raises sqlite3.Error, with the transaction not ended."""
-    if not connection.in_transaction:  # as it is when the tables are an older appliance's
+    """Write a batch in one transaction. Raises sqlite3.Error, with the transaction still open."""
+    if not connection.in_transaction:  # the migration of an older appliance's tables began one
         connection.execute("BEGIN IMMEDIATE")
     for table in Table:
         for keys in _chunks(list(batch.deleted[table])):
@@ -138,7 +144,7 @@ def write(connection: sqlite3.Connection, batch: Batch) -> None:
 
 
 def _chunks(items: list[_Item]) -> Iterator[list[_Item]]:
-    """In portions of few sizes, so that there are few different statements."""
+    """Chunks of few different sizes, so that there are few different statements."""
     start = 0
     for size in _CHUNKS:
         while len(items) - start >= size:

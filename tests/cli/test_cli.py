@@ -158,7 +158,7 @@ def test_check_reads_the_store_and_leaves_nothing_beside_it(
     here: Path, output: pytest.CaptureFixture[str]
 ) -> None:
     path = here / "state/store.db"
-    database.make_directory(path)
+    path.parent.mkdir()
     contents = database.read(path, "power")
     assert contents.connection is not None
     contents.connection.close()

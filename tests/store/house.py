@@ -54,8 +54,8 @@ class House:
         """All that was staged is committed."""
         store = self.store
         deadline = time.monotonic() + PATIENCE
-        while not store._failing and (store._writing or store._open):
-            assert time.monotonic() < deadline, f"not written in {PATIENCE:g} s: {store._open}"
+        while not store._committer.is_idle:
+            assert time.monotonic() < deadline, f"not written in {PATIENCE:g} s"
             store.hurry()
             await asyncio.sleep(0.002)
 

@@ -144,7 +144,7 @@ async def test_what_nobody_waits_for_is_written_at_the_stop(house: House, tmp_pa
     peer.send(Publish("late", b"kept", 0, True))
     before = state(twin.broker)
     assert "late" in before["retained"]
-    assert not twin.store.commits and not twin.store._writing
+    assert not twin.store.metrics.commits and not twin.store._committer._is_writing
     await twin.stop()
     again = twin.twin(tmp_path / "again")
     assert not difference(before, state(again.broker))
@@ -270,7 +270,7 @@ async def test_what_is_too_old_is_dropped(tmp_path: Path) -> None:
     twin.store._drop_old()
     queue = twin.broker.sessions["client"].queue
     assert len(queue) == 2
-    twin.store._offset += 1000
+    twin.store._clock.offset += 1000
     twin.store._drop_old()
     queue = twin.broker.sessions["client"].queue
     assert [delivery[0].payload for delivery in queue] == [b"new"]

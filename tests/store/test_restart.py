@@ -354,7 +354,7 @@ async def test_a_store_of_before_there_was_a_clock_in_it(tmp_path: Path) -> None
 
 async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:
     await house.written()
-    commits = house.store.commits
+    commits = house.store.metrics.commits
     client = await house.join("client")
     client.send(Subscribe(1, [Subscription("#", 2)]))
     client.received()
@@ -364,7 +364,8 @@ async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:
     publisher.publish("a", qos=2)
     publisher.publish("$SYS/x", qos=0, retain=True)
     assert len(client.drain()) == 2
-    assert not house.store._open and house.store.commits == commits and not house.store.staged
+    assert not house.store._committer.open and not house.store.staged
+    assert house.store.metrics.commits == commits
 
 
 async def test_nothing_passes_what_waits_for_a_batch_in_which_there_is_nothing(

@@ -1,0 +1,38 @@
+"""What a store must do: what the broker calls, and a life from `open` to `close`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from appliance.broker.broker import Broker
+from appliance.broker.ports import Store
+
+
+class SessionStore(Store, Protocol):
+    """Stores sessions and retained messages; the event loop's thread alone calls it.
+
+    `open` comes first, then a broker is created with the store, and `restore` fills it before
+    clients connect. `close` ends every store that was opened, restored or not.
+    """
+
+    @property
+    def path(self) -> Path | None:
+        """Where sessions and messages are stored; None when they end with the process."""
+
+    @property
+    def failing(self) -> bool:
+        """Whether nothing can be stored now."""
+
+    def open(self) -> None:
+        """Lock and read what the last run has stored.
+
+        Raises:
+            StoreError: it is in use, of a newer version, or cannot be read.
+        """
+
+    def restore(self, broker: Broker) -> None:
+        """Give the broker what was stored, on the event loop."""
+
+    async def close(self) -> None:
+        """Commit what is staged and release everything; may be called twice."""

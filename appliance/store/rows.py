@@ -1,0 +1,258 @@
+"""The rows of the database's tables, and how objects of the broker become rows.
+
+Whatever reads rows reads them by name: a row that was read is a named tuple. Rows that are written
+are plain tuples in the same order, because the data path makes several for each message and a named
+tuple takes several times as long to make.
+
+Times are seconds of the store's own clock, see `clock`. `offset` is how far that is ahead of the
+broker's clock.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import NamedTuple, TypeAlias, cast
+
+from appliance.broker.accounts import Account
+from appliance.broker.message import Message
+from appliance.broker.session import Delivery, Session, UnreleasedPublish
+from appliance.broker.shared import Share
+from appliance.mqtt.codec import (
+    NO_PROPERTIES,
+    Property,
+    decode_varint,
+    encode_property_list,
+    encode_varint,
+)
+from appliance.mqtt.packets import Subscription
+
+#: What SQLite returns for a column. The database may be damaged, so a column may hold any of these.
+Value: TypeAlias = "int | float | str | bytes | None"
+
+#: The columns of a row in the order of its named tuple; its key comes first.
+Row: TypeAlias = "tuple[Value, ...]"
+
+
+class Table(IntEnum):
+    """The tables, by the names that they have in the database, in the order of writing."""
+
+    MESSAGE = 0
+    SESSION = 1
+    SUBSCRIPTION = 2
+    OWED = 3
+    RECEIVED = 4
+    RETAINED = 5
+    CLOCK = 6
+
+
+class MessageRow(NamedTuple):
+    """A message, which any number of the other rows refer to."""
+
+    id: int
+    topic: Value
+    payload: Value
+    qos: Value
+    retain: Value
+    properties: Value
+    passed_on: Value
+    expires_at: Value
+    stored_at: Value
+
+
+class SessionRow(NamedTuple):
+    """A session; `will` is the key of a message."""
+
+    id: int
+    client_id: Value
+    username: Value
+    expiry: Value
+    ends_at: Value
+    will: Value
+    will_delay: Value
+    will_at: Value
+
+
+class SubscriptionRow(NamedTuple):
+    """A subscription of a session."""
+
+    id: int
+    session: Value
+    filter: Value
+    qos: Value
+    no_local: Value
+    retain_as_published: Value
+    retain_handling: Value
+    identifier: Value
+    replaying: Value = 0
+
+
+class OwedRow(NamedTuple):
+    """A QoS 1 or 2 message that a session has not acknowledged, queued or inflight."""
+
+    id: int
+    session: Value
+    message: Value
+    qos: Value
+    retain: Value
+    subscription_ids: Value
+    share: Value
+    packet_id: Value
+    sent: Value
+
+
+class ReceivedRow(NamedTuple):
+    """A QoS 2 message of a session's client that waits for its PUBREL."""
+
+    id: int
+    session: Value
+    packet_id: Value
+    message: Value
+    no_room: Value
+
+
+class RetainedRow(NamedTuple):
+    """The retained message of a topic, and who published it."""
+
+    id: int
+    message: Value
+    username: Value = None
+    inside: Value = 0
+
+
+class ClockRow(NamedTuple):
+    """What the clocks said when the store was last written; the table has this one row."""
+
+    id: int
+    time: Value
+    wall: Value
+    counted: Value
+    boot: Value
+
+
+#: The named tuple of each table. A column that an older version of the tables does not have is at
+#: the end and has a default.
+ROW_TYPES: dict[Table, type[NamedTuple]] = {
+    Table.MESSAGE: MessageRow,
+    Table.SESSION: SessionRow,
+    Table.SUBSCRIPTION: SubscriptionRow,
+    Table.OWED: OwedRow,
+    Table.RECEIVED: ReceivedRow,
+    Table.RETAINED: RetainedRow,
+    Table.CLOCK: ClockRow,
+}
+
+COLUMNS: dict[Table, tuple[str, ...]] = {table: ROW_TYPES[table]._fields for table in Table}
+
+
+@dataclass(slots=True)
+class Rows:
+    """All rows of a database by their keys; the fields are named as the tables."""
+
+    message: dict[int, MessageRow] = field(default_factory=dict)
+    session: dict[int, SessionRow] = field(default_factory=dict)
+    subscription: dict[int, SubscriptionRow] = field(default_factory=dict)
+    owed: dict[int, OwedRow] = field(default_factory=dict)
+    received: dict[int, ReceivedRow] = field(default_factory=dict)
+    retained: dict[int, RetainedRow] = field(default_factory=dict)
+    clock: dict[int, ClockRow] = field(default_factory=dict)
+
+    def of(self, table: Table) -> dict[int, Row]:
+        """The rows of one table."""
+        return cast("dict[int, Row]", getattr(self, table.name.lower()))
+
+
+def message_row(
+    key: int, message: Message, offset: float, now: float, expiry: int | None = None
+) -> Row:
+    """The row of a message that is stored at `now`, by the store's clock.
+
+    `expiry` is the message expiry interval of a will, in seconds from its publication.
+    """
+    properties = message.properties_wire
+    if expiry is not None:
+        own = properties[decode_varint(properties, 0)[1] :]
+        own += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: expiry})
+        properties = encode_varint(len(own)) + own
+    return (
+        key,
+        message.topic,
+        message.payload,
+        message.qos,
+        int(message.retain),
+        properties if properties != NO_PROPERTIES else None,
+        None,
+        None if message.expires_at is None else message.expires_at + offset,
+        now,
+    )
+
+
+def session_row(key: int, session: Session, will: int | None, offset: float) -> Row:
+    """The row of a session; `will` is the key of its message."""
+    identity = session.identity
+    assert identity is not None
+    return (
+        key,
+        session.client_id,
+        identity.username,
+        session.expiry,
+        None if session.ends_at is None else session.ends_at + offset,
+        will,
+        session.will.delay if session.will is not None else 0,
+        None if session.will_at is None else session.will_at + offset,
+    )
+
+
+def subscription_row(key: int, session: int, subscription: Subscription, *, replaying: bool) -> Row:
+    """The row of a subscription, `replaying` while its retained messages are being sent."""
+    return (
+        key,
+        session,
+        subscription.filter,
+        int(subscription.qos),
+        int(subscription.no_local),
+        int(subscription.retain_as_published),
+        int(subscription.retain_handling),
+        subscription.identifier,
+        int(replaying),
+    )
+
+
+def owed_row(
+    key: int,
+    session: int,
+    message: int | None,
+    delivery: Delivery,
+    packet_id: int | None,
+    sent: int | None,
+) -> Row:
+    """The row of a delivery to a session; `sent` grows in the order of sending."""
+    _, qos, retain, subscription_ids, share = delivery
+    return (
+        key,
+        session,
+        message,
+        qos,
+        int(retain),
+        json.dumps(subscription_ids) if subscription_ids else None,
+        share.filter if share is not None else None,
+        packet_id,
+        sent,
+    )
+
+
+def retained_row(key: int, message: int, owner: Account) -> Row:
+    """The row of a retained message in the owner's account."""
+    return key, message, owner.username, int(owner.is_inside)
+
+
+def received_row(
+    key: int, session: int, packet_id: int, message: int, held: UnreleasedPublish, full: list[int]
+) -> Row:
+    """The row of a QoS 2 message that waits for PUBREL; `full` are the sessions without room."""
+    no_room = None
+    if held.full:
+        shares = [receiver.filter for receiver in held.full if isinstance(receiver, Share)]
+        no_room = json.dumps([full, shares])
+    return key, session, packet_id, message, no_room
