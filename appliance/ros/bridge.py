@@ -605,7 +605,7 @@ class Bridge:
         has_changed = self._follow_routes()
         has_changed |= self._match_patterns()
         has_changed |= self._look_at_flows()
-        self.calls.look()
+        self.calls.poller.poll_graph()
         ready = [flow for flow in self._found.values() if flow.bridged is not None]
         if ready != self._ready:
             self._ready = ready
@@ -722,7 +722,7 @@ class Bridge:
         for flow in (*self._flows(), *self._leaving):
             flow.lost()
         self._refused = []
-        self.calls.lost()
+        self.calls.poller.on_bus_lost()
         if self._diagnostics is not None:
             self._diagnostics.lost()
         self._post(self._stopped, reason, failed=self._join_later)

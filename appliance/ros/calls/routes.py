@@ -1,16 +1,16 @@
-"""What of the ROS graph is asked and answered instead of sent: services, actions, parameters.
+"""The bridge's calls: all routes of services, actions and parameters, and what they share.
 
-Beside the bridge's topics, on the same node and the same two threads. What belongs to the ROS
-thread is in the methods `look` and `lost`, all else is for the event loop's thread.
+They use the same node and the same two threads as the bridge's topics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
+from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.actions import ActionRoutes, ActionSettings
 from appliance.ros.calls.dispatcher import CallCounters, CallDispatcher, CallLimits
@@ -18,6 +18,7 @@ from appliance.ros.calls.parameter_server import ServerParameters
 from appliance.ros.calls.parameter_topics import ParameterSettings
 from appliance.ros.calls.parameters import ParameterRoutes
 from appliance.ros.calls.requests import Requests
+from appliance.ros.calls.service_clients import ServiceClients
 from appliance.ros.calls.services import ServiceRoutes, ServiceSettings
 from appliance.ros.mailbox import Mailbox
 from appliance.ros.node import RosNode
@@ -40,7 +41,7 @@ AnySettings: TypeAlias = ServiceSettings | ActionSettings | ParameterSettings
 
 @dataclass(frozen=True, slots=True)
 class CallRoutes:
-    """Every route that is called, and how many calls may be under way."""
+    """All routes of calls, and the limits on calls under way."""
 
     services: tuple[ServiceSettings, ...] = ()
     actions: tuple[ActionSettings, ...] = ()
@@ -50,15 +51,63 @@ class CallRoutes:
 
 @dataclass(frozen=True, slots=True)
 class CallStatus:
-    """A route, the names on the bus that it is for now, and what it has counted."""
+    """A route, the names on the bus that it bridges now, and its counters."""
 
     settings: AnySettings
     names: tuple[str, ...]
     counters: CallCounters
 
 
+class GraphFollower(Protocol):
+    """What follows the graph, on the ROS thread."""
+
+    def poll_graph(self) -> None:
+        """Follow what has come and gone on the graph."""
+
+    def on_bus_lost(self) -> None:
+        """The node has ended, and all that was created with it."""
+
+
+class CallPoller:
+    """The ROS thread's side of all calls. `enable` is for the loop's thread, all else for the ROS
+    thread."""
+
+    def __init__(
+        self,
+        clients: ServiceClients,
+        others: Sequence[GraphFollower],
+        faults: Faults,
+        post: Callable[..., None],
+    ) -> None:
+        self._clients = clients
+        self._others = others
+        self._faults = faults
+        self._post = post
+        #: Replaced by the loop's thread.
+        self._is_enabled = False
+
+    def enable(self, is_enabled: bool) -> None:
+        """Follow the services on the bus, or only those that are being asked."""
+        self._is_enabled = is_enabled
+
+    def poll_graph(self) -> None:
+        """Follow what has come and gone on the graph."""
+        follows_services = self._is_enabled or self._clients.has_clients
+        for follower in (self._clients, *self._others) if follows_services else self._others:
+            try:
+                follower.poll_graph()
+            except Exception as error:
+                self._post(self._faults.caught, "calls.look", error)
+
+    def on_bus_lost(self) -> None:
+        """The node has ended, and all that was created with it."""
+        for follower in (self._clients, *self._others):
+            follower.on_bus_lost()
+
+
 class CallBridge:
-    """All that is called, in one place: `look` follows the graph, `replace` the configuration."""
+    """Bridges services, actions and parameters; for the loop's thread, and `poller` for the ROS
+    thread."""
 
     def __init__(
         self,
@@ -69,16 +118,15 @@ class CallBridge:
         mailbox: Mailbox,
         post: Callable[..., None],
         announce: Callable[[], None],
-        turns: ConversionQueue,
+        conversions: ConversionQueue,
     ) -> None:
         """`post` calls on the loop's thread; `announce` is called there when what `bridged` gives
         may have changed."""
         self._broker = broker
         self._faults = broker.faults
-        self._post = post
         self._announce = announce
         self._routes = CallRoutes()
-        self.dispatcher = CallDispatcher(broker, entries, turns)
+        self.dispatcher = CallDispatcher(broker, entries, conversions)
         self._requests = Requests(node, entries.loop, post, self._follow)
         self._services = ServiceRoutes(
             self.dispatcher, self._requests, converters, node, entries, post, announce
@@ -93,15 +141,18 @@ class CallBridge:
             self._parameters = ParameterRoutes(
                 self.dispatcher, self._requests, converters, node, entries, post
             )
+        followers = (self._services.servers, self._actions.topics, self._parameters.source)
+        self.poller = CallPoller(self._requests.clients, followers, broker.faults, post)
 
     @property
     def routes(self) -> CallRoutes:
-        """Those that there are now."""
+        """The routes that are used now."""
         return self._routes
 
     def replace(self, routes: CallRoutes) -> None:
-        """Have these routes from now on; one that was there before does not notice."""
+        """Use these routes from now on; one that was there before goes on without a break."""
         self._routes = routes
+        self.poller.enable(bool(routes.services or routes.actions or routes.parameters))
         self.dispatcher.limits = routes.limits
         self._services.replace(routes.services)
         self._actions.replace(routes.actions)
@@ -122,18 +173,18 @@ class CallBridge:
         self._requests.keep_ready((*self._services.keys(), *self._actions.keys()))
 
     def start(self) -> None:
-        """Let calls come in."""
+        """Accept calls."""
         self.dispatcher.start()
         self._actions.start()
         self._parameters.start()
         self._broker.departures.append(self._actions.departed)
 
     async def leave(self) -> None:
-        """The bus is about to be left."""
+        """Cancel what may not outlive the appliance, before the bus is left."""
         await self._actions.cancel_orphans()
 
     async def stop(self) -> None:
-        """Answer what is under way, take back what was shown; may be called twice."""
+        """Answer the calls under way, clear what is retained; may be called twice."""
         if self._actions.departed in self._broker.departures:
             self._broker.departures.remove(self._actions.departed)
         await self._actions.stop()
@@ -159,31 +210,5 @@ class CallBridge:
         ]
 
     def skips(self) -> list[Skipped]:
-        """What routes speak of and is not bridged, and why."""
+        """What a route names and is not bridged, and why."""
         return [*self._services.skips(), *self._actions.skips(), *self._parameters.skips()]
-
-    # The ROS thread
-
-    def look(self) -> None:
-        """Follow what has come and gone on the graph."""
-        routes = self._routes
-        looks = [
-            self._services.servers.poll_graph,
-            self._actions.topics.poll_graph,
-            self._parameters.source.poll_graph,
-        ]
-        has_routes = routes.services or routes.actions or routes.parameters
-        if has_routes or self._requests.clients.has_clients:
-            looks.insert(0, self._requests.clients.poll_graph)
-        for look in looks:
-            try:
-                look()
-            except Exception as error:
-                self._post(self._faults.caught, "calls.look", error)
-
-    def lost(self) -> None:
-        """The bus is gone, and with it all that was set up."""
-        self._requests.clients.on_bus_lost()
-        self._services.servers.on_bus_lost()
-        self._actions.topics.on_bus_lost()
-        self._parameters.source.on_bus_lost()
