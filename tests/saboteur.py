@@ -51,7 +51,7 @@ ENTRY = re.compile(r"[a-z_]+(\.[a-z_]+)?")
 
 #: By entry: the module and class (or none) of what is called in its `try`, and the caller.
 INLINE = {
-    "actions.look": ("ros.actions", "Action", "look", "look"),
+    "actions.look": ("ros.calls.action_topics", "ActionSubscriptions", "poll_graph", "poll_graph"),
     "app.certificates": ("app", "", "keep_server_certificate", ""),
     "app.reload": ("app", "App", "reload", "_try_reload"),
     "bridge.look": ("ros.flows", "Flow", "look", ""),
@@ -60,9 +60,9 @@ INLINE = {
     "broker.delivery": ("broker.session", "Session", "deliver", "publish_to"),
     "broker.end": ("broker.client", "ClientHandler", "fault", "fault"),
     "broker.will": ("broker.broker", "Broker", "_publish_late", "_publish_will"),
-    "calls.handle": ("ros.requests", "Requests", "ask", "_ask"),
-    "calls.take": ("ros.services", "ServiceRoutes", "_type", "_handle"),
-    "calls.look": ("ros.services", "ServiceRoutes", "look", "look"),
+    "calls.handle": ("ros.calls.requests", "Requests", "ask", "_ask"),
+    "calls.take": ("ros.calls.services", "ServiceRoutes", "_type", "_handle"),
+    "calls.look": ("ros.calls.service_server", "ServiceServers", "poll_graph", "poll_graph"),
     "client.cut_off": ("broker.client", "ClientHandler", "_make_sure", "cut_off"),
     "client.shut": ("broker.client", "ClientHandler", "_shut", "cut_off"),
     "clock.keep_alive": ("broker.client", "ClientHandler", "tick", "tick"),
