@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from appliance.access.acl import Acl, Explanation, Verdict
+from appliance.access.acl import Acl, ActionVerdict, Explanation
 from appliance.access.files import Changes, FileAccess, Rules
 from appliance.access.login import LoginPlugins, LoginPolicy, no_user
 from appliance.access.passwords import Passwords, check_password, check_username
-from appliance.access.problems import AccessFileError, Problem
+from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.rules import Permission, Rule
 from appliance.broker.ports import Refusal
 
 __all__ = [
     "AccessFileError",
     "Acl",
+    "ActionVerdict",
     "Changes",
     "Explanation",
     "FileAccess",
+    "FileProblem",
     "LoginPlugins",
     "LoginPolicy",
     "Passwords",
     "Permission",
-    "Problem",
     "Refusal",
     "Rule",
     "Rules",
-    "Verdict",
     "check_password",
     "check_username",
     "no_user",

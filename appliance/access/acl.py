@@ -126,7 +126,7 @@ class _Applied:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ActionVerdict:
     """What is decided about one action, by which rule, and why the rules before it were not it.
 
     `rule` is None when no rule says anything: then it is refused.
@@ -145,7 +145,7 @@ class Explanation:
 
     identity: Identity
     topic: str
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ActionVerdict, ...]
 
     def __str__(self) -> str:
         lines = [f"{_who(self.identity)}, {self.topic!r}:"]
@@ -231,7 +231,7 @@ class Acl:
         if received.topic != topic:
             received = self._received = _Received(topic)
         client_id = identity.client_id
-        is_unfit = _is_unfit(client_id)
+        is_unfit = _changes_levels(client_id)
         if not is_unfit and client_id in received.levels:  # a rule may name it
             return self._decide(identity, Action.RECEIVE, topic)
         who = (identity.username, is_unfit)
@@ -264,7 +264,7 @@ class Acl:
 
     def _verdict(
         self, identity: Identity, action: Action, topic: str, rules: Iterable[_Applied]
-    ) -> Verdict:
+    ) -> ActionVerdict:
         if action is Action.SUBSCRIBE:
             return self._subscribe(identity, topic, list(rules))
         needed = _NEEDED[action]
@@ -274,12 +274,16 @@ class Acl:
             if not (rule.denies or rule.gives(needed)):
                 passed.append((rule, _ONLY[rule.permission]))
             elif applied.matches(topic):
-                return Verdict(action, not rule.denies, rule, str(applied), tuple(passed))
+                return ActionVerdict(action, not rule.denies, rule, str(applied), tuple(passed))
             else:
                 passed.append((rule, "does not match" if applied.filter is not None else _UNFIT))
-        return Verdict(action, False, None, self._silence(identity, action, topic), tuple(passed))
+        return ActionVerdict(
+            action, False, None, self._no_rule(identity, action, topic), tuple(passed)
+        )
 
-    def _subscribe(self, identity: Identity, filter: str, rules: Sequence[_Applied]) -> Verdict:
+    def _subscribe(
+        self, identity: Identity, filter: str, rules: Sequence[_Applied]
+    ) -> ActionVerdict:
         action = Action.SUBSCRIBE
         shared = parse_shared(filter)
         wanted = shared[1] if shared is not None else filter
@@ -309,11 +313,13 @@ class Acl:
                         None,
                     )
                     if denied_by is None:
-                        return Verdict(action, True, rule, str(rule), tuple(passed))
+                        return ActionVerdict(action, True, rule, str(rule), tuple(passed))
                 passed.append((rule, f"all that it gives there is denied by {denied_by}"))
         if denied_by is not None:
-            return Verdict(action, False, denied_by.rule, str(denied_by), tuple(passed))
-        return Verdict(action, False, None, self._silence(identity, action, filter), tuple(passed))
+            return ActionVerdict(action, False, denied_by.rule, str(denied_by), tuple(passed))
+        return ActionVerdict(
+            action, False, None, self._no_rule(identity, action, filter), tuple(passed)
+        )
 
     def _applied(self, identity: Identity, about: str | None = None) -> Iterator[_Applied]:
         """The rules for a client, in the order in which they count.
@@ -333,7 +339,7 @@ class Acl:
             if filter is None or filter[0] != "$" or rule.filter[0] == "$":
                 yield _Applied(rule, filter)
 
-    def _silence(self, identity: Identity, action: Action, topic: str) -> str:
+    def _no_rule(self, identity: Identity, action: Action, topic: str) -> str:
         return f"{self._name}: no rule lets {_who(identity)} {_VERBS[action]} {topic!r}"
 
 
@@ -352,13 +358,13 @@ def _substitute(filter: str, identity: Identity) -> str | None:
     for index, level in enumerate(levels):
         if level in names:
             name = names[level]
-            if name is None or _is_unfit(name):
+            if name is None or _changes_levels(name):
                 return None
             levels[index] = name
     return "/".join(levels)
 
 
-def _is_unfit(name: str) -> bool:
+def _changes_levels(name: str) -> bool:
     """Whether it would change the levels of a filter that it is put into."""
     return not name or "/" in name or "+" in name or "#" in name
 

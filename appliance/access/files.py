@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Final
 
 from appliance.access.acl import Acl
-from appliance.access.checks import BusyError, Checks
+from appliance.access.hashing import HashingPool, QueueFullError
 from appliance.access.passwords import Passwords
-from appliance.access.problems import AccessFileError, Problem
+from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
-from appliance.access.throttle import LoginThrottle, Recent
+from appliance.access.throttle import LoginThrottle, RecentKeys
 from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
 from appliance.host.addresses import network_prefix
 from appliance.mqtt.codec import quote
@@ -30,15 +30,15 @@ _MAX_WAITING: Final = 64
 
 # Seconds that a login may wait for its turn after others from its address failed: less than clients
 # wait.
-_PATIENCE: Final = 6.0
+_MAX_WAIT: Final = 6.0
 
 # Failed logins that are known to be wrong, some 150 bytes each, and those that were sent away
 # unchecked: of the second kind there are many in a flood, and one that counts among them.
-_WRONG: Final = 1024
-_TURNED_AWAY: Final = 16_384
+_MAX_KNOWN_WRONG: Final = 1024
+_MAX_UNCHECKED: Final = 16_384
 
 # Logins with a password that is known to be wrong that are answered late, at a time.
-_PENITENTS: Final = 64
+_MAX_DELAYED_REPEATS: Final = 64
 
 #: Failed logins a minute, from one address or of one user, that slow nothing down.
 FAILED_LOGINS: Final = 30
@@ -47,7 +47,7 @@ _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
 
 _STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
 _TOO_MANY: Final = Refusal(ReasonCode.SERVER_BUSY, "too many passwords wait to be checked")
-_COME_AGAIN: Final = Refusal(
+_TRY_LATER: Final = Refusal(
     ReasonCode.SERVER_BUSY,
     "too many logins from its address were wrong, it has to come again "
     "(broker.limits.failed_logins)",
@@ -69,7 +69,7 @@ class Rules:
     def read(cls, users: Path | None, acl: Path | None, robot: str, anonymous: bool) -> Rules:
         """Reads both files; AccessFileError names all that is wrong with either."""
         passwords, rules = Passwords(Path()), None
-        problems: list[Problem] = []
+        problems: list[FileProblem] = []
         if users is not None:
             try:
                 passwords = Passwords.load(users)
@@ -136,13 +136,13 @@ class FileAccess:
         anonymous: bool = False,
         max_waiting: int = _MAX_WAITING,
         failed_logins: int = FAILED_LOGINS,
-        patience: float = _PATIENCE,
+        max_wait: float = _MAX_WAIT,
     ) -> None:
         """Reads both files; AccessFileError names all that is wrong with either.
 
         Without a users file nobody has a password here. Without an ACL file whoever came in may
         do everything, as in mosquitto. `failed_logins` in a minute cost an address or a user
-        nothing; who would have to wait longer than `patience`, in seconds, is to come again.
+        nothing; who would have to wait longer than `max_wait`, in seconds, is to come again.
         """
         self.epoch = 0
         self._in_force = rules = Rules.read(users, acl, robot, anonymous)
@@ -151,18 +151,18 @@ class FileAccess:
             _log.warning("no ACL file: whoever is let in may read and write every topic")
         self._key = secrets.token_bytes(32)
         #: By user name: the login that was right, and the hash that it was right for.
-        self._remembered: dict[str, tuple[bytes, str]] = {}
-        self._wrong = Recent(_WRONG)
-        self._turned_away = Recent(_TURNED_AWAY)
-        self._penitents = 0
+        self._verified: dict[str, tuple[bytes, str]] = {}
+        self._known_wrong = RecentKeys(_MAX_KNOWN_WRONG)
+        self._unchecked = RecentKeys(_MAX_UNCHECKED)
+        self._delayed_repeats = 0
         #: By address and login: what is found about it by the users file that is named.
         self._checking: dict[tuple[bytes, bytes], asyncio.Task[str | Refusal | None]] = {}
         self._closed = False
-        self._patience = patience
-        self.guesses = LoginThrottle(failed_logins)
+        self._max_wait = max_wait
+        self.throttle = LoginThrottle(failed_logins)
         # One of two cores stays with the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
-        self._checks: Checks[str | None] = Checks(workers, max_waiting)
+        self._hashing: HashingPool[str | None] = HashingPool(workers, max_waiting)
 
     @property
     def in_force(self) -> Rules:
@@ -181,10 +181,10 @@ class FileAccess:
         before, self._in_force = self._in_force, rules
         self._passwords, self._acl = rules.passwords, rules.acl
         self._checking.clear()  # They are about the old hashes, and are not joined any more.
-        self._wrong.clear()
-        self._remembered = {
+        self._known_wrong.clear()
+        self._verified = {
             username: (login, stored)
-            for username, (login, stored) in self._remembered.items()
+            for username, (login, stored) in self._verified.items()
             if stored == self._passwords.hash_of(username)
         }
         self.epoch += 1
@@ -193,7 +193,7 @@ class FileAccess:
     def close(self) -> None:
         """Stops the threads; logins that wait are refused. May be called twice."""
         self._closed = True
-        self._checks.close()  # A hash takes some 20 ms.
+        self._hashing.close()  # A hash takes some 20 ms.
 
     def users(self) -> list[str]:
         """The names of all users, sorted."""
@@ -220,11 +220,11 @@ class FileAccess:
 
         if address is None:
             return ScramExchange(verifier_of)
-        guesses = self.guesses
+        throttle = self.throttle
         return ScramExchange(
             verifier_of,
-            admits=lambda: guesses.turn(address, METHOD, patience=0.0) is not None,
-            failed=lambda username: guesses.failed(address, username),
+            admits=lambda: throttle.reserve(address, METHOD, max_wait=0.0) is not None,
+            failed=lambda username: throttle.record_failure(address, username),
         )
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
@@ -255,20 +255,20 @@ class FileAccess:
         while True:
             passwords = self._passwords
             stored = passwords.hash_of(username)
-            if stored is not None and self._remembered.get(username) == (login, stored):
+            if stored is not None and self._verified.get(username) == (login, stored):
                 return Identity(username, client_id)
             if self._closed:
                 return _STOPPING
-            if login in self._wrong:
-                await self._repent(address, username)
+            if login in self._known_wrong:
+                await self._delay_repeat(address, username)
                 right: str | Refusal | None = None
             else:
                 where = network_prefix(address)
                 check = self._checking.get((where, login))
                 if check is None:
-                    turn = self._turn(address, login)
+                    turn = self._reserve(address, login)
                     if turn is None:
-                        return _COME_AGAIN
+                        return _TRY_LATER
                     check = self._begin_check((where, login), address, username, password, turn)
                 # Not the check itself is awaited: one that leaves must not cancel it for others.
                 await asyncio.wait([check])
@@ -278,7 +278,7 @@ class FileAccess:
             if isinstance(right, Refusal):
                 return right
             if right is not None and right == self._passwords.hash_of(username):
-                self._remembered[username] = login, right
+                self._verified[username] = login, right
             if self._passwords is not passwords:
                 continue  # Reloaded meanwhile: what was found is about a user of before.
             if right is not None:
@@ -286,12 +286,12 @@ class FileAccess:
             what = "unknown user" if stored is None else "wrong password for user"
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {quote(username)}")
 
-    def _turn(self, address: str, login: bytes) -> float | None:
+    def _reserve(self, address: str, login: bytes) -> float | None:
         """In how many seconds the login is looked at; None when that is too long."""
-        again = "again" if login in self._turned_away else ""
-        turn = self.guesses.turn(address, again, self._patience)
+        again = "again" if login in self._unchecked else ""
+        turn = self.throttle.reserve(address, again, self._max_wait)
         if turn is None:
-            self._turned_away.add(login)
+            self._unchecked.add(login)
         return turn
 
     def _begin_check(
@@ -318,35 +318,35 @@ class FileAccess:
         self, key: tuple[bytes, bytes], address: str, username: str, password: bytes, turn: float
     ) -> str | Refusal | None:
         """The hash that the password is right for, None when it is wrong."""
-        lane, login = key
-        delay = max(turn, self.guesses.hold_up(username))
+        queue, login = key
+        delay = max(turn, self.throttle.user_delay(username))
         if delay:
             await asyncio.sleep(delay)
         passwords = self._passwords
         try:
-            right = await self._checks.run(
-                lane, partial(passwords.verified_hash, username, password)
+            right = await self._hashing.run(
+                queue, partial(passwords.verified_hash, username, password)
             )
-        except BusyError:
-            self._turned_away.add(login)
+        except QueueFullError:
+            self._unchecked.add(login)
             return _TOO_MANY
         if right is None:
-            self.guesses.failed(address, username)
+            self.throttle.record_failure(address, username)
             if self._passwords is passwords:
-                self._wrong.add(login)
+                self._known_wrong.add(login)
         return right
 
-    async def _repent(self, address: str, username: str) -> None:
+    async def _delay_repeat(self, address: str, username: str) -> None:
         """Let who comes with a wrong password again wait as long as others that guess."""
-        if self._penitents >= _PENITENTS:
+        if self._delayed_repeats >= _MAX_DELAYED_REPEATS:
             return
-        delay = max(self.guesses.hold_up(username), self.guesses.delay(address))
+        delay = max(self.throttle.user_delay(username), self.throttle.address_delay(address))
         if delay:
-            self._penitents += 1
+            self._delayed_repeats += 1
             try:
                 await asyncio.sleep(delay)
             finally:
-                self._penitents -= 1
+                self._delayed_repeats -= 1
 
     def _login(self, username: str, password: bytes) -> bytes:
         name = username.encode()

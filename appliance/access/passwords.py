@@ -23,7 +23,7 @@ import argon2
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from appliance.access import scram
-from appliance.access.problems import AccessFileError, Problem, read_text
+from appliance.access.problems import AccessFileError, FileProblem, read_text
 
 _log = logging.getLogger(__name__)
 
@@ -219,7 +219,7 @@ class Passwords:
                 f"cannot be written ({error.strerror}); use the user that owns the file and its "
                 "directory"
             )
-            raise AccessFileError([Problem(self.path, 0, 0, message)]) from error
+            raise AccessFileError([FileProblem(self.path, 0, 0, message)]) from error
         self._changes.clear()
 
     def _read_verifiers(self) -> None:
@@ -258,7 +258,7 @@ def _scram_hash(username: str, password: str | bytes) -> str:
 def _parse(path: Path, text: str) -> dict[str, str]:
     hashes: dict[str, str] = {}
     lines: dict[str, int] = {}
-    problems: list[Problem] = []
+    problems: list[FileProblem] = []
     for number, line in enumerate(text.split("\n"), 1):
         entry = _entry(line)
         if entry is None:
@@ -269,17 +269,17 @@ def _parse(path: Path, text: str) -> dict[str, str]:
                 raise ValueError("not user:hash; add users with: appliance user add NAME")
             check_username(username)
         except ValueError as error:
-            problems.append(Problem(path, number, 1, str(error)))
+            problems.append(FileProblem(path, number, 1, str(error)))
             continue
         if username in lines:
             message = f"user {username!r} is in line {lines[username]} already; remove one of them"
-            problems.append(Problem(path, number, 1, message))
+            problems.append(FileProblem(path, number, 1, message))
             continue
         lines[username] = number
         try:
             _check_hash(stored, username)
         except ValueError as error:
-            problems.append(Problem(path, number, len(username) + 2, str(error)))
+            problems.append(FileProblem(path, number, len(username) + 2, str(error)))
         else:
             hashes[username] = stored
     if problems:

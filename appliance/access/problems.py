@@ -12,7 +12,7 @@ MAX_SIZE: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class FileProblem:
     """One thing wrong in one file; lines and columns count from 1, and 0 means the whole file."""
 
     file: Path
@@ -29,7 +29,7 @@ class Problem:
 class AccessFileError(ValueError):
     """A users file or an ACL file cannot be used; `problems` has all that is wrong with it."""
 
-    def __init__(self, problems: Sequence[Problem]) -> None:
+    def __init__(self, problems: Sequence[FileProblem]) -> None:
         super().__init__("\n".join(map(str, problems)))
         self.problems = list(problems)
 
@@ -41,17 +41,19 @@ def read_text(path: Path, advice: str, limit: int = MAX_SIZE) -> str:
     """
     try:
         if path.is_fifo():  # somebody who writes to it would be waited for
-            raise AccessFileError([Problem(path, 0, 0, "is no file, but a pipe")])
+            raise AccessFileError([FileProblem(path, 0, 0, "is no file, but a pipe")])
         with path.open("rb") as file:
             data = file.read(limit + 1)
     except FileNotFoundError:
-        raise AccessFileError([Problem(path, 0, 0, f"there is no such file; {advice}")]) from None
+        raise AccessFileError(
+            [FileProblem(path, 0, 0, f"there is no such file; {advice}")]
+        ) from None
     except OSError as error:
         message = f"cannot be read ({error.strerror}); let the user that runs the appliance read it"
-        raise AccessFileError([Problem(path, 0, 0, message)]) from error
+        raise AccessFileError([FileProblem(path, 0, 0, message)]) from error
     if len(data) > limit:
         message = f"larger than {limit >> 20} MiB; is it the right file?"
-        raise AccessFileError([Problem(path, 0, 0, message)])
+        raise AccessFileError([FileProblem(path, 0, 0, message)])
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -59,4 +61,4 @@ def read_text(path: Path, advice: str, limit: int = MAX_SIZE) -> str:
         line = before.count(b"\n") + 1
         column = len(before.rpartition(b"\n")[2].decode("utf-8", "replace")) + 1
         message = "not UTF-8; save the file in that encoding"
-        raise AccessFileError([Problem(path, line, column, message)]) from None
+        raise AccessFileError([FileProblem(path, line, column, message)]) from None

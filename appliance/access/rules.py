@@ -11,7 +11,7 @@ from enum import Flag
 from pathlib import Path
 from typing import Final
 
-from appliance.access.problems import AccessFileError, Problem, read_text
+from appliance.access.problems import AccessFileError, FileProblem, read_text
 from appliance.mqtt.topics import check_filter, check_topic
 
 _log = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ def read_rules(path: Path, robot: str) -> tuple[list[Rule], frozenset[Path]]:
     AccessFileError names all that is wrong; ValueError when `robot` cannot stand in a topic.
     """
     check_topic(robot)
-    reader = _Reader(path.parent, robot)
+    reader = _AclReader(path.parent, robot)
     reader.read(path)
     if reader.problems:
         raise AccessFileError(reader.problems)
@@ -120,17 +120,17 @@ class _Line:
     text: str = ""
 
 
-class _Reader:
+class _AclReader:
     """Reads an ACL file and those that it includes: all rules, and all that is wrong."""
 
     def __init__(self, directory: Path, robot: str) -> None:
         """File names of rules are as seen from `directory`."""
-        self.problems: list[Problem] = []
+        self.problems: list[FileProblem] = []
         self.files: set[Path] = set()
         self._directory = directory
         self._robot = robot
-        self._told: set[Problem] = set()
-        self._lines: dict[Path, list[_Line | Problem]] = {}
+        self._reported: set[FileProblem] = set()
+        self._lines: dict[Path, list[_Line | FileProblem]] = {}
         #: By file, line and user, so that nothing counts twice however often it is included.
         self._rules: dict[tuple[Path, int, str | None], Rule] = {}
         self._read: set[tuple[Path, str | None]] = set()
@@ -160,8 +160,8 @@ class _Reader:
         self._read.add((file, user))
         name = self._name(path)
         for line in self._parse(path, file):
-            if isinstance(line, Problem):
-                self._complain(line)
+            if isinstance(line, FileProblem):
+                self._report(line)
                 continue
             try:
                 if line.keyword == "user":
@@ -172,16 +172,16 @@ class _Reader:
                 else:
                     self._add(file, name, line, user, via)
             except _LineError as mistake:
-                self._complain(Problem(path, line.number, mistake.column + 1, str(mistake)))
+                self._report(FileProblem(path, line.number, mistake.column + 1, str(mistake)))
 
     def _name(self, path: Path) -> str:
         below = path.is_relative_to(self._directory)
         return str(path.relative_to(self._directory) if below else path)
 
-    def _complain(self, problem: Problem) -> None:
+    def _report(self, problem: FileProblem) -> None:
         # A group's file is gone through for each of its users.
-        if problem not in self._told and len(self._told) < _MAX_PROBLEMS:
-            self._told.add(problem)
+        if problem not in self._reported and len(self._reported) < _MAX_PROBLEMS:
+            self._reported.add(problem)
             self.problems.append(problem)
 
     def _add(
@@ -225,7 +225,7 @@ class _Reader:
             raise _LineError(line.column, f"files include each other too deep: {way}")
         self.read(included, user, including, via)
 
-    def _parse(self, path: Path, file: Path) -> list[_Line | Problem]:
+    def _parse(self, path: Path, file: Path) -> list[_Line | FileProblem]:
         """The lines of a file, looked at once, however often it is included."""
         if file in self._lines:
             return self._lines[file]
@@ -250,7 +250,7 @@ class _Reader:
             try:
                 lines.append(self._parse_line(number, line))
             except _LineError as mistake:
-                lines.append(Problem(path, number, mistake.column + 1, str(mistake)))
+                lines.append(FileProblem(path, number, mistake.column + 1, str(mistake)))
         return lines
 
     def _parse_line(self, number: int, line: str) -> _Line:

@@ -193,7 +193,7 @@ class ScramExchange:
         """`verifier_of` is asked at both messages; one that has changed between them fails.
 
         `nonce` is the server's part of it, a random one unless a test brings its own. `admits` is
-        asked before anything is told about a user, and `failed` is told of a wrong proof for one.
+        asked before anything is revealed about a user, `failed` is called for a wrong proof of one.
         """
         self._verifier_of = verifier_of
         self._admits = admits

@@ -1,7 +1,7 @@
 """Brute force: who has tried wrong passwords waits longer and longer before the next is looked at.
 
 Nobody is locked out by it. What slows an address slows no other one, and what slows a user slows it
-by `USER_PATIENCE` at most, however many guess its password, and from wherever. The password that
+by `MAX_USER_DELAY` at most, however many guess its password, and from wherever. The password that
 was right for a user before is not a guess: it never comes here.
 """
 
@@ -23,10 +23,10 @@ FIRST_DELAY: Final = 0.125
 LONGEST_DELAY: Final = 4.0
 
 #: Seconds that a login waits at most because of failures of others for the same user.
-USER_PATIENCE: Final = 2.0
+MAX_USER_DELAY: Final = 2.0
 
 #: Addresses, and users, that are remembered. Those that failed last are.
-REMEMBERED: Final = 4096
+MAX_ENTRIES: Final = 4096
 
 
 @dataclass(slots=True)
@@ -54,35 +54,35 @@ class LoginThrottle:
         self._networks: OrderedDict[bytes, _Failures] = OrderedDict()
         self._users: OrderedDict[bytes, _Failures] = OrderedDict()
 
-    def turn(self, address: str, line: str = "", patience: float = math.inf) -> float | None:
+    def reserve(self, address: str, queue: str = "", max_wait: float = math.inf) -> float | None:
         """Seconds until the next guess from this address is due, and it is taken; or None.
 
-        It is None, and nothing is taken, when that is longer than `patience`. Guesses in another
-        `line` are not in each other's way.
+        It is None, and nothing is taken, when that is longer than `max_wait`. Guesses in another
+        `queue` are not in each other's way.
         """
         failures = self._networks.get(network_prefix(address))
         if failures is None:
             return 0.0
         now = self._clock()
-        due = max(now, failures.free_at.get(line, now))
-        if due - now > patience:
+        due = max(now, failures.free_at.get(queue, now))
+        if due - now > max_wait:
             return None
         delay = self._delay(failures, now)
         if delay:
-            failures.free_at[line] = due + delay
+            failures.free_at[queue] = due + delay
         return due - now
 
-    def delay(self, address: str) -> float:
+    def address_delay(self, address: str) -> float:
         """Seconds between two guesses from this address, as things are."""
         failures = self._networks.get(network_prefix(address))
         return self._delay(failures, self._clock()) if failures else 0.0
 
-    def hold_up(self, username: str) -> float:
+    def user_delay(self, username: str) -> float:
         """Seconds that a guess waits because others were wrong about the same user."""
         failures = self._users.get(self._key_of(username))
-        return min(USER_PATIENCE, self._delay(failures, self._clock())) if failures else 0.0
+        return min(MAX_USER_DELAY, self._delay(failures, self._clock())) if failures else 0.0
 
-    def failed(self, address: str, username: str) -> None:
+    def record_failure(self, address: str, username: str) -> None:
         """A guess was wrong."""
         now = self._clock()
         for known, key in (
@@ -92,7 +92,7 @@ class LoginThrottle:
             failures = known.get(key)
             if failures is None:
                 failures = known[key] = _Failures(at=now)
-                if len(known) > REMEMBERED:
+                if len(known) > MAX_ENTRIES:
                     known.popitem(last=False)
             known.move_to_end(key)
             failures.level = self._level(failures, now) + 1
@@ -112,7 +112,7 @@ class LoginThrottle:
         return hashlib.blake2b(username.encode(), digest_size=16, key=self._key).digest()
 
 
-class Recent:
+class RecentKeys:
     """A set of the keys that were added last, `size` of them."""
 
     def __init__(self, size: int) -> None:

@@ -141,7 +141,7 @@ class App:
             settings.robot,
             broker_settings.anonymous,
             failed_logins=broker_settings.limits.failed_logins,
-            patience=0.6 * broker_settings.limits.connect_timeout,
+            max_wait=0.6 * broker_settings.limits.connect_timeout,
         )
         self._stack.callback(access.close)
         limits = broker_settings.limits

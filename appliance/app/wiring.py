@@ -62,7 +62,7 @@ def plugins(
     wanted = settings.broker.plugins
     if not wanted:
         return None
-    from appliance.plugins import Answers, ApplianceBroker, configuration
+    from appliance.plugins import ApplianceBroker, CachePolicy, configuration
 
     limits, answers = settings.broker.limits, settings.broker.plugin_answers
     listeners = [(str(listener.bind), listener.tls) for listener in settings.broker.listeners]
@@ -74,7 +74,7 @@ def plugins(
         hang_up,
         # In less than the listeners' time limit, so that a client gets an answer when plugins hang.
         min(answers.timeout, 0.8 * limits.connect_timeout),
-        answers=Answers(answers.keep, answers.keep_refusals, answers.size),
+        answers=CachePolicy(answers.keep, answers.keep_refusals, answers.size),
         secrets=secrets_in(wanted),
-        patience=0.2 * limits.connect_timeout,
+        max_wait=0.2 * limits.connect_timeout,
     )

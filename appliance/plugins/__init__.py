@@ -26,17 +26,17 @@ from __future__ import annotations
 from appliance.config.plugins import PluginSettingsError
 from appliance.plugins.broker import (
     ApplianceBroker,
-    Files,
+    FileRules,
     check_plugin_settings,
     configuration,
     plugin_kinds,
 )
-from appliance.plugins.logins import Answers
+from appliance.plugins.logins import CachePolicy
 
 __all__ = [
-    "Answers",
     "ApplianceBroker",
-    "Files",
+    "CachePolicy",
+    "FileRules",
     "PluginSettingsError",
     "check_plugin_settings",
     "configuration",

@@ -19,25 +19,25 @@ from appliance.broker.broker import Broker
 from appliance.broker.ports import Access, AccessQuery, Action, Decision, Identity
 from appliance.config.redaction import redacted
 from appliance.net.callbacks import Entries
-from appliance.plugins.adapters import Sessions, Unclaimed
-from appliance.plugins.guard import Guard, name
-from appliance.plugins.logins import Answers
+from appliance.plugins.adapters import SessionViews, UnclaimedIdentity
+from appliance.plugins.guard import PluginGuard, plugin_name
+from appliance.plugins.logins import CachePolicy
 from appliance.plugins.threads import Threads, blocks
 
 log = logging.getLogger(__name__)
 
 #: Seconds for which an older verdict holds while they are asked.
-VERDICT_USE = 600.0
+STALE_VERDICT_LIFETIME = 600.0
 #: Questions to such plugins at one time, in all and of one client.
-QUESTIONS = 64
-CLIENT_QUESTIONS = 8
+MAX_QUERIES = 64
+MAX_CLIENT_QUERIES = 8
 #: And of one user's clients together.
-USER_QUESTIONS = 16
+MAX_USER_QUERIES = 16
 #: Seconds between two looks at whether those who could not ask for want of room can now.
-LINE_INTERVAL = 0.25
+ROOM_CHECK_INTERVAL = 0.25
 
 #: The answer of a plugin that has none without waiting.
-_WAITS: Final = object()
+_WOULD_BLOCK: Final = object()
 
 
 class PluginAccess:
@@ -60,10 +60,10 @@ class PluginAccess:
         files: Access,
         broker: Broker,
         plugins: PluginManager[BrokerContext],
-        sessions: Sessions,
-        guard: Guard,
+        sessions: SessionViews,
+        guard: PluginGuard,
         threads: Threads,
-        answers: Answers,
+        answers: CachePolicy,
     ) -> None:
         self.answers = answers
         self._threads = threads
@@ -73,13 +73,13 @@ class PluginAccess:
         self._sessions = sessions
         self._guard = guard
         self._epoch = 0
-        self._waits = False
+        self._is_blocking = False
         self._verdicts: OrderedDict[AccessQuery, tuple[Decision, float, int]] = OrderedDict()
         self._asked: dict[AccessQuery, asyncio.Task[None]] = {}
         #: Who waits for the answer to each of them, and who for room to ask, in their order.
         self._waiting: dict[AccessQuery, dict[Callable[[], None], None]] = {}
-        self._line: dict[Callable[[], None], None] = {}
-        self._line_timer: asyncio.TimerHandle | None = None
+        self._waiting_for_room: dict[Callable[[], None], None] = {}
+        self._room_timer: asyncio.TimerHandle | None = None
 
     @property
     def epoch(self) -> int:
@@ -92,12 +92,12 @@ class PluginAccess:
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """What the files allow and no plugin refuses."""
-        if isinstance(identity, Unclaimed):
+        if isinstance(identity, UnclaimedIdentity):
             return Decision(True, "a plugin subscribed it; checked again when the client comes")
         decision = self._files.decide(identity, action, topic)
         if not decision or not self._plugins._topic_plugins:
             return decision
-        if not self._waits:
+        if not self._is_blocking:
             answered, refusing = self._ask_now(identity, action, topic)
             if answered:
                 return Decision(False, f"refused by {refusing}") if refusing else decision
@@ -108,24 +108,27 @@ class PluginAccess:
         """Seconds that a packet waits for an answer."""
         return self._guard.timeout
 
-    def is_pending(self, question: AccessQuery, wake: Callable[[], None]) -> bool:
+    def is_pending(self, query: AccessQuery, wake: Callable[[], None]) -> bool:
         """Whether there is no answer yet; `wake` is then called when there may be one."""
-        if not self.decide(*question).pending:
+        if not self.decide(*query).pending:
             return False
-        if question in self._asked:
-            self._waiting.setdefault(question, {})[wake] = None
+        if query in self._asked:
+            self._waiting.setdefault(query, {})[wake] = None
         else:
-            self._line[wake] = None
-            if self._line_timer is None:
+            self._waiting_for_room[wake] = None
+            if self._room_timer is None:
                 entries = Entries(asyncio.get_running_loop(), self._broker.faults)
-                self._line_timer = entries.later(
-                    "plugins.line", LINE_INTERVAL, self._wake_line, failed=self._wake_line
+                self._room_timer = entries.later(
+                    "plugins.line",
+                    ROOM_CHECK_INTERVAL,
+                    self._wake_waiting_for_room,
+                    failed=self._wake_waiting_for_room,
                 )
         return True
 
-    def _wake_line(self) -> None:
-        self._line_timer = None
-        line, self._line = self._line, {}
+    def _wake_waiting_for_room(self) -> None:
+        self._room_timer = None
+        line, self._waiting_for_room = self._waiting_for_room, {}
         for wake in line:
             self._broker.faults.run("plugins.wake", wake, otherwise=None)
 
@@ -139,81 +142,83 @@ class PluginAccess:
         for asking in self._asked.values():
             asking.cancel()
         self._waiting.clear()
-        self._line.clear()
-        if self._line_timer is not None:
-            self._line_timer.cancel()
+        self._waiting_for_room.clear()
+        if self._room_timer is not None:
+            self._room_timer.cancel()
 
     def _ask_now(self, identity: Identity, action: Action, topic: str) -> tuple[bool, str]:
         """Whether the plugins could answer on the spot, and which one refuses."""
         session = self._sessions.of_identity(identity)
         for plugin in self._plugins._topic_plugins:
             try:
-                answer = _WAITS if blocks(plugin) else _answer_now(plugin, session, action, topic)
+                answer = (
+                    _WOULD_BLOCK if blocks(plugin) else _answer_now(plugin, session, action, topic)
+                )
             except Exception:
                 # Whatever it was, the lack of a task perhaps: it is asked again in one, and what
                 # it raises there is told.
                 return False, ""
-            if answer is _WAITS:
-                self._waits = True
+            if answer is _WOULD_BLOCK:
+                self._is_blocking = True
                 log.warning(
                     "%s has to wait before it can say whether a topic is allowed: what is asked "
                     "for the first time waits with it, for up to %g s",
-                    name(plugin),
+                    plugin_name(plugin),
                     self.timeout,
                 )
                 return False, ""
             if not answer:  # As in amqtt, None is a no.
-                return True, name(plugin)
+                return True, plugin_name(plugin)
         return True, ""
 
-    def _verdict(self, question: AccessQuery) -> Decision:
+    def _verdict(self, query: AccessQuery) -> Decision:
         """What the plugins last said; they are asked when that is long ago."""
-        decision, said_at, epoch = self._verdicts.get(question, (None, 0.0, 0))
+        decision, said_at, epoch = self._verdicts.get(query, (None, 0.0, 0))
         age = asyncio.get_running_loop().time() - said_at
         is_old = (
             decision is None
-            or age > self.answers.of_topic(allowed=decision.allowed)
+            or age > self.answers.topic_lifetime(allowed=decision.allowed)
             or epoch != self._files.epoch
         )
-        if is_old and question not in self._asked:
-            if not self._has_room(question[0]):
+        if is_old and query not in self._asked:
+            if not self._has_room(query[0]):
                 return Decision(False, "the topic plugins have too many questions to answer", True)
-            self._asked[question] = asyncio.ensure_future(self._ask(question))
-        if decision is None or age > VERDICT_USE:
+            self._asked[query] = asyncio.ensure_future(self._ask(query))
+        if decision is None or age > STALE_VERDICT_LIFETIME:
             return Decision(False, "the topic plugins were asked; the next try is answered", True)
-        self._verdicts.move_to_end(question)
+        self._verdicts.move_to_end(query)
         return decision
 
     def _has_room(self, identity: Identity) -> bool:
         """Whether there may be one more question about this client."""
-        if len(self._asked) >= QUESTIONS:
+        if len(self._asked) >= MAX_QUERIES:
             return False
         clients = [asked[0] for asked in self._asked if asked[0].username == identity.username]
-        return len(clients) < USER_QUESTIONS and clients.count(identity) < CLIENT_QUESTIONS
+        return len(clients) < MAX_USER_QUERIES and clients.count(identity) < MAX_CLIENT_QUERIES
 
-    async def _ask(self, question: AccessQuery) -> None:
+    async def _ask(self, query: AccessQuery) -> None:
         """Ask all topic plugins and keep what they say."""
-        identity, action, topic = question
+        identity, action, topic = query
         session = self._sessions.of_identity(identity)
         try:
-            answers = await self._guard.within(self._ask_all(session, action, topic))
+            answers = await self._guard.run(self._ask_all(session, action, topic))
         except asyncio.TimeoutError:
             reason = f"the topic plugins said nothing within {self._guard.timeout:g} s"
             decision = Decision(False, reason)
         except Exception as error:  # a plugin may raise anything
-            self._guard.tell("an amqtt topic plugin", error)
+            self._guard.log_failure("an amqtt topic plugin", error)
             reason = redacted(repr(error), self._guard.secrets)
             decision = Decision(False, f"a topic plugin failed: {reason}")
         else:
-            refusing = ", ".join(name(plugin) for plugin, yes in answers.items() if not yes)
+            refusing = ", ".join(plugin_name(plugin) for plugin, yes in answers.items() if not yes)
             reason = f"refused by {refusing}" if refusing else "allowed by the topic plugins"
             decision = Decision(not refusing, reason)
         finally:
-            del self._asked[question]
+            del self._asked[query]
         try:
-            self._keep(question, decision)
+            self._keep(query, decision)
         finally:
-            for wake in self._waiting.pop(question, {}):
+            for wake in self._waiting.pop(query, {}):
                 self._broker.faults.run("plugins.wake", wake, otherwise=None)
 
     async def _ask_all(
@@ -224,10 +229,10 @@ class PluginAccess:
         asked = (self._threads.call(plugin, "topic_filtering", arguments) for plugin in plugins)
         return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
 
-    def _keep(self, question: AccessQuery, decision: Decision) -> None:
-        before, _, _ = self._verdicts.pop(question, (None, 0.0, 0))
+    def _keep(self, query: AccessQuery, decision: Decision) -> None:
+        before, _, _ = self._verdicts.pop(query, (None, 0.0, 0))
         now = asyncio.get_running_loop().time()
-        self._verdicts[question] = decision, now, self._files.epoch
+        self._verdicts[query] = decision, now, self._files.epoch
         if len(self._verdicts) > self.answers.size:
             self._verdicts.popitem(last=False)
         was_allowed = before is not None and before.allowed
@@ -249,4 +254,4 @@ def _answer_now(
         return answer.value
     with contextlib.suppress(RuntimeError):  # it goes on waiting while it is cleaning up
         asked.close()
-    return _WAITS
+    return _WOULD_BLOCK

@@ -19,7 +19,7 @@ from appliance.mqtt.codec import V5, Property
 from appliance.mqtt.packets import Connect
 
 
-class Unclaimed(Identity):
+class UnclaimedIdentity(Identity):
     """Owner of a session that a plugin made for a client that never came.
 
     The first client that logs in with its id becomes its owner.
@@ -34,7 +34,7 @@ def _split(address: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def login_of(
+def view_of_login(
     connect: Connect, address: str, password: str | None, ssl_object: ssl.SSLObject | None
 ) -> AmqttSession:
     """The session that plugins are shown before it is known whether the client may come in."""
@@ -56,23 +56,23 @@ def login_of(
     return login
 
 
-def _shown(session: Session) -> AmqttSession:
+def _view_of(session: Session) -> AmqttSession:
     """A session as amqtt has it, of one whose login plugins have not seen."""
-    shown = AmqttSession()
-    shown.client_id = session.client_id
-    shown.username = session.identity.username if session.identity else None
-    shown.is_anonymous = shown.username is None
-    shown.clean_session = not session.persistent
+    view = AmqttSession()
+    view.client_id = session.client_id
+    view.username = session.identity.username if session.identity else None
+    view.is_anonymous = view.username is None
+    view.clean_session = not session.persistent
     if isinstance(session.link, Output):
-        shown.remote_address, shown.remote_port = _split(session.link.transport.address)
+        view.remote_address, view.remote_port = _split(session.link.transport.address)
     if session.will is not None:
         will = session.will.message
-        shown.will_flag, shown.will_topic, shown.will_message = True, will.topic, will.payload
-        shown.will_qos, shown.will_retain = will.qos, will.retain
-    return shown
+        view.will_flag, view.will_topic, view.will_message = True, will.topic, will.payload
+        view.will_qos, view.will_retain = will.qos, will.retain
+    return view
 
 
-class Sessions(Mapping[str, tuple[AmqttSession, None]]):
+class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
     """The sessions of all network clients by client id, each with no protocol handler.
 
     amqtt's objects are large (24 KB), so they are made when they are asked for.
@@ -108,18 +108,18 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
         """amqtt's object of the session: its last login as plugins saw it, brought up to date."""
         known = self._known.get(session.client_id)
         before = known[1] if known is not None and known[0] is session else None
-        shown = self._claim_login(session) or before or _shown(session)
-        if shown is not before:
+        view = self._claim_login(session) or before or _view_of(session)
+        if view is not before:
             if before is not None:  # a session continued: what plugins noted in it stays
-                shown.parent = 1
-                shown.attributes = before.attributes | shown.attributes
-            self._known[session.client_id] = session, shown
-        state = shown.transitions.state
+                view.parent = 1
+                view.attributes = before.attributes | view.attributes
+            self._known[session.client_id] = session, view
+        state = view.transitions.state
         if session.link is not None and state != "connected":
-            shown.transitions.connect()
+            view.transitions.connect()
         elif session.link is None and state != "disconnected":
-            shown.transitions.disconnect()
-        return shown
+            view.transitions.disconnect()
+        return view
 
     def _claim_login(self, session: Session) -> AmqttSession | None:
         """What plugins saw of the login behind the session's connection, once."""
@@ -144,11 +144,11 @@ class Sessions(Mapping[str, tuple[AmqttSession, None]]):
         known = self._known.get(identity.client_id)
         if known is not None and known[0].identity == identity:
             return known[1]
-        shown = AmqttSession()
-        shown.client_id, shown.username = identity.client_id, identity.username
-        return shown
+        view = AmqttSession()
+        view.client_id, view.username = identity.client_id, identity.username
+        return view
 
-    def expect(self, address: str, login: AmqttSession) -> None:
+    def remember_login(self, address: str, login: AmqttSession) -> None:
         """The client at the address may come in: this is what plugins know of it."""
         self._logins[address] = login
 

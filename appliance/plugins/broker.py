@@ -35,24 +35,24 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 from appliance.net.callbacks import Entries, PeriodicCallback, contained_proxy
 from appliance.plugins.access import PluginAccess
-from appliance.plugins.adapters import RetainedMessages, Sessions, Unclaimed
+from appliance.plugins.adapters import RetainedMessages, SessionViews, UnclaimedIdentity
 from appliance.plugins.events import PluginEvents
-from appliance.plugins.guard import PLUGIN_TIMEOUT, Guard, name
-from appliance.plugins.logins import Answers, Guesses, PluginLogins
+from appliance.plugins.guard import PLUGIN_TIMEOUT, PluginGuard, plugin_name
+from appliance.plugins.logins import CachePolicy, PluginLogins, Throttle
 from appliance.plugins.threads import Threads
 
 log = logging.getLogger(__name__)
 
 
 #: Nothing of a login is remembered unless that is asked for.
-_ANSWERS = Answers(keep=0.0, keep_refusals=0.0)
+_ANSWERS = CachePolicy(keep=0.0, keep_refusals=0.0)
 
 
-class Files(Access, Protocol):
+class FileRules(Access, Protocol):
     """The users file and the ACL file, as far as the plugins stand beside them."""
 
     @property
-    def guesses(self) -> Guesses:
+    def throttle(self) -> Throttle:
         """How long logins have to wait because others were wrong."""
 
 
@@ -155,19 +155,19 @@ class ApplianceBroker(amqtt.broker.Broker):
     def __init__(
         self,
         broker: Broker,
-        files: Files,
+        files: FileRules,
         config: BrokerConfig,
         listen: Callable[[], Awaitable[None]],
         hang_up: Callable[[], Awaitable[None]],
         plugin_timeout: float = PLUGIN_TIMEOUT,
         *,
-        answers: Answers = _ANSWERS,
+        answers: CachePolicy = _ANSWERS,
         secrets: Iterable[str] = (),
-        patience: float = PLUGIN_TIMEOUT,
+        max_wait: float = PLUGIN_TIMEOUT,
     ) -> None:
         """Loads the plugins; to be called on the event loop.
 
-        `secrets` are strings of their settings that are told to nobody; `patience` is how many
+        `secrets` are strings of their settings that are told to nobody; `max_wait` is how many
         seconds a login may wait when others from its address were wrong.
 
         Raises:
@@ -177,10 +177,10 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._files = files
         self._listen = listen
         self._hang_up = hang_up
-        self._guard = Guard(plugin_timeout, secrets)
+        self._guard = PluginGuard(plugin_timeout, secrets)
         self._threads = Threads()
         self._answers = answers
-        self._views = Sessions(broker)
+        self._views = SessionViews(broker)
         self._inside: Session | None = None
         self._timer: PeriodicCallback | None = None
         try:
@@ -203,10 +203,10 @@ class ApplianceBroker(amqtt.broker.Broker):
             self._events,
             self._guard,
             self._threads,
-            files.guesses,
+            files.throttle,
             lambda: files.epoch,
             answers,
-            patience,
+            max_wait,
         )
         # BrokerContext reads and writes these: they are windows on our broker.
         self._sessions = cast(Any, self._views)
@@ -228,10 +228,10 @@ class ApplianceBroker(amqtt.broker.Broker):
         self._inside = self.broker.attach("_amqtt", InsideLink())
         if self.plugins_manager.plugins:
             self.broker.access = self.broker.router.pending_decisions = self._access
-            if self._events.about_clients:
+            if self._events.observes_clients:
                 faults = self.broker.faults
                 self.broker.observer = contained_proxy("plugins.observer", faults, self._events)
-            interval = self._answers.of_topic(allowed=True)
+            interval = self._answers.topic_lifetime(allowed=True)
             entries = Entries(asyncio.get_running_loop(), self.broker.faults)
             self._timer = entries.every("plugins.tick", interval, self._tick, 0)
         try:
@@ -243,7 +243,9 @@ class ApplianceBroker(amqtt.broker.Broker):
             raise
         self.transitions.starting_success()
         await self._events.life_cycle(BrokerEvents.POST_START)
-        log.debug("amqtt plugins: %s", ", ".join(map(name, self.plugins_manager.plugins)) or "none")
+        log.debug(
+            "amqtt plugins: %s", ", ".join(map(plugin_name, self.plugins_manager.plugins)) or "none"
+        )
 
     async def _start_listeners(self) -> None:
         """Start our listeners in the place of amqtt's."""
@@ -279,11 +281,11 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     async def _finish(self, what: str, work: Coroutine[Any, Any, None]) -> None:
         try:
-            await self._guard.within(work)
+            await self._guard.run(work)
         except asyncio.TimeoutError:
             log.warning("amqtt plugins still work on %s after %g s", what, self._guard.timeout)
         except Exception as error:  # a plugin may raise anything, and all else is to stop too
-            self._guard.tell(f"an amqtt plugin at {what}", error)
+            self._guard.log_failure(f"an amqtt plugin at {what}", error)
 
     def _tick(self) -> None:
         """Forget what has ended, and let topic plugins change their mind."""
@@ -377,7 +379,11 @@ class ApplianceBroker(amqtt.broker.Broker):
         try:
             with self._unobserved():
                 session, _ = self.broker.connect(
-                    link, Unclaimed(None, client_id), clean_start=False, expiry=expiry, will=None
+                    link,
+                    UnclaimedIdentity(None, client_id),
+                    clean_start=False,
+                    expiry=expiry,
+                    will=None,
                 )
                 self.broker.disconnect(session, link, publish_will=False)
         except ProtocolError as error:

@@ -19,14 +19,14 @@ from appliance.broker.ports import Identity
 from appliance.broker.session import Session
 from appliance.mqtt.codec import V31
 from appliance.mqtt.packets import Connect
-from appliance.plugins.adapters import Sessions, retained_message
-from appliance.plugins.guard import Guard
+from appliance.plugins.adapters import SessionViews, retained_message
+from appliance.plugins.guard import PluginGuard
 
 log = logging.getLogger(__name__)
 
 #: Events, and bytes of payload in them, that wait for plugins.
-EVENTS = 10_000
-EVENT_BYTES = 64 * 1024 * 1024
+MAX_EVENTS = 10_000
+MAX_EVENT_BYTES = 64 * 1024 * 1024
 
 #: Seconds between two lines in the log about events that were too many.
 LOST_LOG_INTERVAL = 60.0
@@ -48,7 +48,7 @@ class PluginEvents:
     """The broker's `Observer`: fires amqtt's events, those that a plugin has a handler for."""
 
     def __init__(
-        self, plugins: PluginManager[BrokerContext], sessions: Sessions, guard: Guard
+        self, plugins: PluginManager[BrokerContext], sessions: SessionViews, guard: PluginGuard
     ) -> None:
         self._plugins = plugins
         self._sessions = sessions
@@ -58,12 +58,12 @@ class PluginEvents:
         self._pending = 0
         self._pending_bytes = 0
         self._lost = 0
-        self._told_lost_at = float("-inf")
+        self._lost_logged_at = float("-inf")
         #: What is being published, and by whom.
         self._published: tuple[Message, Session] | None = None
 
     @property
-    def about_clients(self) -> bool:
+    def observes_clients(self) -> bool:
         """Whether some plugin wants more than the four events of the life cycle."""
         return not self._wanted <= _LIFE_CYCLE
 
@@ -91,24 +91,26 @@ class PluginEvents:
             header.will_flag, header.will_qos, header.will_retain_flag = True, will.qos, will.retain
             payload.will_topic, payload.will_message = will.topic, will.payload
         packet = ConnectPacket(variable_header=header, payload=payload)
-        self._tell(MQTTEvents.PACKET_RECEIVED, packet=packet)
+        self._notify(MQTTEvents.PACKET_RECEIVED, packet=packet)
 
     def connected(self, session: Session) -> None:
         """A client is there."""
-        shown = self._sessions.of(session)
-        self._tell(BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=shown)
+        view = self._sessions.of(session)
+        self._notify(
+            BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=view
+        )
 
     def disconnected(self, session: Session) -> None:
         """A client is gone."""
-        shown = self._sessions.of(session)
-        self._tell(
-            BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=shown
+        view = self._sessions.of(session)
+        self._notify(
+            BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=view
         )
 
     def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
         """A client subscribed."""
         if session.identity is not None:
-            self._tell(
+            self._notify(
                 BrokerEvents.CLIENT_SUBSCRIBED,
                 client_id=session.client_id,
                 topic=topic_filter,
@@ -118,7 +120,7 @@ class PluginEvents:
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         """A client unsubscribed."""
         if session.identity is not None:
-            self._tell(
+            self._notify(
                 BrokerEvents.CLIENT_UNSUBSCRIBED, client_id=session.client_id, topic=topic_filter
             )
 
@@ -129,12 +131,12 @@ class PluginEvents:
         if message.retain:
             self._published = message, session
         if self._wants_messages:
-            self._tell_message(session, message, allowed=True)
+            self._notify_message(session, message, allowed=True)
 
     def refused(self, session: Session, message: Message) -> None:
         """A client's message goes nowhere, as it is not allowed; amqtt tells that it came."""
         if session.identity is not None and self._wants_messages:
-            self._tell_message(session, message, allowed=False)
+            self._notify_message(session, message, allowed=False)
 
     def retained(self, message: Message) -> None:
         """A message was retained, or, being empty, deleted."""
@@ -144,42 +146,44 @@ class PluginEvents:
         source = None
         if published is not None and published[0] is message:
             source = self._sessions.of_identity(cast(Identity, published[1].identity))
-        self._tell(
+        self._notify(
             BrokerEvents.RETAINED_MESSAGE,
             len(message.payload),
             client_id=None,
             retained_message=retained_message(source, message),
         )
 
-    def _tell_message(self, session: Session, message: Message, *, allowed: bool) -> None:
+    def _notify_message(self, session: Session, message: Message, *, allowed: bool) -> None:
         size = len(message.payload)
         received = IncomingApplicationMessage(
             None, message.topic, message.qos, message.payload, message.retain
         )
         received.publish_packet = received.build_publish_packet()
         if MQTTEvents.PACKET_RECEIVED in self._wanted:
-            self._tell(
+            self._notify(
                 MQTTEvents.PACKET_RECEIVED,
                 size,
                 packet=received.publish_packet,
                 session=self._sessions.of_identity(cast(Identity, session.identity)),
             )
         client_id = session.client_id
-        self._tell(BrokerEvents.MESSAGE_RECEIVED, size, client_id=client_id, message=received)
+        self._notify(BrokerEvents.MESSAGE_RECEIVED, size, client_id=client_id, message=received)
         if allowed:
-            self._tell(BrokerEvents.MESSAGE_BROADCAST, size, client_id=client_id, message=received)
+            self._notify(
+                BrokerEvents.MESSAGE_BROADCAST, size, client_id=client_id, message=received
+            )
 
-    def _tell(self, event: Events, size: int = 0, **arguments: object) -> None:
+    def _notify(self, event: Events, size: int = 0, **arguments: object) -> None:
         """Fire the event unless as many are waiting as may; `size` is in bytes of payload."""
         if event not in self._wanted:
             return
-        if self._pending < EVENTS and self._pending_bytes + size <= EVENT_BYTES:
+        if self._pending < MAX_EVENTS and self._pending_bytes + size <= MAX_EVENT_BYTES:
             self._fire(event, size, arguments)
             return
         self._lost += 1
         now = asyncio.get_running_loop().time()
-        if now - self._told_lost_at >= LOST_LOG_INTERVAL:
-            self._told_lost_at = now
+        if now - self._lost_logged_at >= LOST_LOG_INTERVAL:
+            self._lost_logged_at = now
             log.warning("amqtt plugins are too slow: %d events were not told to them", self._lost)
 
     def _fire(
@@ -204,4 +208,4 @@ class PluginEvents:
         if not task.cancelled():
             error = task.exception()
             if error is not None:
-                self._guard.tell(f"an amqtt plugin's handler of {event.value}", error)
+                self._guard.log_failure(f"an amqtt plugin's handler of {event.value}", error)

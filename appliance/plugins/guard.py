@@ -22,7 +22,7 @@ _FAILURES = 1000
 _T = TypeVar("_T")
 
 
-class Guard:
+class PluginGuard:
     """Limits the time that plugins take, in seconds, and tells their failures.
 
     `secrets` are those of the plugins' settings: no failure is told with one of them in it.
@@ -31,9 +31,9 @@ class Guard:
     def __init__(self, timeout: float = PLUGIN_TIMEOUT, secrets: Iterable[str] = ()) -> None:
         self.timeout = timeout
         self.secrets = list(secrets)
-        self._told: set[tuple[str, str]] = set()
+        self._logged: set[tuple[str, str]] = set()
 
-    async def within(self, work: Coroutine[Any, Any, _T]) -> _T:
+    async def run(self, work: Coroutine[Any, Any, _T]) -> _T:
         """The result of the work.
 
         Raises:
@@ -48,7 +48,7 @@ class Guard:
         finally:
             task.cancel()
 
-    def tell(self, what: str, error: BaseException, secrets: Iterable[str] = ()) -> None:
+    def log_failure(self, what: str, error: BaseException, secrets: Iterable[str] = ()) -> None:
         """Log that `what` failed, with the traceback, the first time that it did so there.
 
         `secrets` are what the plugin was told and nobody else may read, such as a password.
@@ -56,14 +56,14 @@ class Guard:
         hidden = [*self.secrets, *secrets]
         last = traceback.extract_tb(error.__traceback__)[-1:]
         failure = what, f"{type(error).__name__} {last}"
-        if failure in self._told or len(self._told) >= _FAILURES:
+        if failure in self._logged or len(self._logged) >= _FAILURES:
             log.debug("%s failed again: %s", what, redacted(str(error), hidden))
         else:
-            self._told.add(failure)
-            told = "".join(traceback.format_exception(error)).rstrip()
-            log.error("%s failed; this is told once\n%s", what, redacted(told, hidden))
+            self._logged.add(failure)
+            text = "".join(traceback.format_exception(error)).rstrip()
+            log.error("%s failed; this is told once\n%s", what, redacted(text, hidden))
 
 
-def name(plugin: object) -> str:
+def plugin_name(plugin: object) -> str:
     """What a plugin is called in the log."""
     return type(plugin).__name__

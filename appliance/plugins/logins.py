@@ -23,42 +23,42 @@ from appliance.broker.ports import Identity, Refusal
 from appliance.config.redaction import redacted
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
-from appliance.plugins.adapters import Sessions, Unclaimed, login_of
+from appliance.plugins.adapters import SessionViews, UnclaimedIdentity, view_of_login
 from appliance.plugins.events import PluginEvents
-from appliance.plugins.guard import Guard, name
+from appliance.plugins.guard import PluginGuard, plugin_name
 from appliance.plugins.threads import Threads
 
 log = logging.getLogger(__name__)
 
 #: Logins that plugins are asked about at one time; others wait, as long as they may.
-LOGINS: Final = 64
+MAX_LOGINS: Final = 64
 
 #: The line of guesses that they wait in, if they have to.
-LINE: Final = "plugins"
+QUEUE: Final = "plugins"
 
 _STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
-_COME_AGAIN: Final = Refusal(
+_TRY_LATER: Final = Refusal(
     ReasonCode.SERVER_BUSY,
     "too many logins from its address were wrong, it has to come again "
     "(broker.limits.failed_logins)",
 )
 
 
-class Guesses(Protocol):
+class Throttle(Protocol):
     """How long a login has to wait because others were wrong."""
 
-    def turn(self, address: str, line: str = "", patience: float = ...) -> float | None:
+    def reserve(self, address: str, queue: str = "", max_wait: float = ...) -> float | None:
         """Seconds until the next one from this address is due; None when that is too long."""
 
-    def hold_up(self, username: str) -> float:
+    def user_delay(self, username: str) -> float:
         """Seconds because of wrong ones for the same user."""
 
-    def failed(self, address: str, username: str) -> None:
+    def record_failure(self, address: str, username: str) -> None:
         """One was wrong."""
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class CachePolicy:
     """How long a yes and a no of plugins hold, in seconds, and how many are kept of each kind.
 
     Topics are judged while messages wait: of them an answer holds a second at least.
@@ -68,7 +68,7 @@ class Answers:
     keep_refusals: float = 2.0
     size: int = 4096
 
-    def of_topic(self, *, allowed: bool) -> float:
+    def topic_lifetime(self, *, allowed: bool) -> float:
         """Seconds after which plugins are asked again about a topic."""
         return max(1.0, self.keep if allowed else self.keep_refusals)
 
@@ -88,14 +88,14 @@ class PluginLogins:
         self,
         broker: Broker,
         plugins: PluginManager[BrokerContext],
-        sessions: Sessions,
+        sessions: SessionViews,
         events: PluginEvents,
-        guard: Guard,
+        guard: PluginGuard,
         threads: Threads,
-        guesses: Guesses,
+        throttle: Throttle,
         epoch: Callable[[], int],
-        answers: Answers,
-        patience: float,
+        answers: CachePolicy,
+        max_wait: float,
     ) -> None:
         self._broker = broker
         self._plugins = plugins
@@ -103,14 +103,14 @@ class PluginLogins:
         self._events = events
         self._guard = guard
         self._threads = threads
-        self._guesses = guesses
+        self._throttle = throttle
         self._epoch = epoch
         self._answers = answers
-        self._patience = patience
+        self._max_wait = max_wait
         self._key = secrets.token_bytes(32)
         self._known: OrderedDict[bytes, tuple[_Outcome, float, int]] = OrderedDict()
         self._asking: dict[tuple[bytes, int], asyncio.Task[_Outcome]] = {}
-        self._free = asyncio.Semaphore(LOGINS)
+        self._free = asyncio.Semaphore(MAX_LOGINS)
 
     @property
     def authenticates(self) -> bool:
@@ -135,7 +135,7 @@ class PluginLogins:
             text = None if connect.password is None else connect.password.decode()
         except UnicodeDecodeError:
             return Refusal(ReasonCode.NOT_AUTHORIZED, "its password is not UTF-8"), None
-        login = login_of(connect, address, text, tls)
+        login = view_of_login(connect, address, text, tls)
         return await self.ask(login, address), login
 
     def admitted(
@@ -147,14 +147,14 @@ class PluginLogins:
         noted: object,
     ) -> None:
         """Remember the login for its connection, and hand an unclaimed session to its owner."""
-        if self._events.about_clients or self._plugins._topic_plugins:
+        if self._events.observes_clients or self._plugins._topic_plugins:
             login = cast("AmqttSession | None", noted)
             if login is None:  # its password is none of the plugins' business
-                login = login_of(connect, address, None, tls)
+                login = view_of_login(connect, address, None, tls)
                 login.username = identity.username
-            self._sessions.expect(address, login)
+            self._sessions.remember_login(address, login)
         session = self._broker.sessions.get(identity.client_id)
-        if session is not None and isinstance(session.identity, Unclaimed):
+        if session is not None and isinstance(session.identity, UnclaimedIdentity):
             log.info("the session that a plugin made is taken over by %s", identity)
             self._broker.claim(session, identity)
             self._broker.rules_changed()
@@ -167,11 +167,11 @@ class PluginLogins:
         """
         key = self._digest(login)
         epoch = self._epoch()
-        outcome = self._remembered(key, epoch)
+        outcome = self._cached(key, epoch)
         if outcome is None:
             asking = self._asking.get((key, epoch))
             if asking is None:
-                asking = asyncio.ensure_future(self._ask_in_turn(login, address, key, epoch))
+                asking = asyncio.ensure_future(self._ask_throttled(login, address, key, epoch))
                 self._asking[key, epoch] = asking
                 asking.add_done_callback(lambda _: self._asking.pop((key, epoch), None))
             # One that leaves does not cancel it for others who sent the same.
@@ -189,41 +189,41 @@ class PluginLogins:
         for asking in list(self._asking.values()):
             asking.cancel()
 
-    async def _ask_in_turn(
+    async def _ask_throttled(
         self, login: AmqttSession, address: str, key: bytes, epoch: int
     ) -> _Outcome:
-        turn = self._guesses.turn(address, LINE, self._patience)
+        turn = self._throttle.reserve(address, QUEUE, self._max_wait)
         if turn is None:
-            return _COME_AGAIN, {}, None
+            return _TRY_LATER, {}, None
         username = login.username or ""
-        delay = max(turn, self._guesses.hold_up(username))
+        delay = max(turn, self._throttle.user_delay(username))
         if delay:
             await asyncio.sleep(delay)
         who = await self._ask(login)
         outcome = who, login.attributes, login.is_anonymous
         if isinstance(who, Identity):
-            self._remember(key, outcome, self._answers.keep, epoch)
+            self._store(key, outcome, self._answers.keep, epoch)
         elif who.code == ReasonCode.NOT_AUTHORIZED:
-            self._guesses.failed(address, username)
-            self._remember(key, outcome, self._answers.keep_refusals, epoch)
+            self._throttle.record_failure(address, username)
+            self._store(key, outcome, self._answers.keep_refusals, epoch)
         return outcome
 
     async def _ask(self, login: AmqttSession) -> Identity | Refusal:
-        names = ", ".join(map(name, self._plugins._auth_plugins))
+        names = ", ".join(map(plugin_name, self._plugins._auth_plugins))
         try:
-            answers, vouched = await self._guard.within(self._ask_all(login))
+            answers, vouched = await self._guard.run(self._ask_all(login))
         except asyncio.TimeoutError:
             reason = f"{names} said nothing within {self._guard.timeout:g} s"
             return Refusal(ReasonCode.SERVER_UNAVAILABLE, reason)
         except Exception as error:  # a plugin may raise anything
             password = [login.password] if login.password else []
-            self._guard.tell(f"authentication by {names}", error, password)
+            self._guard.log_failure(f"authentication by {names}", error, password)
             reason = redacted(repr(error), [*password, *self._guard.secrets])
             return Refusal(ReasonCode.SERVER_UNAVAILABLE, f"{names} failed: {reason}")
         answered = {plugin: yes for plugin, yes in answers.items() if yes is not None}
         if not answered:
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{names} do not know the client")
-        refusing = ", ".join(name(plugin) for plugin, yes in answered.items() if not yes)
+        refusing = ", ".join(plugin_name(plugin) for plugin, yes in answered.items() if not yes)
         if refusing:
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"refused by {refusing}")
         return Identity(login.username if vouched else None, login.client_id or "")
@@ -249,13 +249,13 @@ class PluginLogins:
 
     # --- what they said ------------------------------------------------------------------------
 
-    def _remembered(self, key: bytes, epoch: int) -> _Outcome | None:
+    def _cached(self, key: bytes, epoch: int) -> _Outcome | None:
         outcome, until, then = self._known.get(key, (None, 0.0, 0))
         if then != epoch or asyncio.get_running_loop().time() >= until:
             return None
         return outcome
 
-    def _remember(self, key: bytes, outcome: _Outcome, seconds: float, epoch: int) -> None:
+    def _store(self, key: bytes, outcome: _Outcome, seconds: float, epoch: int) -> None:
         if not seconds or epoch != self._epoch():
             return
         self._known.pop(key, None)

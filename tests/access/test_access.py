@@ -991,11 +991,11 @@ async def test_too_many_that_wait_are_refused(
     assert await access.authenticate("alice", b"geheim", "c", "::1") == Identity("alice", "c")
     go.set()
     codes = [answer.code for answer in await asyncio.gather(*attack)]  # type: ignore[union-attr]
-    in_turn = access._checks._workers + 3
+    in_turn = access._hashing._workers + 3
     assert codes.count(busy) == 20 - in_turn
     assert codes.count(ReasonCode.NOT_AUTHORIZED) == in_turn
     assert isinstance(await access.authenticate("bob", b"x", "c", "::1"), Refusal)
-    assert access._checks.idle and not access._checking
+    assert access._hashing.idle and not access._checking
     access.close()
 
 
@@ -1019,8 +1019,8 @@ async def test_one_password_of_each_user_is_remembered_and_not_as_it_is(
     for password in (b"before", b"geheim"):
         for name in names:
             await access.authenticate(name, password, "c", "::1")
-    assert sorted(access._remembered) == sorted(names)
-    assert "geheim" not in repr(access._remembered)
+    assert sorted(access._verified) == sorted(names)
+    assert "geheim" not in repr(access._verified)
     monkeypatch.setattr(passwords_module, "check_password", lambda stored, password: False)
     for number, name in enumerate(names):
         # Not one of them was forgotten, and none is let in with the one before.
@@ -1029,7 +1029,7 @@ async def test_one_password_of_each_user_is_remembered_and_not_as_it_is(
         assert isinstance(await access.authenticate(name, b"before", "c", address), Refusal)
     write(files[0], f"user7:{stored}\n")
     access.reload()
-    assert list(access._remembered) == ["user7"]
+    assert list(access._verified) == ["user7"]
     access.close()
 
 

@@ -13,10 +13,10 @@ from statistics import median
 import pytest
 
 from appliance.access import FileAccess, Passwords
-from appliance.access import checks as checks_module
+from appliance.access import hashing as hashing_module
 from appliance.access import passwords as passwords_module
-from appliance.access import throttle as guesses_module
-from appliance.access.throttle import LoginThrottle, Recent
+from appliance.access import throttle as throttle_module
+from appliance.access.throttle import LoginThrottle, RecentKeys
 from appliance.broker.ports import Accepted, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 
@@ -36,44 +36,44 @@ class Clock:
 
 def test_an_address_that_guesses_is_slowed_more_and_more_and_forgiven() -> None:
     clock = Clock()
-    guesses = LoginThrottle(6, clock)
+    throttle = LoginThrottle(6, clock)
     waits = []
     for _ in range(16):
-        wait = guesses.turn("10.0.0.1:1")
+        wait = throttle.reserve("10.0.0.1:1")
         assert wait is not None
         waits.append(wait)
         clock.now += wait
-        guesses.failed("10.0.0.1:2", "alice")
+        throttle.record_failure("10.0.0.1:2", "alice")
     assert waits[:7] == [0.0] * 7
     assert all(0 < first < second for first, second in pairwise(waits[8:12]))
-    assert max(waits) <= guesses_module.LONGEST_DELAY
-    assert guesses.turn("10.0.0.1:3", patience=0.0) is None
-    assert guesses.turn("10.0.0.1:3", "another line", patience=0.0) == 0.0
-    assert guesses.turn("10.0.0.2:1", patience=0.0) == 0.0
+    assert max(waits) <= throttle_module.LONGEST_DELAY
+    assert throttle.reserve("10.0.0.1:3", max_wait=0.0) is None
+    assert throttle.reserve("10.0.0.1:3", "another line", max_wait=0.0) == 0.0
+    assert throttle.reserve("10.0.0.2:1", max_wait=0.0) == 0.0
     clock.now += 200
-    assert [guesses.turn("10.0.0.1:3") for _ in range(3)] == [0.0] * 3
-    assert guesses.hold_up("alice") == 0.0
+    assert [throttle.reserve("10.0.0.1:3") for _ in range(3)] == [0.0] * 3
+    assert throttle.user_delay("alice") == 0.0
 
 
 def test_a_user_that_many_guess_at_is_held_up_for_a_bounded_time() -> None:
-    guesses = LoginThrottle(6, Clock())
+    throttle = LoginThrottle(6, Clock())
     for number in range(100):
-        guesses.failed(f"10.0.0.{number}", "alice")
-    assert guesses.hold_up("alice") == guesses_module.USER_PATIENCE
+        throttle.record_failure(f"10.0.0.{number}", "alice")
+    assert throttle.user_delay("alice") == throttle_module.MAX_USER_DELAY
     # Beside each other: the second does not wait for the first.
-    assert guesses.hold_up("alice") == guesses_module.USER_PATIENCE
-    assert guesses.hold_up("bob") == 0.0
-    assert guesses.turn("10.0.0.200", patience=0.0) == 0.0
+    assert throttle.user_delay("alice") == throttle_module.MAX_USER_DELAY
+    assert throttle.user_delay("bob") == 0.0
+    assert throttle.reserve("10.0.0.200", max_wait=0.0) == 0.0
 
 
 def test_what_is_remembered_of_guessers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guesses_module, "REMEMBERED", 100)
-    guesses = LoginThrottle(6, Clock())
+    monkeypatch.setattr(throttle_module, "MAX_ENTRIES", 100)
+    throttle = LoginThrottle(6, Clock())
     for number in range(1000):
-        guesses.failed(f"10.0.{number // 250}.{number % 250}", "x" * 60_000 + str(number))
-    assert len(guesses._networks) == len(guesses._users) == 100
-    assert sum(map(len, guesses._users)) == 100 * 16
-    recent = Recent(10)
+        throttle.record_failure(f"10.0.{number // 250}.{number % 250}", "x" * 60_000 + str(number))
+    assert len(throttle._networks) == len(throttle._users) == 100
+    assert sum(map(len, throttle._users)) == 100 * 16
+    recent = RecentKeys(10)
     for number in range(100):
         recent.add(b"%d" % number)
     assert b"99" in recent and b"90" in recent and b"89" not in recent
@@ -82,9 +82,9 @@ def test_what_is_remembered_of_guessers_is_bounded(monkeypatch: pytest.MonkeyPat
 def guessing(access: FileAccess, address: str, username: str = "alice") -> None:
     """Make as if so many guesses had failed that the next ones wait for minutes."""
     for _ in range(60):
-        access.guesses.failed(address, username)
+        access.throttle.record_failure(address, username)
     for line in ("", "SCRAM-SHA-256"):
-        while access.guesses.turn(address, line, patience=60.0) is not None:
+        while access.throttle.reserve(address, line, max_wait=60.0) is not None:
             pass
 
 
@@ -96,7 +96,7 @@ def code_of(answer: Identity | Refusal) -> ReasonCode:
 async def test_guesses_do_not_keep_out_who_was_here_before_nor_another_address(
     access: FileAccess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.1)
+    monkeypatch.setattr(throttle_module, "MAX_USER_DELAY", 0.1)
     guessing(access, "10.0.0.1:1")
     checks = count_checks(monkeypatch)
     # Nothing is hashed for who guesses on, and it learns nothing about users.
@@ -118,7 +118,7 @@ async def test_guesses_do_not_keep_out_who_was_here_before_nor_another_address(
 async def test_who_comes_again_does_not_wait_behind_those_who_guess(
     access: FileAccess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guesses_module, "USER_PATIENCE", 0.0)
+    monkeypatch.setattr(throttle_module, "MAX_USER_DELAY", 0.0)
     guessing(access, "10.0.0.1:1", "eve")
     right = "alice", b"geheim", "c", "10.0.0.1:1"
     assert code_of(await access.authenticate(*right)) == ReasonCode.SERVER_BUSY
@@ -137,7 +137,7 @@ async def test_a_device_with_a_wrong_password_costs_one_hash_and_slows_nobody(
     for _ in range(100):
         assert code_of(await access.authenticate(*wrong)) == ReasonCode.NOT_AUTHORIZED
     assert len(checks) == 1
-    assert access.guesses.delay("10.0.0.1") == access.guesses.hold_up("alice") == 0.0
+    assert access.throttle.address_delay("10.0.0.1") == access.throttle.user_delay("alice") == 0.0
 
 
 async def test_a_password_that_was_wrong_may_be_right_after_a_reload(
@@ -157,7 +157,7 @@ async def test_a_proof_is_a_guess_too(files: tuple[Path, Path]) -> None:
     passwords.set("sally", "geheim", for_scram=True)
     passwords.save()
     access = FileAccess(*files, "r2d2", failed_logins=5)
-    access.guesses = LoginThrottle(5, Clock())  # however long the passwords take
+    access.throttle = LoginThrottle(5, Clock())  # however long the passwords take
 
     def log_in(password: str, address: str | None, user: str = "sally") -> ReasonCode | None:
         exchange = access.exchange("SCRAM-SHA-256", address)
@@ -204,9 +204,9 @@ async def test_each_address_has_its_turn_and_its_place(
     go.set()
     assert await owner == ReasonCode.SUCCESS
     # One of the flood gave up its place, and no more than those with a thread came before.
-    assert ended.index("10.0.0.2") <= turned_away + access._checks._workers + 1
+    assert ended.index("10.0.0.2") <= turned_away + access._hashing._workers + 1
     codes = await asyncio.gather(*flood)
-    assert codes.count(ReasonCode.SERVER_BUSY) == 25 - 20 - access._checks._workers + 1
+    assert codes.count(ReasonCode.SERVER_BUSY) == 25 - 20 - access._hashing._workers + 1
     access.close()
 
 
@@ -228,8 +228,8 @@ async def test_a_stranger_cannot_tell_by_the_time_who_is_a_user(access: FileAcce
 
 
 def test_passwords_are_hashed_behind_everything_else(access: FileAccess) -> None:
-    priority = access._checks._pool.submit(
+    priority = access._hashing._pool.submit(
         lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     )
     process = os.getpriority(os.PRIO_PROCESS, os.getpid())
-    assert priority.result() == min(19, process + checks_module.NICE)
+    assert priority.result() == min(19, process + hashing_module.NICE)

@@ -61,8 +61,8 @@ ALLOWED = {
     # Another object's, which hands it on to the ROS thread's executor and contains it there.
     ("ros/calls/*", "call_soon"),
     ("ros/ros1/*", "call_soon"),
-    # A future that `checks` settles itself; and one that the login waits for, and with it ends.
-    ("access/checks.py", "add_done_callback"),
+    # A future that `hashing` settles itself; and one that the login waits for, and with it ends.
+    ("access/hashing.py", "add_done_callback"),
     ("access/files.py", "create_task"),
     ("access/files.py", "add_done_callback"),
     # Waited for where they are made, or made so that nothing escapes: plugins may raise anything.

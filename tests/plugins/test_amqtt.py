@@ -41,8 +41,8 @@ from appliance.mqtt.packets import Connect, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
 from appliance.plugins import (
-    Answers,
     ApplianceBroker,
+    CachePolicy,
     PluginSettingsError,
     access,
     configuration,
@@ -258,7 +258,7 @@ async def running(
     acl: Path | None = None,
     anonymous: bool = False,
     plugin_timeout: float = PATIENCE,
-    answers: Answers = Answers(0.0, 0.0),  # noqa: B008 (it is frozen)
+    answers: CachePolicy = CachePolicy(0.0, 0.0),  # noqa: B008 (it is frozen)
     secrets: Iterable[str] = (),
 ) -> AsyncIterator[Rig]:
     files = FileAccess(users, acl, "robot", anonymous)
@@ -627,7 +627,7 @@ async def test_what_waits_for_a_plugin_keeps_nobody_else() -> None:
 @pytest.mark.parametrize("strangers", [1, 4])
 async def test_who_may_receive_it_holds_nobody_elses_message(strangers: int) -> None:
     """A new client that subscribes to all is asked about, for ever: who publishes goes on."""
-    async with running({**OPEN, own(Gate): {}}, answers=Answers(600.0, 600.0)) as rig:
+    async with running({**OPEN, own(Gate): {}}, answers=CachePolicy(600.0, 600.0)) as rig:
         ann, bob = await rig.connect("ann:x", "a1"), await rig.connect("bob:x", "b1")
         await bob.subscribe([("x", 1)])
         await ann.publish("x", b"first", qos=1)
@@ -637,7 +637,7 @@ async def test_who_may_receive_it_holds_nobody_elses_message(strangers: int) -> 
         Gate.answers["x"] = "hang"
         for n in range(4):
             await asyncio.wait_for(ann.publish("x", b"%d" % n, qos=1), PATIENCE / 2)
-        asked = [question for question in rig.frame._access._asked if question[2] == "x"]
+        asked = [query for query in rig.frame._access._asked if query[2] == "x"]
         newcomers_ids = {f"e{n}" for n in range(strangers)}
         assert {who.client_id for who, _, _ in asked} == newcomers_ids, "nothing is known yet"
         assert [(await receive(bob)).data for _ in range(5)] == [b"first", b"0", b"1", b"2", b"3"]
@@ -649,7 +649,7 @@ async def test_who_may_receive_it_is_waited_for_for_a_moment(
     """So that a plugin that answers soon lets a new subscriber have the first message, too."""
     monkeypatch.setattr(network_client, "RIGHTS_PATIENCE", PATIENCE)
     monkeypatch.setattr(Gate, "delay", 0.02)
-    async with running({**OPEN, own(Gate): {}}, answers=Answers(600.0, 600.0)) as rig:
+    async with running({**OPEN, own(Gate): {}}, answers=CachePolicy(600.0, 600.0)) as rig:
         ann, eve = await rig.connect("ann:x", "a1"), await rig.connect("eve:x", "e1")
         await eve.subscribe([("#", 1)])
         await ann.publish("x", b"first", qos=1)
@@ -672,24 +672,24 @@ async def test_who_leaves_while_a_plugin_is_asked_is_forgotten() -> None:
 async def test_more_questions_than_there_is_room_for_wait_in_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(access, "QUESTIONS", 2)
+    monkeypatch.setattr(access, "MAX_QUERIES", 2)
     monkeypatch.setattr(Gate, "delay", 0.02)
     async with running({**OPEN, own(Gate): {}}) as rig:
         several = [await rig.connect(f"user{n}:x", f"c{n}") for n in range(6)]
         codes = await asyncio.gather(*(each.subscribe([("a", 1)]) for each in several))
         assert codes == [[1]] * 6
-        assert rig.frame._access._line == {}
+        assert rig.frame._access._waiting_for_room == {}
 
 
 async def test_one_user_leaves_room_for_the_questions_of_others() -> None:
     Gate.answers["hang"] = "hang"
     async with running({own(Gate): {}}, plugin_timeout=SHORT) as rig:
         decide, asked = rig.frame._access.decide, rig.frame._access._asked
-        for number in range(access.QUESTIONS):
+        for number in range(access.MAX_QUERIES):
             decide(Identity("eve", f"e{number}"), Action.PUBLISH, "hang")
-        assert len(asked) == access.USER_QUESTIONS
+        assert len(asked) == access.MAX_USER_QUERIES
         decide(Identity("ann", "a1"), Action.PUBLISH, "hang")
-        assert len(asked) == access.USER_QUESTIONS + 1
+        assert len(asked) == access.MAX_USER_QUERIES + 1
         await until(lambda: asked == {})
 
 
@@ -710,21 +710,21 @@ async def test_an_answer_in_the_background_that_turns_to_no(
         assert await answered()
         assert rig.broker.router.epoch > epoch
         assert len(Gate.asked) == 1
-        monkeypatch.setattr(Answers, "of_topic", lambda self, allowed: 0.0)
+        monkeypatch.setattr(CachePolicy, "topic_lifetime", lambda self, allowed: 0.0)
         Gate.answers["a"] = None
         assert decide(me, Action.PUBLISH, "a")  # holds while it is asked again
         assert "Gate" in (await answered()).reason
         Gate.answers["a"] = True
         assert not decide(me, Action.PUBLISH, "a")
         assert await answered()
-        monkeypatch.setattr(access, "VERDICT_USE", 0.0)
+        monkeypatch.setattr(access, "STALE_VERDICT_LIFETIME", 0.0)
         assert not await answered()  # too old to hold
 
 
 async def test_questions_and_answers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(access, "QUESTIONS", 3)
-    monkeypatch.setattr(access, "CLIENT_QUESTIONS", 2)
-    async with running({own(Gate): {}}, answers=Answers(size=2)) as rig:
+    monkeypatch.setattr(access, "MAX_QUERIES", 3)
+    monkeypatch.setattr(access, "MAX_CLIENT_QUERIES", 2)
+    async with running({own(Gate): {}}, answers=CachePolicy(size=2)) as rig:
         frame_access = rig.frame._access
         asked = [("bob", 0), ("bob", 1), ("bob", 2), ("eve", 0), ("eve", 1), ("ann", 0)]
         reasons = [
@@ -881,7 +881,7 @@ async def test_slow_plugins_lose_events_and_delay_nothing(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(events, "EVENTS", 20)
+    monkeypatch.setattr(events, "MAX_EVENTS", 20)
     async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
         bob = await rig.connect("bob:secret", "b1")
         await bob.subscribe([("a", 1)])
@@ -897,7 +897,7 @@ async def test_slow_plugins_lose_events_and_delay_nothing(
 async def test_events_are_bounded_in_bytes(
     amqtt_users: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "EVENT_BYTES", 1000)
+    monkeypatch.setattr(events, "MAX_EVENT_BYTES", 1000)
     async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
         bob = await rig.connect("bob:secret", "b1")
         for _ in range(5):

@@ -20,7 +20,7 @@ from appliance.broker.ports import Action, Decision, Identity, Refusal
 from appliance.config import secrets_in
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
-from appliance.plugins import Answers, PluginSettingsError
+from appliance.plugins import CachePolicy, PluginSettingsError
 from appliance.plugins import logins as logins_module
 
 pytest.importorskip("sqlalchemy", reason="amqtt.contrib needs SQLAlchemy: pip install sqlalchemy")
@@ -183,7 +183,7 @@ async def test_a_server_that_hangs_holds_up_nobody_else(backend: Backend, tmp_pa
 async def test_so_many_at_once_and_no_more(
     backend: Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(logins_module, "LOGINS", 3)
+    monkeypatch.setattr(logins_module, "MAX_LOGINS", 3)
     async with running(backend.plugins(), plugin_timeout=1.5) as rig:
         asks = [
             rig.login.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
@@ -202,7 +202,7 @@ async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
     monkeypatch.setattr(loop, "time", lambda: clock() + ahead)
     users = tmp_path / "users.passwd"
     users.touch(0o600)
-    async with running(backend.plugins(), users=users, answers=Answers(600, 200)) as rig:
+    async with running(backend.plugins(), users=users, answers=CachePolicy(600, 200)) as rig:
 
         async def ask(password: str = PASSWORD, client_id: str = "c1") -> ReasonCode:
             return code_of(await rig.login.authenticate(bob(client_id, password), HOST))
@@ -225,7 +225,7 @@ async def test_answers_hold_for_a_while_a_no_shorter_and_none_across_a_reload(
 
 
 async def test_what_is_kept_is_bounded_and_holds_no_password(backend: Backend) -> None:
-    async with running(backend.plugins(), answers=Answers(60, 60, size=10)) as rig:
+    async with running(backend.plugins(), answers=CachePolicy(60, 60, size=10)) as rig:
         asks = [rig.login.authenticate(bob(f"c{number}"), HOST) for number in range(30)]
         await asyncio.gather(*asks)
         logins = rig.frame.logins
@@ -242,13 +242,13 @@ async def test_the_same_login_many_times_at_once_is_one_question(backend: Backen
 
 async def test_wrong_passwords_for_plugins_are_guesses_too(backend: Backend) -> None:
     async with running(backend.plugins()) as rig:
-        rig.files.guesses._allowed = 5
+        rig.files.throttle._allowed = 5
         answers = [
             await rig.login.authenticate(bob(password=str(number)), f"{HOST}{number}")
             for number in range(8)
         ]
         assert [code_of(answer) for answer in answers[:5]] == [ReasonCode.NOT_AUTHORIZED] * 5
-        while rig.files.guesses.turn(HOST, logins_module.LINE, patience=60.0) is not None:
+        while rig.files.throttle.reserve(HOST, logins_module.QUEUE, max_wait=60.0) is not None:
             pass
         asked = len(backend.asked)
         assert code_of(await rig.login.authenticate(bob(), HOST)) == ReasonCode.SERVER_BUSY
@@ -257,14 +257,14 @@ async def test_wrong_passwords_for_plugins_are_guesses_too(backend: Backend) -> 
 
 
 async def test_what_plugins_noted_of_a_login_is_there_again() -> None:
-    async with running({own(Login): {}}, answers=Answers()) as rig:
+    async with running({own(Login): {}}, answers=CachePolicy()) as rig:
         for client_id in ("c1", "c1"):
             connect = bob(client_id)
             assert isinstance(await rig.login.authenticate(connect, HOST), Identity)
         first = Login.seen
         assert len(first) == 1
-        shown = rig.frame._views._logins.get(HOST)
-        assert shown is None or shown.attributes == {"test.login": 1}
+        view = rig.frame._views._logins.get(HOST)
+        assert view is None or view.attributes == {"test.login": 1}
 
 
 @pytest.mark.parametrize("mode", ["GET", "POST"])

@@ -18,11 +18,11 @@ NICE: Final = 10
 T = TypeVar("T")
 
 
-class BusyError(Exception):
+class QueueFullError(Exception):
     """As many wait for a check as may."""
 
 
-class Checks(Generic[T]):
+class HashingPool(Generic[T]):
     """Runs checks in `workers` threads; `max_waiting` may wait for one. On the event loop.
 
     Each lane has its turn, whatever waits in the others. When no more may wait, who comes takes
@@ -36,8 +36,8 @@ class Checks(Generic[T]):
         self._running = 0
         self._waiting = 0
         self._closed = False
-        self._lanes: OrderedDict[bytes, deque[tuple[asyncio.Future[T], Callable[[], T]]]]
-        self._lanes = OrderedDict()
+        self._queues: OrderedDict[bytes, deque[tuple[asyncio.Future[T], Callable[[], T]]]]
+        self._queues = OrderedDict()
         self._pool = ThreadPoolExecutor(
             workers, thread_name_prefix="password", initializer=_stand_back
         )
@@ -47,7 +47,7 @@ class Checks(Generic[T]):
         """Whether nothing runs and nothing waits."""
         return not (self._running or self._waiting)
 
-    async def run(self, lane: bytes, check: Callable[[], T]) -> T:
+    async def run(self, queue: bytes, check: Callable[[], T]) -> T:
         """The result of the check, which must not raise.
 
         Raises:
@@ -57,9 +57,9 @@ class Checks(Generic[T]):
         if self._closed:
             raise asyncio.CancelledError
         if self._waiting >= self._max_waiting and self._running >= self._workers:
-            self._make_room(lane)
+            self._make_room(queue)
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        self._lanes.setdefault(lane, deque()).append((future, check))
+        self._queues.setdefault(queue, deque()).append((future, check))
         self._waiting += 1
         self._start_next()
         return await future
@@ -67,29 +67,29 @@ class Checks(Generic[T]):
     def close(self) -> None:
         """Cancel what waits, and wait for what runs. May be called twice."""
         self._closed = True
-        for lane in self._lanes.values():
-            for future, _ in lane:
+        for queue in self._queues.values():
+            for future, _ in queue:
                 with contextlib.suppress(RuntimeError):  # its event loop may be closed already
                     future.cancel()
-        self._lanes.clear()
+        self._queues.clear()
         self._waiting = 0
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def _make_room(self, lane: bytes) -> None:
-        longest = max(self._lanes, key=lambda name: len(self._lanes[name]), default=lane)
-        if len(self._lanes.get(longest, ())) <= len(self._lanes.get(lane, ())) + 1:
-            raise BusyError
-        future, _ = self._lanes[longest].pop()
+    def _make_room(self, queue: bytes) -> None:
+        longest = max(self._queues, key=lambda name: len(self._queues[name]), default=queue)
+        if len(self._queues.get(longest, ())) <= len(self._queues.get(queue, ())) + 1:
+            raise QueueFullError
+        future, _ = self._queues[longest].pop()
         self._waiting -= 1
         if not future.done():
-            future.set_exception(BusyError())
+            future.set_exception(QueueFullError())
 
     def _start_next(self) -> None:
-        while self._lanes and self._running < self._workers:
-            name, lane = self._lanes.popitem(last=False)
-            future, check = lane.popleft()
-            if lane:
-                self._lanes[name] = lane  # the others' turn is before its next
+        while self._queues and self._running < self._workers:
+            name, queue = self._queues.popitem(last=False)
+            future, check = queue.popleft()
+            if queue:
+                self._queues[name] = queue  # the others' turn is before its next
             self._waiting -= 1
             if future.done():  # who wanted to know has gone
                 continue
