@@ -1,7 +1,7 @@
-"""Whole arrays and wide strings, read and written at once: what generated code calls.
+"""Readers and writers of whole arrays and wide strings, which generated code calls.
 
-As generated code does, these take only what is exactly right, and raise anything else than a
-ConversionError when it is not.
+Like generated code they accept only values of exactly the right types, and raise one of
+`codegen.MISFIT` for others: the fallback then converts the message, or names what is wrong.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pybase64
 
 from appliance.ros.payload.definitions import CDR, PRIMITIVES, Primitive
 
-# Fewer numbers than this have a Struct prepared, and are not worth numpy's detour.
+# Arrays of fewer numbers than this use a prepared Struct: numpy would take longer.
 _FEW = 32
 
 _BOOLS = frozenset({bool})
@@ -29,7 +29,7 @@ _NUMBERS_AND_NULL = frozenset({int, float, type(None)})
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """An array of numbers as it is on the wire, in little endian."""
+    """An array of numbers in its serialized form, little endian."""
 
     primitive: Primitive
     data: bytes
@@ -40,9 +40,9 @@ class Numbers:
 
 
 def unpack_numbers(code: str, data: bytes) -> list[Any]:
-    """The numbers that `data` is: `code` is `struct`'s, the byte order and one number.
+    """The numbers in `data`. `code` is a `struct` format: the byte order and one number.
 
-    Raises ValueError when it ends within a number.
+    Raises ValueError when `data` ends within a number.
     """
     count, left = divmod(len(data), struct.calcsize(code))
     if left:
@@ -51,7 +51,7 @@ def unpack_numbers(code: str, data: bytes) -> list[Any]:
 
 
 def _octets(value: Any) -> bytes:
-    """uint8[] and its like: base64 in JSON, bytes from `careful.accept`."""
+    """The bytes of uint8[], byte[] or char[]: base64 in JSON, bytes from `fallback.accept`."""
     if value.__class__ is str:
         return pybase64.b64decode(value, validate=True)
     if value.__class__ is bytes:
@@ -62,7 +62,7 @@ def _octets(value: Any) -> bytes:
 
 
 def _listed(value: Any) -> list[Any]:
-    """The list that stands for an array of numbers which is none."""
+    """The list of an array of numbers that is not a list already."""
     if isinstance(value, Numbers):
         return value.listed()
     raise TypeError
@@ -81,7 +81,7 @@ def _read_wide_string(b: bytes, q: int, count: int) -> str:
 
 
 def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
-    """The function that writes a whole list of numbers."""
+    """The function that serializes a whole list of numbers."""
     code = primitive.code
     few = [struct.Struct(f"<{count}{code}").pack for count in range(_FEW)]
     types = _BOOLS if primitive.name == "bool" else _INTEGERS
@@ -94,7 +94,7 @@ def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
         count = len(values)
         pack = few[count] if count < _FEW else struct.Struct(f"<{count}{code}").pack
         try:
-            # conjugate gives a float as it is, and refuses all else: the cheapest test there is.
+            # conjugate returns a float unchanged and refuses other types: the cheapest check.
             return pack(*map(float.conjugate, values))
         except TypeError:
             if not _NUMBERS_AND_NULL.issuperset(map(type, values)):
@@ -116,10 +116,11 @@ def _writer(primitive: Primitive) -> Callable[[Any], bytes]:
 
 
 def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int], Any]:
-    """The function that reads `count` numbers at `q`, all checked to be there."""
+    """The function that reads `count` numbers at `q`. It raises IndexError or struct.error when the
+    message ends before them."""
     code, size = primitive.code, primitive.size
     few = [struct.Struct(f"<{count}{code}").unpack_from for count in range(_FEW)]
-    # float32 always by numpy, so that its digits do not depend on how many there are.
+    # float32 is always read by numpy, so that its digits do not depend on the length of the array.
     fewest = 1 if code == "f" else _FEW
 
     def read_octets(b: bytes, q: int, count: int) -> str:
@@ -147,15 +148,15 @@ def _reader(primitive: Primitive, with_numpy: bool) -> Callable[[bytes, int, int
         end = q + count * size
         if end > len(b):
             raise IndexError
-        # A slice, because the numbers in it are aligned in memory as well.
+        # numpy needs the numbers aligned in memory; those of a slice are.
         return frombuffer(b[q:end], code)
 
     return read_array
 
 
 def _frombuffer() -> Callable[[bytes, str], Any] | None:
-    """numpy's, where there is numpy (every rclpy brings it), on a little-endian machine. It is
-    imported when it is first needed: that takes longer than all else."""
+    """numpy's frombuffer; None without numpy, which every rclpy depends on, or on a big-endian
+    machine. numpy is imported on first use, as the import takes longer than all else here."""
     if sys.byteorder != "little":
         return None
     try:
@@ -167,7 +168,8 @@ def _frombuffer() -> Callable[[bytes, str], Any] | None:
 
 @cache
 def readers(with_numpy: bool) -> dict[str, Any]:
-    """What decoders call. With numpy, long arrays come as numpy's, else as lists."""
+    """The names that generated decoders call. Long arrays become numpy arrays when `with_numpy`,
+    else lists."""
     return {
         "LITTLE_ENDIAN": CDR.header[:2],
         "base64": pybase64.b64encode_as_string,
@@ -176,12 +178,12 @@ def readers(with_numpy: bool) -> dict[str, Any]:
     }
 
 
-def _as_it_is(value: bytes) -> bytes:
+def _unchanged(value: bytes) -> bytes:
     return value
 
 
 def _binary_reader(primitive: Primitive) -> Callable[[bytes, int, int], Any]:
-    """The function that reads `count` numbers at `q` without looking at them."""
+    """The function that copies `count` numbers at `q` without decoding them."""
     size = primitive.size
 
     def read_octets(b: bytes, q: int, count: int) -> bytes:
@@ -199,8 +201,8 @@ def _binary_reader(primitive: Primitive) -> Callable[[bytes, int, int], Any]:
     return read_octets if primitive.is_octet else read_numbers
 
 
-def _row(primitive: Primitive) -> Callable[..., Any]:
-    """The function that makes an array of numbers that have been read one by one."""
+def _inline_array(primitive: Primitive) -> Callable[..., Any]:
+    """The function that makes an array of numbers that were read one by one."""
     code = primitive.code
     if primitive.name == "bool":
         return lambda *values: list(values)
@@ -209,19 +211,20 @@ def _row(primitive: Primitive) -> Callable[..., Any]:
 
 @cache
 def binary_readers() -> dict[str, Any]:
-    """What decoders call that leave arrays of numbers as they are; those of bools are lists."""
+    """The names that generated decoders call which only copy arrays of numbers. Arrays of bools
+    become lists."""
     bools = PRIMITIVES["bool"]
     return {
         "LITTLE_ENDIAN": CDR.header[:2],
-        "base64": _as_it_is,
+        "base64": _unchanged,
         "read_wide_string": _read_wide_string,
         **{f"read_{p.name}": _binary_reader(p) for p in PRIMITIVES.values()},
         "read_bool": _reader(bools, with_numpy=False),
-        **{f"numbers_{p.name}": _row(p) for p in PRIMITIVES.values()},
+        **{f"numbers_{p.name}": _inline_array(p) for p in PRIMITIVES.values()},
     }
 
 
-# What encoders call.
+# The names that generated encoders call.
 WRITERS: dict[str, Any] = {
     "HEADER": CDR.header,
     "ZEROS": bytes(8),

@@ -1,15 +1,15 @@
-"""Python source for one message type: `decode` and `encode`, straight between wire and values.
+"""Generates Python source for one message type: `decode` and `encode`, from and to its bytes.
 
-What can be known beforehand is worked out here, once a type: neighbouring numbers are read and
-written by one precompiled `struct.Struct` (a *run*), nested messages are laid flat, and padding is
+Everything that the type determines is computed here, once a type. Neighbouring numbers are read and
+written by one precompiled `struct.Struct` (a *run*), nested messages are flattened, and padding is
 part of the run. CDR aligns a number to its size, counted from the end of the four bytes of header.
-While the position modulo 8 is known, a run has one layout; after a string it has up to eight, and
-the position picks one of them. ROS 1 aligns nothing, so that there every run has one layout.
+While the position modulo 8 is known, a run has one layout. After a string it has up to eight, and
+the position selects one of them. ROS 1 aligns nothing, so that every run has one layout there.
 
-Of a message of which only some fields are wanted, what is passed over is not read at all.
+When only some fields of a message are wanted, the others are skipped without being read.
 
-Generated code never takes what careful.py would refuse. It need not take all else: it raises one of
-`MISFIT`, and the caller goes the careful way, which mends or names what was wrong.
+Generated code never accepts a message that fallback.py would refuse. It may refuse others: it then
+raises one of `MISFIT`, and the caller takes the fallback, which corrects or names what is wrong.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from appliance.ros.payload.definitions import (
     WideString,
 )
 
-# What generated code raises when a message is not exactly as expected.
+# The errors that generated code raises when a message is not exactly as expected.
 MISFIT = (
     KeyError,
     IndexError,
@@ -53,8 +53,11 @@ _PADDING = Primitive("padding", "x", 1)
 
 
 class GeneratedConverters(NamedTuple):
-    """The functions of a type, and their source. Where `decode_plain` gives lists, `decode` gives
-    numpy arrays, which orjson writes faster and, those of float32, in half the digits."""
+    """The functions of a type, and their source.
+
+    `decode_plain` returns arrays as lists. `decode` returns numpy arrays, which orjson writes
+    faster and, for float32, with half the digits.
+    """
 
     decode: Callable[[bytes], dict[str, Any]]
     decode_plain: Callable[[bytes], dict[str, Any]]
@@ -63,27 +66,31 @@ class GeneratedConverters(NamedTuple):
 
 
 class Checker(NamedTuple):
-    """The function that reads a type for nothing but to see that it can be read, and its source.
-    It gives up with OverBudgetError when that is more work than it may be (see weigh.py)."""
+    """The function that checks that a message of a type can be read, and its source.
+
+    It raises OverBudgetError when the message costs more than it may (cost.py).
+    """
 
     check: Callable[[bytes, int], object]
     source: str
 
 
 class OverBudgetError(Exception):
-    """A message is more work than it may be."""
+    """A message costs more than it may."""
 
 
 class BinaryDecoder(NamedTuple):
-    """The function that reads a type for encodings that have bytes, and its source. Octets are
-    bytes, and other arrays of numbers `arrays.Numbers`."""
+    """The function that reads a type for encodings with byte strings, and its source.
+
+    Octets become bytes, and other arrays of numbers `arrays.Numbers`.
+    """
 
     decode: Callable[[bytes], dict[str, Any]]
     source: str
 
 
 def generate_binary(description: TypeDescription, wanted: Selection | None = None) -> BinaryDecoder:
-    """Generates and compiles the reader of a type, or of some of its fields."""
+    """Generates and compiles the binary decoder of a type, or of some of its fields."""
     decoder = _Decoder(description.serialization, wanted, "numbers_{}({})")
     source = decoder.function(description)
     namespace = {**decoder.constants, **binary_readers()}
@@ -92,7 +99,7 @@ def generate_binary(description: TypeDescription, wanted: Selection | None = Non
 
 
 def generate_checker(description: TypeDescription) -> Checker:
-    """Generates and compiles the function that looks whether a message is one of the type."""
+    """Generates and compiles the function that checks whether a message is one of the type."""
     decoder = _Decoder(description.serialization, None, has_budget=True)
     source = decoder.function(description)
     namespace = {**decoder.constants, **binary_readers(), "OverBudgetError": OverBudgetError}
@@ -101,7 +108,8 @@ def generate_checker(description: TypeDescription) -> Checker:
 
 
 def generate(description: TypeDescription, wanted: Selection | None = None) -> GeneratedConverters:
-    """Generates and compiles the converters of a type; those that decode, of some of its fields."""
+    """Generates and compiles the converters of a type. With `wanted`, the decoders read only these
+    fields."""
     decoder, encoder = (
         _Decoder(description.serialization, wanted),
         _Encoder(description.serialization),
@@ -116,12 +124,12 @@ def generate(description: TypeDescription, wanted: Selection | None = None) -> G
     return GeneratedConverters(fast["decode"], plain["decode"], encoding["encode"], source)
 
 
-# --- where we are ---------------------------------------------------------------------------
+# --- what is known of the position ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What is known of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1).
+    """What is known of the alignment of a position: it is `rest` modulo `modulus` (8, 4, 2 or 1).
 
     Nothing is aligned to more than `most`.
     """
@@ -143,48 +151,48 @@ class Alignment:
     def advance(self, count: int) -> Alignment:
         return Alignment(self.modulus, (self.rest + count) % self.modulus, self.most)
 
-    def lost(self, modulus: int = 1) -> Alignment:
-        """What is known behind something unknown: it ends at a multiple of `modulus`."""
+    def after_unknown(self, modulus: int = 1) -> Alignment:
+        """The alignment behind a value of unknown size, which ends at a multiple of `modulus`."""
         return Alignment(modulus, 0, self.most)
 
     def join(self, other: Alignment) -> Alignment:
-        """What is known when it may be this or the other."""
+        """The alignment that holds for both."""
         modulus = min(self.modulus, other.modulus)
         while self.rest % modulus != other.rest % modulus:
             modulus //= 2
         return Alignment(modulus, self.rest % modulus, self.most)
 
 
-def _after(type_: FieldType, phase: Alignment) -> Alignment:
-    """What is known of the position behind a value, given what is known before it."""
+def _after(type_: FieldType, alignment: Alignment) -> Alignment:
+    """The alignment behind a value, given the alignment before it."""
     if isinstance(type_, Primitive):
-        return phase.align(type_.size).advance(type_.size)
+        return alignment.align(type_.size).advance(type_.size)
     if isinstance(type_, String):
-        return phase.lost()
+        return alignment.after_unknown()
     if isinstance(type_, WideString):
-        return phase.lost(4)
+        return alignment.after_unknown(4)
     if isinstance(type_, TypeDescription):
         for field in type_.fields:
-            phase = _after(field.type, phase)
-        return phase if type_.fields else phase.advance(len(type_.serialization.empty))
+            alignment = _after(field.type, alignment)
+        return alignment if type_.fields else alignment.advance(len(type_.serialization.empty))
     if isinstance(type_, Sequence):
-        phase = phase.align(4).advance(4)
-        return phase.join(_after(type_.item, _loop_phase(type_.item, phase)))
+        alignment = alignment.align(4).advance(4)
+        return alignment.join(_after(type_.item, _loop_alignment(type_.item, alignment)))
     if isinstance(type_.item, Primitive):
-        return phase.align(type_.item.size).advance(type_.item.size * type_.length)
-    return _after(type_.item, _loop_phase(type_.item, phase))
+        return alignment.align(type_.item.size).advance(type_.item.size * type_.length)
+    return _after(type_.item, _loop_alignment(type_.item, alignment))
 
 
-def _loop_phase(item: FieldType, phase: Alignment) -> Alignment:
-    """What is known at the beginning of every round of a loop over items."""
-    phase = phase.align(_first_size(item))
-    while (joined := phase.join(_after(item, phase))) != phase:
-        phase = joined
-    return phase
+def _loop_alignment(item: FieldType, alignment: Alignment) -> Alignment:
+    """The alignment that holds at the beginning of each iteration over items."""
+    alignment = alignment.align(_first_size(item))
+    while (joined := alignment.join(_after(item, alignment))) != alignment:
+        alignment = joined
+    return alignment
 
 
 def _first_size(type_: FieldType) -> int:
-    """What the very first number of a value is aligned to."""
+    """The size to which the first number of a value is aligned."""
     if isinstance(type_, Primitive):
         return type_.size
     if isinstance(type_, Array):
@@ -194,8 +202,9 @@ def _first_size(type_: FieldType) -> int:
     return 4
 
 
-def _is_row(type_: FieldType) -> bool:
-    """An array that is part of a run. Not float32: numpy writes these with half the digits."""
+def _is_inline_array(type_: FieldType) -> bool:
+    """Whether the value is an array that is part of a run. Arrays of float32 are not, as numpy
+    writes these with half the digits."""
     return (
         isinstance(type_, Array)
         and isinstance(type_.item, Primitive)
@@ -204,14 +213,14 @@ def _is_row(type_: FieldType) -> bool:
 
 
 def _is_run(type_: FieldType) -> bool:
-    """The whole value is part of a run."""
+    """Whether the whole value is part of a run."""
     if isinstance(type_, TypeDescription):
         return all(_is_run(field.type) for field in type_.fields)
-    return isinstance(type_, Primitive) or _is_row(type_)
+    return isinstance(type_, Primitive) or _is_inline_array(type_)
 
 
 def _run_size(type_: FieldType, rest: int, most: int) -> int:
-    """The bytes of a value that is part of a run, from a position that is `rest` modulo 8."""
+    """The size of a value that is part of a run, at a position that is `rest` modulo 8."""
     if isinstance(type_, TypeDescription):
         size = 0 if type_.fields else len(type_.serialization.empty)
         for field in type_.fields:
@@ -226,8 +235,11 @@ def _run_size(type_: FieldType, rest: int, most: int) -> int:
 
 
 class _Part(NamedTuple):
-    """A part of a run: `length` numbers, or as many bytes. `text` is the names that they are read
-    into, or the expression that is written; empty for padding."""
+    """A part of a run: `length` numbers, or as many bytes.
+
+    `text` is the names of the variables that are read, or the expression that is written. It is
+    empty for padding.
+    """
 
     primitive: Primitive
     length: int
@@ -245,11 +257,11 @@ class _Part(NamedTuple):
 
 
 class _Generator:
-    """What reading and writing have in common: lines, names, the run and the position.
+    """The common base of the decoder and the encoder: lines, names, the run and the position.
 
-    The position is an index into the message with its header: the number `_offset`, plus the
-    variable `q` once something of unknown length has been passed, plus `_terms`, expressions that
-    have yet to be added to `q`.
+    The position is an index into the message with its header. It is the number `_offset`, plus the
+    variable `q` once a value of unknown size has been passed, plus `_terms`, expressions that have
+    yet to be added to `q`.
     """
 
     def __init__(self, serialization: Serialization) -> None:
@@ -259,7 +271,7 @@ class _Generator:
         self._indent = 1
         self._names = 0
         self._run: list[_Part] = []
-        self._phase = Alignment(8, 0, serialization.alignment)
+        self._alignment = Alignment(8, 0, serialization.alignment)
         self._variable = False
         self._offset = len(serialization.header)
         self._terms: list[str] = []
@@ -279,7 +291,7 @@ class _Generator:
         return f"{hint}_{self._names}"
 
     def _settle(self) -> None:
-        """Makes `q` the position."""
+        """Adds lines that set `q` to the position."""
         terms = [*self._terms]
         if self._offset:
             terms.append(str(self._offset))
@@ -296,19 +308,22 @@ class _Generator:
         return f"q + {self._offset}" if self._offset else "q"
 
     def _end_run(self, method: str) -> tuple[str, str]:
-        """Defines the constant that reads or writes the run, and passes it: the constant's name,
-        and what picks the layout of a run that has several, else nothing."""
+        """Defines the constant that reads or writes the run, and advances past the run.
+
+        Returns the name of the constant, and the index expression that selects the layout of a run
+        that has several; else an empty string.
+        """
         layouts: dict[int, struct.Struct] = {}
-        for rest in range(self._phase.rest, 8, self._phase.modulus):
+        for rest in range(self._alignment.rest, 8, self._alignment.modulus):
             position, codes = rest, "<"
             for part in self._run:
                 padding = -position % min(part.primitive.size, self._serialization.alignment)
                 codes += "x" * padding + part.code
                 position += padding + part.size
-            # The header makes an index four more than the position that is aligned.
+            # The index counts the header's four bytes, too; alignment does not.
             layouts[(rest + len(self._serialization.header)) % 8] = struct.Struct(codes)
         for part in self._run:
-            self._phase = self._phase.align(part.primitive.size).advance(part.size)
+            self._alignment = self._alignment.align(part.primitive.size).advance(part.size)
         self._run = []
         name = self._name("R")
         first, *others = layouts.values()
@@ -321,45 +336,48 @@ class _Generator:
         every = [layouts.get(index, unused) for index in range(8)]
         self.constants[name] = tuple(getattr(layout, method) for layout in every)
         self.constants[f"SIZE_{name}"] = tuple(layout.size for layout in every)
-        phase = self._name("phase")
-        self._line(f"{phase} = q & 7")
-        self._terms.append(f"SIZE_{name}[{phase}]")
-        return name, f"[{phase}]"
+        alignment = self._name("phase")
+        self._line(f"{alignment} = q & 7")
+        self._terms.append(f"SIZE_{name}[{alignment}]")
+        return name, f"[{alignment}]"
 
     def _fill(self, description: TypeDescription) -> None:
-        """What a structure without fields is."""
+        """Adds the byte of a structure without fields to the run."""
         if not description.fields and self._serialization.empty:
             self._run.append(_Part(_PADDING, 1, ""))
 
     def _stride(self, item: FieldType) -> int | None:
-        """The bytes from one item to the next, if all of them have the same layout, with the
-        first of them where we are."""
-        phase = _loop_phase(item, self._phase)
-        if not _is_run(item) or _after(item, phase) != phase:
+        """The bytes from one item to the next, if all items have the same layout when the first is
+        at the present position; else None."""
+        alignment = _loop_alignment(item, self._alignment)
+        if not _is_run(item) or _after(item, alignment) != alignment:
             return None
         most = self._serialization.alignment
-        sizes = {_run_size(item, rest, most) for rest in range(phase.rest, 8, phase.modulus)}
+        sizes = {
+            _run_size(item, rest, most) for rest in range(alignment.rest, 8, alignment.modulus)
+        }
         return sizes.pop() if len(sizes) == 1 else None
 
 
 class _Decoder(_Generator):
-    """Writes `decode(b)`: the value of the message `b`, or of the fields that are wanted.
+    """Generates `decode(b)`, which returns the value of the message `b`, or of its wanted fields.
 
-    `row` is what becomes of the name of a type and the names of numbers that are a row. With
-    `has_budget` it is `decode(b, left)`, which raises OverBudgetError when the message weighs more.
+    `inline_array` is the format of the expression for an inline array; its arguments are the name
+    of the type and the names of the numbers. With `has_budget` the function is `decode(b, left)`,
+    which raises OverBudgetError when the message costs more than `left`.
     """
 
     def __init__(
         self,
         serialization: Serialization,
         wanted: Selection | None,
-        row: str = "[{1}]",
+        inline_array: str = "[{1}]",
         *,
         has_budget: bool = False,
     ) -> None:
         super().__init__(serialization)
         self._wanted = wanted
-        self._row = row
+        self._inline_array = inline_array
         self._has_budget = has_budget
 
     def function(self, description: TypeDescription) -> str:
@@ -371,41 +389,42 @@ class _Decoder(_Generator):
         head = "def decode(b, left):" if self._has_budget else "def decode(b):"
         return "\n".join([head, *self._lines, ""])
 
-    def _pass(self, type_: FieldType) -> None:
-        """Lines that pass a value without reading it."""
+    def _skip(self, type_: FieldType) -> None:
+        """Adds lines that skip a value without reading it."""
         item, count = (type_.item, type_.length) if isinstance(type_, Array) else (type_, 1)
         if isinstance(type_, TypeDescription):
             self._fill(type_)
             for field in type_.fields:
-                self._pass(field.type)
+                self._skip(field.type)
         elif isinstance(item, Primitive) and count * item.size <= MAX_INLINE_ITEMS:
-            self._run.append(_Part(Primitive("passed", "x" * item.size, item.size), count, ""))
+            self._run.append(_Part(Primitive("skipped", "x" * item.size, item.size), count, ""))
         elif isinstance(item, Primitive):
             self._flush()
-            self._pass_numbers(item, str(count))
+            self._skip_numbers(item, str(count))
         elif isinstance(type_, (String, WideString)):
             size = self._number(_COUNT, "size")
             self._flush()
             self._terms.append(size if isinstance(type_, String) else f"{size} * 4")
-            self._phase = self._phase.lost(1 if isinstance(type_, String) else 4)
+            self._alignment = self._alignment.after_unknown(1 if isinstance(type_, String) else 4)
         elif isinstance(type_, Sequence) and isinstance(type_.item, Primitive):
             size = self._number(_COUNT, "size")
             self._flush()
-            empty = self._phase
-            self._pass_numbers(type_.item, size)
-            self._phase = self._phase.join(empty)
+            empty = self._alignment
+            self._skip_numbers(type_.item, size)
+            self._alignment = self._alignment.join(empty)
         else:
             wanted, self._wanted = self._wanted, {}
-            self._value(type_, "passed")
+            self._value(type_, "skipped")
             self._wanted = wanted
 
-    def _pass_numbers(self, primitive: Primitive, count: str) -> None:
+    def _skip_numbers(self, primitive: Primitive, count: str) -> None:
         self._align(primitive.size, count)
         self._terms.append(f"{count} * {primitive.size}")
-        self._phase = _loop_phase(primitive, self._phase)
+        self._alignment = _loop_alignment(primitive, self._alignment)
 
     def _value(self, type_: FieldType, hint: str) -> str:
-        """The expression for a value, good after the next flush, and lines before it."""
+        """Adds lines that read a value. Returns the expression for it, valid after the next
+        flush."""
         if isinstance(type_, Primitive):
             return self._number(type_, hint)
         if isinstance(type_, TypeDescription):
@@ -424,7 +443,7 @@ class _Decoder(_Generator):
         values = []
         for field in description.fields:
             if wanted is not None and field.name not in wanted:
-                self._pass(field.type)
+                self._skip(field.type)
                 continue
             self._wanted = wanted[field.name] if wanted is not None else None
             values.append(f"{field.name!r}: {self._value(field.type, field.name)}")
@@ -442,8 +461,8 @@ class _Decoder(_Generator):
         names = [part.text for part in self._run if part.text]
         target = ", ".join(names) + (" = " if len(names) > 1 else ", = " if names else "")
         first_size = self._run[0].primitive.size
-        if min(first_size, self._serialization.alignment) > self._phase.modulus:
-            # Cheaper than as many layouts, and what follows has often but one.
+        if min(first_size, self._serialization.alignment) > self._alignment.modulus:
+            # Aligning first is cheaper than several layouts, and often leaves only one behind it.
             self._align(first_size, "1")
         position = self._position()
         name, layout = self._end_run("unpack_from")
@@ -458,15 +477,15 @@ class _Decoder(_Generator):
         name, end = self._name(hint), self._name("end")
         if self._serialization.terminator:
             self._line(f"{end} = q + {size} - 1")
-            # Behind the message this is an IndexError. A string without even its NUL passes: the
-            # byte looked at is then the last of its size, which is 0.
+            # Beyond the message this is an IndexError. An empty string without its NUL is accepted:
+            # the byte that is checked is then the last of its size, which is 0.
             self._line(f"if b[{end}]: raise ValueError")
         else:
             self._line(f"{end} = q + {size}")
             self._line(f"if {end} > len(b): raise IndexError")
         self._line(f"{name} = b[q:{end}].decode()")
         self._terms.append(size)
-        self._phase = self._phase.lost()
+        self._alignment = self._alignment.after_unknown()
         return name
 
     def _wide_string(self, string: WideString, hint: str) -> str:
@@ -477,7 +496,7 @@ class _Decoder(_Generator):
         name = self._name(hint)
         self._line(f"{name} = read_wide_string(b, {self._position()}, {count})")
         self._terms.append(f"{count} * 4")
-        self._phase = self._phase.lost(4)
+        self._alignment = self._alignment.after_unknown(4)
         return name
 
     def _array(self, array: Array, hint: str) -> str:
@@ -489,9 +508,9 @@ class _Decoder(_Generator):
             name = self._name(hint)
             self._run.append(_Part(item, length, name))
             return f"base64({name})" if length > 1 else f"base64(bytes([{name}]))"
-        if _is_row(array):
+        if _is_inline_array(array):
             names = ", ".join(self._number(item, hint) for _ in range(length))
-            return self._row.format(item.name, names)
+            return self._inline_array.format(item.name, names)
         self._flush()
         return self._numbers(item, str(length), hint)
 
@@ -501,27 +520,27 @@ class _Decoder(_Generator):
         self._flush()
         if sequence.bound is not None:
             self._line(f"if {count} > {sequence.bound}: raise ValueError")
-        empty = self._phase
+        empty = self._alignment
         if isinstance(item, Primitive):
             value = self._numbers(item, count, hint)
         else:
             value = self._loop(item, count, hint)
-        self._phase = self._phase.join(empty)
+        self._alignment = self._alignment.join(empty)
         return value
 
     def _align(self, size: int, count: str) -> None:
-        """Passes the padding before items, of which there may be none."""
-        if not self._phase.is_aligned(size):
+        """Adds lines that skip the padding before items; without items there is no padding."""
+        if not self._alignment.is_aligned(size):
             self._settle()
             self._line(f"{'' if count.isdigit() else f'if {count}: '}q += (4 - q) & {size - 1}")
-            self._phase = self._phase.align(size)
+            self._alignment = self._alignment.align(size)
 
     def _numbers(self, primitive: Primitive, count: str, hint: str) -> str:
         self._align(primitive.size, count)
         name = self._name(hint)
         self._line(f"{name} = read_{primitive.name}(b, {self._position()}, {count})")
         self._terms.append(f"{count} * {primitive.size}")
-        self._phase = _loop_phase(primitive, self._phase)
+        self._alignment = _loop_alignment(primitive, self._alignment)
         return name
 
     def _loop(self, item: ItemType, count: str, hint: str) -> str:
@@ -532,7 +551,7 @@ class _Decoder(_Generator):
         items = self._name(hint)
         self._settle()
         stride = self._stride(item)
-        self._phase = _loop_phase(item, self._phase)
+        self._alignment = _loop_alignment(item, self._alignment)
         if stride is not None:
             value = self._value(item, hint)
             names = "".join(f"{part.text}, " for part in self._run if part.text)
@@ -544,7 +563,7 @@ class _Decoder(_Generator):
             self._line(f"q = {end}")
             self._offset = 0
             return items
-        # A count that lies ends with the message: every item takes at least a byte of it.
+        # A false count stops at the end of the message, as every item takes at least a byte.
         self._line(f"{items} = []")
         with self._block(f"for _ in range({count}):"):
             value = self._value(item, hint)
@@ -555,14 +574,14 @@ class _Decoder(_Generator):
 
 
 class _Encoder(_Generator):
-    """Writes `encode(message)`: the message, in little endian."""
+    """Generates `encode(message)`, which returns the serialized message, in little endian."""
 
     def __init__(self, serialization: Serialization) -> None:
         super().__init__(serialization)
         # The header is the beginning of the first run.
         if serialization.header:
             self._run = [_Part(PRIMITIVES["uint8"], len(serialization.header), "HEADER")]
-        self._phase = self._phase.advance(-len(serialization.header))
+        self._alignment = self._alignment.advance(-len(serialization.header))
         self._offset = 0
         self._pieces: list[str] = []  # expressions for bytes
         self._spilled = False
@@ -580,12 +599,12 @@ class _Encoder(_Generator):
         return "\n".join(["def encode(message):", *self._lines, ""])
 
     def _value(self, type_: FieldType, source: str, hint: str) -> None:
-        """Checks and writes what the expression `source` gives."""
+        """Adds lines that check and write the value of the expression `source`."""
         if isinstance(type_, TypeDescription):
             self._structure(type_, source, hint)
         elif isinstance(type_, Primitive):
             name = self._assign(hint, source)
-            # JSON has true and false but once each, and struct would take them for numbers.
+            # struct would write true and false as numbers; there is only one object of each.
             if type_.name == "bool":
                 self._line(f"if {name} is not True and {name} is not False: raise TypeError")
             else:
@@ -597,7 +616,7 @@ class _Encoder(_Generator):
             name = self._assign(hint, f"write_wide_string({source})")
             self._bound(f"len({name}) // 4", type_.bound)
             self._run.append(_Part(_COUNT, 1, f"len({name}) // 4"))
-            self._bytes(name, self._phase.lost(4))
+            self._bytes(name, self._alignment.after_unknown(4))
         elif isinstance(type_, Array):
             self._array(type_, source, hint)
         else:
@@ -618,21 +637,26 @@ class _Encoder(_Generator):
         texts = ", ".join(part.text for part in self._run if part.text)
         if not texts and len(self._run) == 1:
             # A lone NUL, or the byte of an empty structure.
-            self._run, self._offset, self._phase = [], self._offset + 1, self._phase.advance(1)
+            self._run, self._offset, self._alignment = (
+                [],
+                self._offset + 1,
+                self._alignment.advance(1),
+            )
             self._pieces.append("b'\\0'")
             return
         name, layout = self._end_run("pack")
         self._pieces.append(f"{name}{layout}({texts})")
 
-    def _bytes(self, name: str, phase: Alignment) -> None:
-        """Writes bytes, behind the run."""
+    def _bytes(self, name: str, alignment: Alignment) -> None:
+        """Adds bytes behind the run."""
         self._flush()
         self._pieces.append(name)
         self._terms.append(f"len({name})")
-        self._phase = phase
+        self._alignment = alignment
 
     def _spill(self) -> None:
-        """Hands over the pieces so far: a loop begins or ends, or the message ends."""
+        """Adds the pieces so far to the list of the message: a loop begins or ends, or the message
+        ends."""
         pieces = ", ".join(self._pieces)
         if not self._spilled:
             self._line(f"w = [{pieces}]")
@@ -649,7 +673,7 @@ class _Encoder(_Generator):
             self._line(f"if {name} != {{}}: raise TypeError")
             self._fill(description)
             return
-        # As many as there are, and each of them found below: none unknown, none missing.
+        # With the right number of fields, and each of them found below, none is unknown or missing.
         self._line(f"if len({name}) != {len(fields)}: raise KeyError")
         for field in fields:
             self._value(field.type, f"{name}[{field.name!r}]", field.name)
@@ -661,7 +685,7 @@ class _Encoder(_Generator):
         self._bound(f"len({name})", string.bound)
         size = f"len({name}) + 1" if self._serialization.terminator else f"len({name})"
         self._run.append(_Part(_COUNT, 1, size))
-        self._bytes(name, self._phase.lost())
+        self._bytes(name, self._alignment.after_unknown())
         if self._serialization.terminator:
             self._run.append(_Part(_PADDING, 1, ""))
 
@@ -676,7 +700,7 @@ class _Encoder(_Generator):
             name = self._assign(hint, f"octets({source})")
             self._line(f"if len({name}) != {length}: raise ValueError")
             self._run.append(_Part(item, length, name if length > 1 else f"{name}[0]"))
-        elif _is_row(array):
+        elif _is_inline_array(array):
             name = self._assign(hint, source)
             self._line(f"if {name}.__class__ is not list: {name} = listed({name})")
             self._line(f"if len({name}) != {length}: raise ValueError")
@@ -702,12 +726,12 @@ class _Encoder(_Generator):
         self._bound(count, sequence.bound)
         self._run.append(_Part(_COUNT, 1, count))
         self._flush()
-        empty = self._phase
+        empty = self._alignment
         if isinstance(item, Primitive):
             self._numbers(item, name)
         else:
             self._loop(item, name)
-        self._phase = self._phase.join(empty)
+        self._alignment = self._alignment.join(empty)
 
     def _list(self, hint: str, source: str) -> str:
         name = self._assign(hint, source)
@@ -715,21 +739,21 @@ class _Encoder(_Generator):
         return name
 
     def _align(self, size: int, items: str) -> None:
-        """Writes the padding before items, of which there may be none."""
-        if not self._phase.is_aligned(size):
+        """Adds lines that write the padding before items; without items there is no padding."""
+        if not self._alignment.is_aligned(size):
             self._settle()
             padding = self._assign("padding", f"ZEROS[:(4 - q) & {size - 1}] if {items} else b''")
-            self._bytes(padding, self._phase.align(size))
+            self._bytes(padding, self._alignment.align(size))
 
     def _numbers(self, primitive: Primitive, name: str) -> None:
         self._align(primitive.size, name)
-        self._bytes(name, _loop_phase(primitive, self._phase))
+        self._bytes(name, _loop_alignment(primitive, self._alignment))
 
     def _loop(self, item: ItemType, items: str) -> None:
         self._align(_first_size(item), items)
         self._spill()
         stride = self._stride(item)
-        self._phase = _loop_phase(item, self._phase)
+        self._alignment = _loop_alignment(item, self._alignment)
         self._settle()
         element = self._name("item")
         with self._block(f"for {element} in {items}:"):
@@ -744,5 +768,5 @@ class _Encoder(_Generator):
 
 
 def _python_types(primitive: Primitive) -> str:
-    """The constant with the Python types that `primitive` is written from."""
+    """The name of the constant with the Python types that a primitive accepts."""
     return "BOOLS" if primitive.name == "bool" else "NUMBERS" if primitive.is_float else "INTEGERS"

@@ -1,26 +1,24 @@
-"""ROS messages as MQTT payloads: JSON, CBOR, text, to and from ROS's own serialized bytes.
+"""The converter of one message type: ROS's serialized bytes to values and JSON, and back.
 
-They are called `cdr` here, whatever they are: in ROS 1 they are not CDR (definitions.Wire).
+The serialized bytes are called `cdr` here on both buses, though those of ROS 1 are not CDR
+(definitions.Serialization).
 
     converters = Converters(load_description)
     twist = converters.get("geometry_msgs/msg/Twist")
     twist.to_json(cdr)      # b'{"linear":{"x":0.5,...
     twist.from_json(b'{"linear": {"x": 0.5}}')     # CDR
 
-No message object is made on the way: code generated once a type (generate.py) goes straight from
-one to the other, and the slow way (careful.py) takes over for what is not exactly as expected.
-The encodings `cdr` and `ros1` need nothing from here.
+No message object is created on the way. Code that is generated once a type (codegen.py) converts
+directly, and the slow way (fallback.py) takes over when a message is not exactly as expected. The
+other encodings (encodings/) are built on the methods of the converter.
 
-JSON, beyond what the word says:
+The rules of JSON, beyond its specification:
 
-- uint8[], byte[] and char[] are base64; on input a list of numbers will do;
+- uint8[], byte[] and char[] are base64; input may also be a list of numbers;
 - NaN and infinities are null; null is NaN on input, so an infinity comes back as NaN;
 - 64-bit integers are integers, which JavaScript reads as the nearest double;
 - a missing field takes its default; an unknown one is an error; of duplicates the last counts;
 - a builtin_interfaces/Time may be given as "now".
-
-CBOR is the same with other words for bytes and arrays of numbers, see cbor.py; it has NaN and
-infinities. And `binary` is a picture as it is: the bytes of the field `data`.
 """
 
 from __future__ import annotations
@@ -57,33 +55,33 @@ __all__ = ["ConversionError", "Converter", "Converters", "TooLargeError", "compi
 # there is one that this leads to its neighbour (each of the 2**31 was tried).
 _TWICE_ROUNDED = b"7.038531e-26"
 
-# Looked up once: these lines run for every message.
+# Looked up once, as they are called for every message.
 _dumps, _loads = orjson.dumps, orjson.loads
 _NUMPY = orjson.OPT_SERIALIZE_NUMPY
 
-#: Bytes of a payload up to which fields may be left out, and what is wrong is named: that takes up
-#: to a microsecond and a half a byte, all of it on the thread of the event loop.
+#: Bytes of a payload up to which fields may be missing and errors name the field. Both take the
+#: fallback, which needs up to 1.5 µs a byte, all of it on the thread of the event loop.
 LARGEST_LENIENT = 64 * 1024
 
 
 class Converter:
     """Converts messages of one type. All methods raise ConversionError and nothing else.
 
-    With `fields`, paths such as `pose.position`, the `to_` methods give these only. `source` is the
-    generated code, for reading.
+    With `fields`, paths such as `pose.position`, the `to_` methods return only these. `source` is
+    the generated code, for people to read.
     """
 
     def __init__(
         self, description: TypeDescription, now: Callable[[], int], fields: Iterable[str] = ()
     ) -> None:
-        """Raises UnknownTypeError for a field that there is not."""
+        """Raises UnknownTypeError for a field that the type does not have."""
         self.description = description
         self._now = now
         self._wanted = select(description, fields) or None
         self._decode, self._decode_plain, self._encode, self.source = generate(
             description, self._wanted
         )
-        #: Made when they are first needed: few routes do.
+        #: Generated on first use: few routes need them.
         self._binary: BinaryDecoder | None = None
         self._checker: Checker | None = None
         self._has_float32_arrays = "read_float32" in self.source
@@ -93,7 +91,7 @@ class Converter:
         try:
             payload = _dumps(self._decode(cdr), None, _NUMPY)
         except MISFIT:
-            return _dumps(self._decode_carefully(cdr))
+            return _dumps(self._decode_slowly(cdr))
         if self._has_float32_arrays and _TWICE_ROUNDED in payload:
             return _dumps(self._decode_plain(cdr))
         return payload
@@ -107,11 +105,12 @@ class Converter:
         return self.from_values(value, len(payload))
 
     def checked(self, cdr: bytes, most: int = DEFAULT_ITEMS) -> bytes:
-        """The serialized message, as it is safe to hand on: nodes end over one that cannot be read
-        (rclpy's over text that is not UTF-16), and rclpy does not look.
+        """The serialized message, checked so that it is safe to publish.
 
-        CDR's options become 0, which say how many bytes of padding are at its end: more than there
-        are would end a node, too, and fewer are passed over. It may weigh `most` (weigh.py).
+        rclpy publishes bytes unchecked, and a message that cannot be read crashes the nodes that
+        receive it (those of rclpy also over text that is not UTF-16). CDR's options say how many
+        bytes of padding are at the end; they become 0, as a count beyond the message would crash a
+        node, too, and readers ignore the padding. The message may cost up to `most` (cost.py).
         """
         if self._checker is None:
             self._checker = generate_checker(self.description)
@@ -120,7 +119,7 @@ class Converter:
         except OverBudgetError:
             raise TooLargeError("", over_limit(most)) from None
         except MISFIT:
-            # Strings that are not UTF-8 take the careful way, which is ten times as long.
+            # Strings that are not UTF-8 take the fallback, which is ten times as slow.
             decode(self.description, cdr, strict=True, most=most // FALLBACK_FACTOR)
         return cdr[:2] + b"\0\0" + cdr[4:] if self.description.serialization.header else cdr
 
@@ -129,11 +128,11 @@ class Converter:
         try:
             return self._decode_plain(cdr)
         except MISFIT:
-            return self._decode_carefully(cdr)
+            return self._decode_slowly(cdr)
 
     def from_dict(self, value: object) -> bytes:
-        """The serialized message of Python values, by the same rules as JSON; bytes for uint8[]
-        will do too."""
+        """The serialized message of Python values, by the rules of JSON; uint8[] may also be given
+        as bytes."""
         return self._encode(accept(self.description, value, self._now))
 
     def to_binary_values(self, cdr: bytes) -> dict[str, Any]:
@@ -144,11 +143,14 @@ class Converter:
         try:
             return self._binary.decode(cdr)
         except MISFIT:
-            return self._decode_carefully(cdr, binary=True)
+            return self._decode_slowly(cdr, binary=True)
 
     def from_values(self, value: object, size: int) -> bytes:
-        """The serialized message of what a payload of so many bytes was; as `from_dict`, and fast
-        for what has exactly the type's fields."""
+        """The serialized message of the values that a payload of `size` bytes had.
+
+        As `from_dict`, but fast when the values have exactly the fields of the type. Raises
+        ConversionError when they have not and the payload is larger than LARGEST_LENIENT.
+        """
         try:
             return self._encode(value)
         except MISFIT:
@@ -160,7 +162,7 @@ class Converter:
                 ) from None
             return self.from_dict(value)
 
-    def _decode_carefully(self, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
+    def _decode_slowly(self, cdr: bytes, *, binary: bool = False) -> dict[str, Any]:
         value = decode(self.description, cdr, binary=binary)
         return value if self._wanted is None else pick(value, self._wanted)
 
@@ -173,9 +175,9 @@ def compile_converter(
 
 
 class Converters:
-    """A converter a type, compiled when it is first asked for.
+    """A cache of converters, each compiled when it is first requested.
 
-    `load` gives the description of a type's name, or raises; so does `get` then.
+    `load` returns the description of a type by its name. What it raises, `get` raises.
     """
 
     def __init__(
@@ -190,17 +192,17 @@ class Converters:
         """The converter of a type by its name, `std_msgs/msg/String`, or of some of its fields."""
         converter = self._converters.get((type_name, fields))
         if converter is None:
-            # Two threads may both come here: one converter is then as good as the other.
+            # Two threads may both get here; their converters are interchangeable.
             converter = Converter(self._load(type_name), self._now, fields)
             self._converters[type_name, fields] = converter
         return converter
 
     def bulk(self, type_name: str) -> Bulk:
-        """What can make messages of the type large; bytes, if it is not known."""
+        """What can make messages of the type large; BYTES when the type is not known."""
         known = self._bulk.get(type_name)
         if known is None:
             try:
                 known = self._bulk[type_name] = bulk(self._load(type_name))
-            except UnknownTypeError:  # it may be known later
+            except UnknownTypeError:  # not cached: the type may become known later
                 return Bulk.BYTES
         return known

@@ -1,10 +1,10 @@
-"""How much work a message for ROS is, found out before it is decoded.
+"""The cost of a message for ROS: how much work it is, estimated before it is decoded.
 
-A few bytes can make much work: 1 MiB of nothing but empty texts, lists or typed arrays takes half a
-second to convert. So what is in a payload is counted in one cheap pass, and weighed: a number, a
-name, `true`, `false` and `null` are 1 each; a text, a list or an object 8; a typed array 24. Each 1
-is some 0.1 µs of work. Strings of bytes and what is in a typed array are only copied, and weigh
-nothing however long they are.
+A few bytes can be much work: 1 MiB of nothing but empty texts, lists or typed arrays takes half a
+second to convert. So one cheap pass counts what is in a payload. A number, a name, `true`, `false`
+and `null` cost 1 each, a text, a list or an object 8, a typed array 24. A cost of 1 is about 0.1 µs
+of work. Byte strings and the items of typed arrays are only copied, and cost nothing however many
+they are.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from appliance.ros.payload.definitions import (
     WideString,
 )
 
-#: What a text, a list or an object weighs, and what is more with a tag on it, of a typed array.
+#: The cost of a text, a list or an object, and what the tag of a typed array adds to it.
 CONTAINER_COST = 8
 TAG_COST = 16
 
-#: What a message may weigh if nothing else is said, see `bridge.limits.items`.
+#: The cost that a message may have by default; `bridge.limits.items` configures it.
 DEFAULT_ITEMS = 100_000
 
-#: Bytes of a text in CBOR that weigh 1: they are read, searched and written.
+#: Bytes of a text in CBOR that cost 1, as they are read, searched and written.
 TEXT_BYTES_PER_ITEM = 32
 
-#: The careful way (careful.py) takes so many times as long as the fast one.
+#: The fallback (fallback.py) takes so many times as long as generated code.
 FALLBACK_FACTOR = 4
 
-#: Lists and objects in one another: deeper than any message type.
+#: The deepest nesting of lists and objects: deeper than any message type.
 MAX_DEPTH = 64
 
 
 def over_limit(most: int) -> str:
-    """What is wrong with a message that weighs more than `most`."""
+    """The error text for a message that costs more than `most`."""
     return f"it has more texts, lists, objects and numbers than {most} (bridge.limits.items)"
 
 
 def cost_of(type_: FieldType) -> int:
-    """What a value of that type weighs, with nothing in those of its arrays that may be empty."""
+    """The least cost of a value of that type: its variable-length arrays are empty."""
     if isinstance(type_, Primitive):
         return 1
     if isinstance(type_, (String, WideString, Sequence)):
@@ -56,31 +56,31 @@ def cost_of(type_: FieldType) -> int:
 
 
 def json_cost(payload: bytes, most: int) -> int:
-    """What a JSON text weighs; something above `most` when it is more than that."""
+    """The cost of a JSON text, or any number above `most` when it costs more than that."""
     if len(payload) * CONTAINER_COST <= most:
-        return len(payload) * CONTAINER_COST  # it cannot be more
-    weight = _weigh_marks(payload, payload.count(b'"') // 2)
-    if weight <= most:
-        return weight
-    # At least so many of the quotes begin and end something, and no more of that are names.
+        return len(payload) * CONTAINER_COST  # an upper bound
+    cost = _count_marks(payload, payload.count(b'"') // 2)
+    if cost <= most:
+        return cost
+    # At least so many pairs of quotes are strings, and at most one a colon of these is a name.
     strings = (payload.count(b'"') - payload.count(rb"\"")) // 2
-    weight = strings + (CONTAINER_COST - 1) * (strings - payload.count(b":"))
-    if weight > most:
-        return weight
-    # What was counted may be names, or within texts, which are now taken out.
+    cost = strings + (CONTAINER_COST - 1) * (strings - payload.count(b":"))
+    if cost > most:
+        return cost
+    # Some of what was counted may be names, or characters within texts. Now remove the texts.
     parts = payload.replace(rb"\\", b"").replace(rb"\"", b"").split(b'"', 2 * most)
     outside = b"".join(parts[::2])
     names = outside.count(b":")
-    return names + _weigh_marks(outside, max(len(parts) // 2 - names, 0))
+    return names + _count_marks(outside, max(len(parts) // 2 - names, 0))
 
 
-def _weigh_marks(payload: bytes, texts: int) -> int:
+def _count_marks(payload: bytes, texts: int) -> int:
     containers = payload.count(b"[") + payload.count(b"{")
     return payload.count(b",") + 1 + CONTAINER_COST * (containers + texts)
 
 
-#: The bytes that one item of CBOR takes by its first byte, where that says all of it: numbers,
-#: `true`, `false`, `null`; and what each weighs.
+#: The size of an item of CBOR by its first byte, for items of a fixed size: numbers, `true`,
+#: `false`, `null`. Each costs 1.
 _SIZES = {
     **dict.fromkeys((*range(0x18), *range(0x20, 0x38), *range(0xE0, 0xF8)), 1),
     **dict.fromkeys((0x18, 0x38, 0xF8), 2),
@@ -90,38 +90,41 @@ _SIZES = {
 }
 _SINGLE = bytes(first for first, size in _SIZES.items() if size == 1)
 
-#: The same with short strings, whose length is in their first byte; 0 for all else.
+#: The same with short strings, whose first byte has the length; 0 for all other items.
 _SHORT = {first: 1 + (first & 0x1F) for first in (*range(0x40, 0x58), *range(0x60, 0x78))}
 _STEPS = [_SIZES.get(first, _SHORT.get(first, 0)) for first in range(256)]
-_WEIGHTS = [CONTAINER_COST if first in _SHORT else 1 for first in range(256)]
+_COSTS = [CONTAINER_COST if first in _SHORT else 1 for first in range(256)]
 
-#: Items from which on it is tried whether all of them have the same size.
+#: Items of a list from which on it is worth to try whether all of them have the same size.
 _MANY = 16
 
 _BREAK = 0xFF
 
-#: Items of what goes on until a break: an even number, as objects have, and never reached.
+#: The item count of a list or object that ends with a break: even, as an object has names and
+#: values, and too large to be reached.
 _ENDLESS = 1 << 62
 
 
 def cbor_cost(payload: bytes, most: int) -> int:
-    """What an item of CBOR weighs; something above `most` when it is more than that. Of what is no
-    CBOR, or deeper than DEPTH, nothing: the decoder stops there, and says so."""
+    """The cost of an item of CBOR, or any number above `most` when it costs more than that.
+
+    0 for bytes that are no CBOR, or nested deeper than MAX_DEPTH: the decoder reports these.
+    """
     if len(payload) * (CONTAINER_COST + TAG_COST) <= most:
         return len(payload) * (CONTAINER_COST + TAG_COST)
     try:
         return _walk_cbor(payload, most)
-    except IndexError:  # it ends before its end, which the decoder will say
+    except IndexError:  # truncated, which the decoder reports
         return 0
 
 
 def _walk_cbor(payload: bytes, most: int) -> int:
-    steps, weights = _STEPS, _WEIGHTS
-    weight = at = 0
-    left = 1  # items to come in the innermost list or object, names included
+    steps, costs = _STEPS, _COSTS
+    cost = at = 0
+    left = 1  # items that are left in the innermost list or object, names included
     is_object = False
     outside: list[tuple[int, bool]] = []
-    while weight <= most:
+    while cost <= most:
         if not left:
             if not outside:
                 break
@@ -133,7 +136,7 @@ def _walk_cbor(payload: bytes, most: int) -> int:
         step = steps[first]
         if step:
             at += step
-            weight += 1 if is_name else weights[first]
+            cost += 1 if is_name else costs[first]
             continue
         if first == _BREAK:
             at += 1
@@ -142,29 +145,32 @@ def _walk_cbor(payload: bytes, most: int) -> int:
         kind = first >> 5
         count, at = _argument(payload, at)
         if kind == 6:
-            weight += TAG_COST
-            left += 1  # what the tag is of
-        elif kind > 3 or count == _ENDLESS:  # a list or an object; or a string in pieces
-            weight += CONTAINER_COST
+            cost += TAG_COST
+            left += 1  # the tagged item
+        elif kind > 3 or count == _ENDLESS:  # a list or an object; or a string in chunks
+            cost += CONTAINER_COST
             outside.append((left, is_object))
             if len(outside) > MAX_DEPTH:
-                return 0  # which the decoder will say
+                return 0  # which the decoder reports
             is_object = kind == 5
             left = count * 2 if is_object and count != _ENDLESS else count
             if kind == 4 and _MANY <= left < _ENDLESS and (end := _end_of_same(payload, at, left)):
-                weight += left
+                cost += left
                 left, at = 0, end
         else:  # a string
             at += count
-            weight += 1 if is_name else CONTAINER_COST
+            cost += 1 if is_name else CONTAINER_COST
             if kind == 3:
-                weight += count // TEXT_BYTES_PER_ITEM
-    return weight
+                cost += count // TEXT_BYTES_PER_ITEM
+    return cost
 
 
 def _argument(payload: bytes, at: int) -> tuple[int, int]:
-    """The number in an item's head, and where what follows it begins; _ENDLESS when the item ends
-    with a break, and beyond the payload when there is none."""
+    """The argument of an item's head, and the position behind the head.
+
+    The argument is _ENDLESS when the item ends with a break. The position is beyond the payload
+    when the head is truncated.
+    """
     low = payload[at] & 0x1F
     if low < 24:
         return low, at + 1
@@ -177,7 +183,7 @@ def _argument(payload: bytes, at: int) -> tuple[int, int]:
 
 
 def _end_of_same(payload: bytes, at: int, count: int) -> int:
-    """Where so many numbers end that take the same number of bytes each; 0 when they do not."""
+    """The position behind `count` numbers of one size; 0 when their sizes differ."""
     first = payload[at]
     size = _SIZES.get(first, 0)
     end = at + count * size

@@ -1,9 +1,9 @@
-"""What a message type is made of, in words of our own.
+"""Descriptions of message types, from which converters are generated.
 
-The converters work from a `TypeDescription`; where it comes from is the bus adapter's business.
-`describe` makes one from a ROS 2 message class (Humble, Jazzy, Kilted), of which it touches only
-`SLOT_TYPES`, `get_fields_and_field_types()` and a fresh instance for the fields' defaults.
-ROS 1, or a test, writes descriptions directly.
+Converters need only a `TypeDescription`, whichever bus it comes from. `describe` makes one from a
+ROS 2 message class (Humble, Jazzy, Kilted), and uses only its `SLOT_TYPES`,
+`get_fields_and_field_types()` and a fresh instance, which has the defaults of the fields. For ROS 1
+ros1/types.py parses definitions. Tests write descriptions by hand.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-# Names end up in generated source (generate.py), so nothing but an identifier may pass.
+# Names of fields end up in generated source (codegen.py), so only identifiers may pass.
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv|action)/)?([A-Za-z]\w*)\Z", re.ASCII)
 
 TIME = "builtin_interfaces/msg/Time"
 
-#: Arrays of a fixed length up to this are read with a name for each of their numbers.
+#: Generated code reads fixed-length arrays up to this many items inline, one variable an item.
 MAX_INLINE_ITEMS = 64
 
 
 class UnknownTypeError(LookupError):
-    """No such message type is installed here, or it has a field that ROS itself cannot carry."""
+    """A message type is not installed here, or has a field that ROS or its route cannot carry."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Field:
-    """A field. `default` is what a message has when it says nothing: None for the type's zero,
-    else a bool, number, str, list of these, or bytes for arrays of uint8, byte and char."""
+    """A field. `default` is its value in a new message: None for the type's zero, else a bool,
+    number, str, list of these, or bytes for arrays of uint8, byte and char."""
 
     name: str
     type: FieldType
@@ -116,11 +116,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Serialization:
-    """How messages are serialized.
+    """How a bus serializes messages.
 
-    `encoding` is what that is called on MQTT. Messages begin with `header`. Numbers are aligned to
-    their size, at most to `alignment` (MAXALIGN of DDS-XTypes), counted from its end. `terminator`
-    ends a string and is counted with it; `empty` is all that there is of a structure without
+    `encoding` is its name on MQTT. Messages begin with `header`. Numbers are aligned to their size,
+    at most to `alignment` (MAXALIGN of DDS-XTypes), counted from the end of the header.
+    `terminator` ends a string and is part of its length. `empty` stands for a structure without
     fields.
     """
 
@@ -131,17 +131,17 @@ class Serialization:
     empty: bytes
 
 
-#: ROS 2's: plain CDR, little endian, no options.
+#: ROS 2: plain CDR, little endian, no options.
 CDR = Serialization("cdr", b"\x00\x01\x00\x00", 8, b"\0", b"\0")
 
-#: ROS 1's: always little endian, and nothing but the values.
+#: ROS 1: always little endian, the values without any padding.
 PACKED = Serialization("ros1", b"", 1, b"", b"")
 
 
 @dataclass(frozen=True)
 class TypeDescription:
-    """A message type: its full name (`geometry_msgs/msg/Twist`), its fields in wire order, and how
-    it is serialized, as the types in it are."""
+    """A message type: its full name (`geometry_msgs/msg/Twist`), its fields in the order in which
+    they are serialized, and how it and the types in it are serialized."""
 
     name: str
     fields: tuple[Field, ...]
@@ -153,8 +153,8 @@ FieldType = ItemType | Array | Sequence
 
 
 class Bulk(IntEnum):
-    """What can make messages of a type large: any number of numbers, as a scan or the states of
-    joints have, or of bytes, as a picture, a cloud of points or a map."""
+    """What can make messages of a type large: sequences of numbers, as in a scan or the states of
+    joints, or of bytes, as in a picture, a point cloud or a map."""
 
     NOTHING = 0
     NUMBERS = 1
@@ -162,7 +162,7 @@ class Bulk(IntEnum):
 
 
 def bulk(type_: FieldType) -> Bulk:
-    """What can make such values large."""
+    """What can make values of the type large."""
     if isinstance(type_, TypeDescription):
         return max((bulk(field.type) for field in type_.fields), default=Bulk.NOTHING)
     if isinstance(type_, Sequence) and type_.bound is None and isinstance(type_.item, Primitive):
@@ -170,13 +170,16 @@ def bulk(type_: FieldType) -> Bulk:
     return bulk(type_.item) if isinstance(type_, (Array, Sequence)) else Bulk.NOTHING
 
 
-#: Some fields of a type by their names, and of these all (None) or some in turn.
+#: Selected fields of a type by name: None selects the whole field, a dict some of its own fields.
 Selection: TypeAlias = "dict[str, Selection | None]"
 
 
 def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
-    """The selection of fields by their paths, `pose.position`; those of items of an array are
-    named as those of a message. Raises UnknownTypeError for a field that there is not."""
+    """The selection of fields by their paths, such as `pose.position`.
+
+    The path of an array's item fields has no index: it goes on as for a single message. Raises
+    UnknownTypeError for a field that the type does not have.
+    """
     chosen: Selection = {}
     for path in paths:
         type_: FieldType = description
@@ -192,7 +195,7 @@ def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
                     f"{description.name} has no field {path!r}: no {name!r}, there are {there}"
                 )
             type_ = field.type
-            if inside is None:  # all of it is chosen already
+            if inside is None:  # another path has selected the whole field
                 continue
             if depth == len(parents):
                 inside[name] = None
@@ -202,9 +205,10 @@ def select(description: TypeDescription, paths: Iterable[str]) -> Selection:
 
 
 def least_size(type_: FieldType) -> int:
-    """The fewest bytes that a serialized value takes, padding not counted: in CDR at least 1.
+    """The fewest bytes of a serialized value, without padding: in CDR at least 1.
 
-    A count in a hostile message is held against it before anything is allocated.
+    The count of a sequence is checked against it before anything is allocated, as a hostile message
+    can announce any count.
     """
     if isinstance(type_, Primitive):
         return type_.size
@@ -219,7 +223,7 @@ def least_size(type_: FieldType) -> int:
 
 # --- ROS 2 message classes ------------------------------------------------------------------
 
-# The names of IDL's basic types; ROS 2's `char` is uint8 already when it arrives here.
+# IDL's names of basic types. rosidl has replaced ROS 2's `char` by uint8 already.
 _BASIC_TYPES = {
     "boolean": "bool",
     "octet": "byte",
@@ -235,13 +239,13 @@ _BASIC_TYPES = {
 
 
 def describe(message_class: type, load: Callable[[str], type]) -> TypeDescription:
-    """The description of a ROS 2 message class; `load` gives the classes of nested types.
+    """The description of a ROS 2 message class. `load` returns the classes of nested types.
 
     Raises UnknownTypeError for a field of a type that rclpy has no support for (wchar, long
     double), and whatever `load` raises.
     """
     if isinstance(read := getattr(message_class, "DESCRIPTION", None), TypeDescription):
-        return read  # from its definition, see uncompiled.py
+        return read  # a class that uncompiled.py made from a definition
     package, kind = message_class.__module__.split(".")[:2]
     name = f"{package}/{kind}/{message_class.__name__}"
     names = message_class.get_fields_and_field_types()  # type: ignore[attr-defined]
@@ -255,8 +259,8 @@ def describe(message_class: type, load: Callable[[str], type]) -> TypeDescriptio
 
 
 def _field_type(slot: Any, load: Callable[[str], type], where: str) -> FieldType:
-    """A `rosidl_parser.definition` type in our words. It is told by its class's name, so that
-    rosidl_parser need not be imported."""
+    """The FieldType of a `rosidl_parser.definition` type. The name of its class identifies it, so
+    that rosidl_parser need not be imported."""
     kind = type(slot).__name__
     if kind == "Array":
         return Array(_item_type(slot.value_type, load, where), slot.size)
@@ -284,12 +288,12 @@ def _item_type(slot: Any, load: Callable[[str], type], where: str) -> ItemType:
 
 
 def _plain(type_: FieldType, value: Any) -> Any:
-    """A default as `Field.default` has it, from what rclpy keeps it in."""
+    """The `Field.default` of a default value as rclpy represents it."""
     if isinstance(type_, (Array, Sequence)):
         if isinstance(type_.item, TypeDescription):
             return None
         if isinstance(type_.item, Primitive) and type_.item.is_octet:
-            # A list of bytes of length one (byte), or an array of one or the other kind (uint8).
+            # rclpy has byte[] as a list of bytes of length one, and uint8[] as an array.
             return b"".join(value) if isinstance(value, list) else value.tobytes()
         return value if isinstance(value, list) else value.tolist()
     if isinstance(type_, TypeDescription):
@@ -303,26 +307,26 @@ def import_message(name: str) -> type:
     """The message class of a name: `std_msgs/msg/String`, `std_msgs/String`, and the parts of
     services and actions, `std_srvs/srv/Trigger_Request`, `pkg/action/Fibonacci_Goal`.
 
-    Raises UnknownTypeError saying what is missing.
+    Raises UnknownTypeError, which names what is missing.
     """
     match = _TYPE_NAME.match(name)
     if match is None:
         raise UnknownTypeError(f"{name!r} is not a type's name such as std_msgs/msg/String")
     package, kind, type_name = match.group(1), match.group(2) or "msg", match.group(3)
-    # Any node may make up a type's name: it does not get what else there is in Python imported.
+    # Any node can make up the name of a type: never import a module of Python's own for it.
     if package in sys.stdlib_module_names:
         raise UnknownTypeError(f"no {name}: {package} is not a package of messages")
     if package not in sys.modules:
-        _look_in_workspaces(package)
+        _add_workspace_path(package)
     try:
         module = import_module(f"{package}.{kind}")
     except ImportError as error:
         raise UnknownTypeError(f"no {name}: the package {package} is not installed here") from error
-    except Exception as error:  # what a package does when it is imported may be any
+    except Exception as error:  # the import of a package runs its code, which may raise anything
         raise UnknownTypeError(f"no {name}: the package {package} is broken: {error!r}") from error
     found = getattr(module, type_name, None)
     if found is None and "_" in type_name:
-        # The packages do not export an action's Goal, Result and Feedback: beside their action.
+        # Packages export an action, but not its Goal, Result and Feedback, of the same module.
         owner = getattr(module, type_name.partition("_")[0], None)
         found = getattr(sys.modules.get(getattr(owner, "__module__", "")), type_name, None)
     if not isinstance(found, type) or not hasattr(found, "SLOT_TYPES"):
@@ -330,11 +334,11 @@ def import_message(name: str) -> type:
     return found
 
 
-def _look_in_workspaces(package: str) -> None:
-    """Let a package be imported from a workspace that only AMENT_PREFIX_PATH tells of.
+def _add_workspace_path(package: str) -> None:
+    """Add a workspace of AMENT_PREFIX_PATH that has the package to Python's search path.
 
-    A shell that sources a workspace has its Python packages in PYTHONPATH as well; a service, most
-    often, has not.
+    A shell that sources a workspace has its Python packages in PYTHONPATH as well; a service often
+    does not.
     """
     version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):

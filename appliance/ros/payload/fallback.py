@@ -1,9 +1,9 @@
-"""The slow, exact way between CDR, values and JSON's rules: it walks the description.
+"""The slow and exact conversion, which walks the description of a type.
 
-The generated converters (generate.py) take only what is exactly as expected, and check just enough
-to be sure of that. Whatever they stumble on comes here, and is mended where the conventions let it
-pass (a missing field, `null`, `"now"`, a list for bytes, big-endian CDR, text that is not UTF-8) or
-refused by a ConversionError that names the field.
+Generated converters (codegen.py) accept only messages that are exactly as expected, and check just
+enough to be sure of that. They leave all other messages to this module. It corrects what the
+conventions allow (a missing field, `null`, `"now"`, a list for bytes, big-endian CDR, text that is
+not UTF-8), and refuses the rest with a ConversionError that names the field.
 """
 
 from __future__ import annotations
@@ -41,8 +41,11 @@ _QUOTED = 40
 
 
 class ConversionError(ValueError):
-    """A message that cannot be converted: `path` names the field (`linear.x`, `poses[3].position`;
-    empty for the message as a whole), `problem` says what is wrong with it."""
+    """A message that cannot be converted.
+
+    `path` names the field (`linear.x`, `poses[3].position`), and is empty for the message as a
+    whole. `problem` says what is wrong with it.
+    """
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__(f"{path}: {problem}" if path else problem)
@@ -51,7 +54,7 @@ class ConversionError(ValueError):
 
 
 class TooLargeError(ConversionError):
-    """A message that is more work than one may be."""
+    """A message that exceeds a limit of size or cost."""
 
 
 # --- CDR to values --------------------------------------------------------------------------
@@ -65,14 +68,14 @@ def decode(
     strict: bool = False,
     most: float = inf,
 ) -> dict[str, Any]:
-    """The value of a serialized message: byte order, alignment and strings as its wire has them.
+    """The value of a serialized message.
 
-    uint8[], byte[] and char[] come as base64, as in JSON; when `binary`, as bytes, and other
-    arrays of numbers, but for bools, as `Numbers`. Bytes after the message are ignored,
-    as every DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) comes with
-    U+FFFD in it; when `strict`, what is not UTF-16 is refused, as rclpy cannot take it, and so is
-    a string that is longer than its bound. Raises ConversionError, TooLargeError for what weighs
-    more than `most` (weigh.py).
+    uint8[], byte[] and char[] become base64, as in JSON; when `binary`, they become bytes, and
+    other arrays of numbers, except bools, `Numbers`. Bytes after the message are ignored, as every
+    DDS does: some senders pad at the end. Text that is not UTF-8 (or UTF-16) has U+FFFD in place of
+    the wrong parts. When `strict`, text that is not UTF-16 is refused, as rclpy cannot read it, and
+    so is a string beyond its bound. Raises ConversionError, and TooLargeError for a
+    message that costs more than `most` (cost.py).
     """
     order = "<"
     if description.serialization.header:
@@ -88,7 +91,7 @@ def decode(
 
 
 def pick(value: Any, wanted: Selection) -> Any:
-    """What is wanted of a message's value, or of each in a list."""
+    """The selected fields of a message's value, or of each in a list."""
     if isinstance(value, list):
         return [pick(item, wanted) for item in value]
     return {
@@ -99,14 +102,14 @@ def pick(value: Any, wanted: Selection) -> Any:
 
 
 class _Budget:
-    """What a message may weigh yet."""
+    """The cost that is left for a message."""
 
     def __init__(self, most: float) -> None:
         self._most = self._left = most
 
-    def spend(self, weight: int) -> None:
-        """Raises TooLargeError when that is too much."""
-        self._left -= weight
+    def spend(self, cost: int) -> None:
+        """Raises TooLargeError when less than `cost` is left."""
+        self._left -= cost
         if self._left < 0:
             raise TooLargeError("", over_limit(int(self._most)))
 
@@ -177,7 +180,7 @@ class _CdrReader:
         return struct.unpack(f"{self._order}{count}{primitive.code}", chunk)
 
     def _count(self, size: int, path: str) -> int:
-        """A count of items of at least `size` bytes, or of a string's bytes."""
+        """The count of items that take at least `size` bytes each, or of a string's bytes."""
         self._align(4)
         (count,) = struct.unpack(f"{self._order}I", self._take(4, path))
         assert isinstance(count, int)
@@ -189,12 +192,12 @@ class _CdrReader:
         return count
 
     def _string(self, path: str) -> str:
-        # The count includes the final NUL. Some senders leave both out of an empty string.
+        # The count includes the final NUL. Some senders count 0 for an empty string, without NUL.
         chunk = self._take(self._count(1, path), path)
         return chunk.removesuffix(self._serialization.terminator).decode("utf-8", "replace")
 
     def _wide_string(self, path: str) -> str:
-        # As every rmw writes it: 16-bit units, each in four bytes, without a final NUL.
+        # Every rmw writes 16-bit units, each in four bytes, without a final NUL.
         count = self._count(4, path)
         units = self._numbers(_UNIT, count, path)
         if any(unit > 0xFFFF for unit in units):
@@ -206,7 +209,7 @@ class _CdrReader:
             raise ConversionError(path, "not UTF-16") from None
 
     def _align(self, size: int) -> None:
-        # It counts from the end of the header.
+        # Alignment counts from the end of the header.
         past = self._position - len(self._serialization.header)
         self._position += -past % min(size, self._serialization.alignment)
 
@@ -227,12 +230,12 @@ _UNIT = Primitive("uint32", "I", 4)
 def accept(
     description: TypeDescription, value: object, now: Callable[[], int], most: float = DEFAULT_ITEMS
 ) -> dict[str, Any]:
-    """`value` by the conventions' rules for input, complete and checked to the last item.
+    """`value` as a complete message: checked to the last item by the conventions' rules for input.
 
-    What comes back has every field and nothing else: defaults filled in, null as NaN, bytes for
-    uint8[], byte[] and char[]. `now` gives nanoseconds since the epoch. Raises ConversionError,
-    TooLargeError for what weighs more than `most` (weigh.py), defaults included: with these, a
-    few bytes can be a large message.
+    The result has exactly the fields of the type: missing fields have their defaults, null becomes
+    NaN, and uint8[], byte[] and char[] become bytes. `now` returns nanoseconds since the epoch.
+    Raises ConversionError, and TooLargeError for a message that costs more than `most` (cost.py)
+    with its defaults, which make a large message of a few bytes.
     """
     return _InputChecker(now, description.serialization, _Budget(most)).structure(
         description, value, ""
@@ -252,7 +255,7 @@ class _InputChecker:
             sec, nanosec = divmod(self._now(), 1_000_000_000)
             value = {"sec": sec, "nanosec": nanosec}
         if not isinstance(value, dict):
-            raise ConversionError(path, f"expected an object, got {_say(value)}")
+            raise ConversionError(path, f"expected an object, got {_show(value)}")
         self._budget.spend(CONTAINER_COST + len(description.fields))
         names = [field.name for field in description.fields]
         for name in value:
@@ -293,13 +296,13 @@ class _InputChecker:
                 return value.data
             value = value.listed() if isinstance(value, Numbers) else value
             if not isinstance(value, (list, tuple)):
-                raise ConversionError(path, f"expected base64 or an array, got {_say(value)}")
+                raise ConversionError(path, f"expected base64 or an array, got {_show(value)}")
             if _all_fit(item, value):
                 return bytes(value)
             return bytes(_number(item, x, f"{path}[{i}]") for i, x in enumerate(value))
         value = value.listed() if isinstance(value, Numbers) else value
         if not isinstance(value, (list, tuple)):
-            raise ConversionError(path, f"expected an array, got {_say(value)}")
+            raise ConversionError(path, f"expected an array, got {_show(value)}")
         self._budget.spend(len(value) * (1 if isinstance(item, Primitive) else CONTAINER_COST))
         if isinstance(item, Primitive) and _all_fit(item, value):
             return list(value)
@@ -307,17 +310,17 @@ class _InputChecker:
 
     def _text(self, type_: String | WideString, value: object, path: str) -> str:
         if not isinstance(value, str):
-            raise ConversionError(path, f"expected a string, got {_say(value)}")
+            raise ConversionError(path, f"expected a string, got {_show(value)}")
         _check_bound(type_, value, path)
         is_ended = isinstance(type_, String) and self._serialization.terminator
         if is_ended and "\0" in value:
-            # What follows would be lost on the way: strings end at NUL in C, and in rclpy.
+            # Strings end at NUL in C and in rclpy: the characters behind it would be lost.
             raise ConversionError(path, "a ROS string cannot hold the character U+0000")
         return value
 
 
 def default(field: Field) -> Any:
-    """What a field has when a message does not mention it."""
+    """The value of a field that a message does not have."""
     return _zero(field.type) if field.default is None else field.default
 
 
@@ -335,7 +338,8 @@ def _zero(type_: FieldType) -> Any:
 
 
 def _all_fit(primitive: Primitive, values: list[Any] | tuple[Any, ...]) -> bool:
-    """Whether these are numbers of the right type and range: the usual case, seen at a glance."""
+    """Whether all values are numbers of the right type and range: a fast check for the usual
+    case."""
     if primitive.name == "bool" or not _NUMBERS[primitive.is_float].issuperset(map(type, values)):
         return False
     try:
@@ -353,7 +357,7 @@ def _number(primitive: Primitive, value: object, path: str) -> Any:
     if primitive.name == "bool":
         if isinstance(value, bool):
             return value
-        raise ConversionError(path, f"expected true or false, got {_say(value)}")
+        raise ConversionError(path, f"expected true or false, got {_show(value)}")
     if value is None and primitive.is_float:
         return nan
     number: int | float
@@ -364,10 +368,10 @@ def _number(primitive: Primitive, value: object, path: str) -> Any:
             number = int(value)
         else:
             expected = "a number" if primitive.is_float else "an integer"
-            raise ConversionError(path, f"expected {expected}, got {_say(value)}")
+            raise ConversionError(path, f"expected {expected}, got {_show(value)}")
         struct.pack(f"<{primitive.code}", number)
     except (OverflowError, struct.error):
-        raise ConversionError(path, f"{_say(value)} does not fit in {primitive.name}") from None
+        raise ConversionError(path, f"{_show(value)} does not fit in {primitive.name}") from None
     return number
 
 
@@ -386,7 +390,7 @@ def _base64(value: str, path: str) -> bytes:
     try:
         return pybase64.b64decode(value, validate=True)
     except (Base64Error, ValueError):
-        raise ConversionError(path, f"not base64: {_say(value)}") from None
+        raise ConversionError(path, f"not base64: {_show(value)}") from None
 
 
 def _unknown(name: str, names: list[str]) -> str:
@@ -395,14 +399,14 @@ def _unknown(name: str, names: list[str]) -> str:
     return f"unknown field; there are {', '.join(names)}" if names else "unknown field"
 
 
-def _say(value: object) -> str:
-    """A value as an error message shows it, in JSON's terms."""
+def _show(value: object) -> str:
+    """A value as error texts show it, in JSON's terms."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, str):
         return f'"{_quote(value)}"'
     if isinstance(value, int):
-        # The digits of a huge integer would take longer than all else.
+        # To write the digits of a huge integer would take longer than all else.
         return str(value) if value.bit_length() < 100 else "a huge integer"
     if isinstance(value, float):
         return str(value)
@@ -412,7 +416,7 @@ def _say(value: object) -> str:
 
 
 def _quote(text: str) -> str:
-    """The beginning of a stranger's text, fit for a line of a log."""
+    """The beginning of a client's text, escaped for a line of the log."""
     start = text if len(text) <= _QUOTED else f"{text[:_QUOTED]}…"
     return start if start.isprintable() else json.dumps(start)[1:-1]
 

@@ -1,6 +1,4 @@
-"""What a route puts on MQTT and takes from it: an encoding, compressed or not, and what MQTT 5 says
-about it in properties.
-"""
+"""MQTT payloads of a route: encoding, compression, size limits, and the properties of MQTT 5."""
 
 from __future__ import annotations
 
@@ -18,22 +16,22 @@ from appliance.ros.payload.fallback import ConversionError, TooLargeError
 
 Compression: TypeAlias = Literal["none", "zstd"]
 
-#: What a user property is called that names the compression, MQTT having no property for it.
+#: The user property that names the compression, for which MQTT 5 has no property of its own.
 CONTENT_ENCODING = "content-encoding"
 
-#: Where a frame of zstd begins (RFC 8878), and no message in any encoding does.
+#: The first bytes of a zstd frame (RFC 8878). No message in any encoding begins with these.
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
-#: Bytes of history that a frame may refer to: what RFC 8878 asks of every decoder.
+#: Bytes of history that a zstd frame may refer to: RFC 8878 asks this of every decoder.
 ZSTD_WINDOW = 8 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class InputLimits:
-    """What one message for ROS may be, as all others wait while it is converted.
+    """Limits of one message for ROS: all others wait while it is converted.
 
-    `payload` are bytes of JSON and of text, where each byte is work; `packet` of what else there
-    is, which is mostly copied. `items` is what it may weigh (weigh.py).
+    `payload` limits the bytes of text encodings such as JSON, where each byte is work; `packet`
+    limits the bytes of the others, which are mostly copied. `items` limits the cost (cost.py).
     """
 
     payload: int = 1024 * 1024
@@ -124,14 +122,14 @@ def user_property(properties: Properties, name: str) -> str | None:
 
 
 def _compressor() -> Callable[[bytes], bytes]:
-    # Imported when a route asks for it: that takes longer than all else.
+    # Imported when a route compresses: the import takes longer than all else here.
     from zstandard import ZstdCompressor
 
     return ZstdCompressor().compress
 
 
 def unpacked_size(payload: bytes) -> float:
-    """Bytes of the payload when it is decompressed, if it was compressed; infinity when unknown."""
+    """Bytes of the payload after decompression, where it is compressed; infinity when unknown."""
     if not payload.startswith(ZSTD_MAGIC):
         return len(payload)
     from zstandard import ZstdError, frame_content_size
@@ -151,7 +149,7 @@ def _decompressor(limits: InputLimits, encoding: Encoding) -> Callable[[bytes], 
 
     def decompress(payload: bytes) -> bytes:
         try:
-            # A size that is told is made room for, whatever it is: it is looked at first.
+            # zstandard allocates the size that the frame announces, so that is checked first.
             limits.check_size(frame_content_size(payload), encoding)
             return decompressor.decompress(payload, max_output_size=largest, allow_extra_data=False)
         except ZstdError as error:

@@ -1,4 +1,4 @@
-"""The JSON Schema (2020-12) of a message type: of what is sent in JSON, and what is taken."""
+"""The JSON Schema (2020-12) of a message type, for the JSON that is sent and accepted."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def topic_of(type_name: str) -> str:
-    """`std_msgs/String` of `std_msgs/msg/String`: where in the schemas its own is."""
+    """The topic level of a type's schema: `std_msgs/String` of `std_msgs/msg/String`."""
     return type_name.replace("/msg/", "/", 1)
 
 
 def json_schema(description: TypeDescription) -> dict[str, Any]:
-    """The schema of a type, with those of the types in it under `$defs`.
+    """The schema of a type, with those of nested types under `$defs`.
 
-    No field is required: a missing one takes its default.
+    No field is required: a missing field takes its default.
     """
     types: dict[str, Any] = {}
     schema = _structure(description, types)
@@ -53,11 +53,11 @@ def _value(type_: FieldType, types: dict[str, Any]) -> dict[str, Any]:
     if isinstance(type_, Primitive):
         return _number(type_)
     if isinstance(type_, (String, WideString)):
-        # A bound counts bytes of UTF-8 or units of UTF-16: no text has more characters than these.
+        # A bound counts bytes of UTF-8 or units of UTF-16; a text has at most as many characters.
         return {"type": "string"} | ({"maxLength": type_.bound} if type_.bound else {})
     if isinstance(type_, TypeDescription):
         if type_.name not in types:
-            types[type_.name] = {}  # its place, as long as it is not known
+            types[type_.name] = {}  # reserved, as nested types may refer to it
             types[type_.name] = _structure(type_, types)
         reference = {"$ref": "#/$defs/" + type_.name.replace("~", "~0").replace("/", "~1")}
         return {"anyOf": [reference, {"const": "now"}]} if type_.name == TIME else reference

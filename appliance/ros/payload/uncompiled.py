@@ -1,11 +1,11 @@
-"""Message types of which only the definition can be read: no compiled support for them loads here.
+"""Message types without compiled support, from their definitions.
 
-That is so in the one file, whose Python and ROS are hardly ever those that a robot's workspace was
-built with. rclpy wants a type support even for messages that it carries as bytes. But of it Fast
-DDS then uses nothing but the name and the hash of the type, and so the support of a type that there
-is serves for any other under another name.
+The one file needs this: its Python and ROS are hardly ever those that a robot's workspace was built
+with, so that the compiled support of the workspace does not load. rclpy requires a type support
+even for messages that it carries as bytes. Fast DDS then uses only the name and the hash of the
+type, so that the support of an installed type can serve for another type under that type's name.
 
-For services there is no such way: rclpy takes and gives no serialized requests.
+Services cannot be bridged this way, as rclpy does not accept or return serialized requests.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from appliance.ros.payload.definitions import (
     import_message,
 )
 
-#: The type whose support serves for others: it has no bounded size, as others may have none.
+#: The type whose support serves for others. Its size is unbounded, as that of others may be.
 MODEL = "std_msgs/msg/String"
-#: The longest array of fixed length: a value of it is made for its default.
-MOST_ITEMS = 1 << 24
+#: The longest fixed-length array, of which a default value is created.
+MAX_ARRAY_ITEMS = 1 << 24
 
-#: Of the types that contain one another, those that are just being read.
+#: The types whose definitions are being read, outermost first, to detect types in themselves.
 _being_read: ContextVar[tuple[str, ...]] = ContextVar("_being_read", default=())
 _IDENTIFIER = b"rosidl_typesupport_fastrtps_c"
 
 
 def find_definition(name: str) -> Path | None:
     """The `.msg`, `.srv` or `.action` file of a type, or of the service or action that it is part
-    of, in a workspace that AMENT_PREFIX_PATH tells of."""
+    of, in the workspaces of AMENT_PREFIX_PATH."""
     package, _, rest = name.partition("/")
     kind, _, type_name = rest.partition("/")
     file = f"{type_name.partition('_')[0]}.{kind}"
@@ -59,15 +59,15 @@ def find_definition(name: str) -> Path | None:
 
 
 def message_class(name: str, definition: Path, load: Callable[[str], type]) -> type[Any]:
-    """A class that rclpy takes for a message's, for raw subscriptions and bytes to publish.
+    """A class that rclpy accepts as a message class, to subscribe and publish serialized messages.
 
-    `describe` knows what it is made of. `load` gives the classes of nested types. Raises
-    UnknownTypeError when the definition cannot be read, or there is no other middleware's support.
+    `describe` returns its description. `load` returns the classes of nested types. Raises
+    UnknownTypeError when the definition cannot be read, or the middleware is not Fast DDS.
     """
     description = _read(name, definition, load)
     namespace, _, type_name = name.replace("/msg/", "::msg/").partition("/")
     support = _Support(namespace, type_name, _hash(name, definition.with_suffix(".json")))
-    # What would turn a message into an object, or back, is never asked for; it only has to be set.
+    # rclpy requires functions that convert messages to objects and back, but never calls these.
     conversions = dict.fromkeys(
         ("_CREATE_ROS_MESSAGE", "_CONVERT_FROM_PY", "_CONVERT_TO_PY", "_DESTROY_ROS_MESSAGE"), name
     )
@@ -102,8 +102,8 @@ def _field(field: Any, load: Callable[[str], type]) -> Field:
     if field.type.is_array:
         size = field.type.array_size
         is_fixed = size is not None and not field.type.is_upper_bound
-        if is_fixed and size > MOST_ITEMS:
-            raise UnknownTypeError(f"{field.name} has {size} items, the most is {MOST_ITEMS}")
+        if is_fixed and size > MAX_ARRAY_ITEMS:
+            raise UnknownTypeError(f"{field.name} has {size} items, the most is {MAX_ARRAY_ITEMS}")
         type_ = Array(item, size) if is_fixed else Sequence(item, size)
     default = field.default_value
     if default is None:
@@ -114,7 +114,8 @@ def _field(field: Any, load: Callable[[str], type]) -> Field:
 
 
 def _zero(type_: FieldType) -> Any:
-    """What a compiled type has where its definition says nothing; None for messages."""
+    """The default of a field whose definition has none, as in a compiled type; None for
+    messages."""
     if isinstance(type_, Array):
         zero = _zero(type_.item)
         return None if zero is None else _values(type_.item, [zero] * type_.length)
@@ -147,12 +148,12 @@ def _hash(name: str, file: Path) -> bytes | None:
             if entry["type_name"] == name and version == "RIHS01" and len(value) == 64:
                 return bytes.fromhex(value)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        pass  # others are told no hash
+        pass  # the type is then announced without a hash
     return None
 
 
 class _Handle(ctypes.Structure):
-    """`rosidl_message_type_support_t`; what begins with the hash is there from ROS 2 Iron on."""
+    """`rosidl_message_type_support_t`; the members from `get_hash` on exist since ROS 2 Iron."""
 
     _fields_ = (
         ("identifier", ctypes.c_char_p),
@@ -175,7 +176,7 @@ class _Callbacks(ctypes.Structure):
 
 
 class _Hash(ctypes.Structure):
-    """`rosidl_type_hash_t`; version 0 is none."""
+    """`rosidl_type_hash_t`; version 0 means no hash."""
 
     _fields_ = (("version", ctypes.c_uint8), ("value", ctypes.c_uint8 * 32))
 
@@ -184,7 +185,8 @@ _GET_HASH = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _Support:
-    """A type's support, in a capsule as rclpy wants it; the middleware has pointers into this."""
+    """The support of a type, in a capsule as rclpy expects it. The middleware has pointers into
+    this object."""
 
     def __init__(self, namespace: str, name: str, type_hash: bytes | None) -> None:
         """Raises UnknownTypeError when the middleware is not Fast DDS."""
@@ -212,7 +214,7 @@ class _Model(NamedTuple):
 
 @functools.cache
 def _model() -> _Model:
-    """The support of MODEL; it is looked at whether it is made as is thought here."""
+    """The support of MODEL. Raises UnknownTypeError when its layout is not the one expected."""
     model = import_message(MODEL)
     kind: Any = model.__class__
     kind.__import_type_support__()

@@ -32,7 +32,7 @@ from appliance.ros.payload import converter as convert
 from appliance.ros.payload.codegen import generate
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import import_message, load_description
-from appliance.ros.payload.fallback import decode as careful_decode
+from appliance.ros.payload.fallback import decode as fallback_decode
 
 CONVERTERS = Converters(load_description, now=lambda: 1_700_000_000_123_456_789)
 VARIANTS = ("default", "smallest", "largest", "random 1", "random 2", "random 3")
@@ -296,7 +296,7 @@ def test_round_trip(name: str) -> None:
         assert same(json.loads(payload), plain(message, in_json=True))
         twin = plain(message)
         assert same(converter.to_dict(cdr), twin)
-        assert same(careful_decode(converter.description, cdr), twin)
+        assert same(fallback_decode(converter.description, cdr), twin)
 
         # JSON to ROS: the same bytes. null was NaN or infinity: it comes back as NaN.
         finite = write(message, nan_for_inf=True)
@@ -378,7 +378,7 @@ def test_missing_fields_take_their_defaults(name: str) -> None:
 
 @pytest.mark.parametrize("name", TYPES)
 def test_mutated_cdr(name: str) -> None:
-    """Whatever the bytes: a ConversionError, or what the careful way reads."""
+    """Whatever the bytes: a ConversionError, or what the fallback reads."""
     converter = CONVERTERS.get(name)
     rng = random.Random(name)
     for message in messages(name):
@@ -386,7 +386,7 @@ def test_mutated_cdr(name: str) -> None:
         for _ in range(8):
             mutant = mutated(cdr, rng)
             try:
-                expected = careful_decode(converter.description, mutant)
+                expected = fallback_decode(converter.description, mutant)
             except ConversionError:
                 with pytest.raises(ConversionError):
                     converter.to_json(mutant)
@@ -437,7 +437,7 @@ def spoiled(value, rng: random.Random):
 
 @pytest.mark.parametrize("name", TYPES)
 def test_mutated_json_and_cbor(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fast way takes nothing that the careful way refuses, and writes the same bytes."""
+    """The fast way takes nothing that the fallback refuses, and writes the same bytes."""
     monkeypatch.setattr(convert, "LARGEST_LENIENT", 1 << 30)
     converter = CONVERTERS.get(name)
     rng = random.Random(name)
