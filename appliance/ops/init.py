@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import secrets
@@ -207,6 +208,10 @@ def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Itera
             "files that this command makes (server.crt, server.key, ca.crt in one directory)"
         )
     made = not authority.exists()
+    if made and directory.is_dir():
+        # Git creates folders as open as the umask allows; nobody else may put a CA in its place.
+        with contextlib.suppress(PermissionError):  # another user's folder
+            directory.chmod(directory.stat().st_mode & ~0o022)
     names, addresses = certs.local_names()
     names += [name for name in more_names if name not in names]
     if made:
@@ -215,9 +220,10 @@ def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Itera
     certs.issue_server(directory, names, addresses)
     known = ", ".join([*names, *map(str, addresses)])
     yield InitStep(tls.certificate, True, f"the server's certificate, for {known}")
-    if not readme.exists():
+    made = not readme.exists()  # a clone of the project's repository has it
+    if made:
         certs.write_readme(directory)
-        yield InitStep(readme, True, "what each of these files is, and who may have it")
+    yield InitStep(readme, made, "what each of these files is, and who may have it")
 
 
 def _users(

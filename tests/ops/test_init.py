@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import ssl
 import stat
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -167,6 +169,44 @@ def test_only_what_is_missing_is_made(tmp_path: Path) -> None:
     assert (tmp_path / "certs/ca.crt").read_bytes() == authority
     findings = list(check(config.load(tmp_path / "appliance.yaml")))
     assert {finding.level for finding in findings} <= {"ok", "warning"}
+
+
+PROJECT = Path(__file__).parents[2]
+
+
+def test_the_repository_has_the_page_that_init_writes(tmp_path: Path) -> None:
+    certs.write_readme(tmp_path)
+    assert (PROJECT / "certs/README.md").read_text() == (tmp_path / "README.md").read_text()
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_a_clone_of_the_repository_is_filled_and_stays_clean(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        command = [
+            "git",
+            "-C",
+            str(tmp_path),
+            "-c",
+            "user.name=x",
+            "-c",
+            "user.email=x",
+            *arguments,
+        ]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    for name in (".gitignore", "appliance.yaml", "certs/README.md"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copyfile(PROJECT / name, tmp_path / name)
+    (tmp_path / "certs").chmod(0o775)
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-q", "-m", "a clone")
+    steps = list(initialise(tmp_path, robot="robot"))
+    assert made(steps) == {"ca.crt", "server.crt", "acl.conf", "users.passwd"}
+    assert (tmp_path / "certs/ca.key").exists() and (tmp_path / "certs/server.key").exists()
+    assert mode(tmp_path / "certs") == 0o755
+    assert git("status", "--porcelain") == ""
+    assert git("ls-files").split() == [".gitignore", "appliance.yaml", "certs/README.md"]
 
 
 def test_a_configuration_that_names_other_files(tmp_path: Path) -> None:
