@@ -1,23 +1,23 @@
-"""Calls: what MQTT clients ask of the bridge, and how they are answered.
+"""Dispatches calls of MQTT clients to endpoints, and answers each of them once.
 
-A call is a message to a call topic such as `r2d2/reset/_call`. Where its answer goes is said by
+A call is a message to a call topic such as `r2d2/reset/_call`. Its answer goes
 
-- the Response Topic of MQTT 5; the Correlation Data goes back with the answer; or
-- a token of the caller's choice as one more level, `r2d2/reset/_call/42`, which is how 3.1.1 does
-  it: the answer is on `r2d2/reset/_reply/{client id}/42`.
+- to the Response Topic of MQTT 5, with the call's Correlation Data; or
+- for 3.1.1, where the caller appends a token of its choice as one more level,
+  `r2d2/reset/_call/42`, to `r2d2/reset/_reply/{client id}/42`.
 
-The appliance publishes the answer, and may publish anywhere; so it does not let itself be used. A
-Response Topic is one that the caller could have published to itself, or one below its own
-`_reply/{client id}`, which it must be allowed to receive. What cannot be answered, for the want of
-a way back or because the caller may not use it, is not carried out: the error is on
-`r2d2/reset/_reply/{client id}`, for who looks for it there, and in the log.
+The appliance publishes the answer and may publish anywhere, so callers must not be able to misuse
+it. A Response Topic must be one that the caller could publish to itself, or one below its own
+`_reply/{client id}` that it may receive. A call that cannot be answered, for want of a Response
+Topic or of the right to use it, is not carried out: the error goes to
+`r2d2/reset/_reply/{client id}`, where the caller may find it, and to the log.
 
-A call may be JSON, CBOR or ROS's own bytes, as its content type says, else as the route does; its
-answer is the same. Both are converted when it is their turn, see conversions.py.
+A call is JSON, CBOR or ROS's own bytes, as its content type says or else its route; its answer has
+the same encoding. Both are converted in turn with those of others, see topics/conversions.py.
 
-How many are under way is bounded for each client, each user and all together. Cancelling has slots
-of its own, which nothing else takes and no other user: who has sent a goal can always stop it.
-Everything here is for the event loop's thread.
+The calls under way are limited for each client, each user and in total. Calls that cancel goals
+have slots of their own, which neither other calls nor other users can exhaust: a client can always
+cancel the goals that it has sent. Everything here is for the event loop's thread.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ log = logging.getLogger(__name__)
 
 CLIENT_ID = "_calls"
 
-#: What can go wrong with a call; the message beside it has the particulars.
+#: Why a call has failed; the message beside it has the details.
 ErrorCode: TypeAlias = Literal[
-    "bad_request",  # the payload, or the message, is not what the call takes
-    "expired",  # it was sent long before it came
+    "bad_request",  # the payload, or the message, is not what the endpoint expects
+    "expired",  # it was sent too long before it arrived
     "no_response_topic",  # there is no way to answer
-    "not_authorized",  # the caller may not have the answer there, or not ask for that
+    "not_authorized",  # the caller may not use that Response Topic, or not make that call
     "too_large",  # the payload is larger than what is converted
     "too_many",  # the caller, or all together, have too many calls under way
-    "unavailable",  # there is no such service, action or node on the bus now
+    "unavailable",  # there is no such service, action or node on the bus
     "vanished",  # there was, and it went away before it answered
     "timeout",  # no answer within the route's time
-    "rejected",  # the node said no
+    "rejected",  # the node has refused
     "unknown_goal",  # the action's server knows of no such goal, or it has ended
     "unknown_type",  # the type is not installed here
     "ros_error",  # ROS itself refused, or is not there
@@ -76,30 +76,30 @@ ErrorCode: TypeAlias = Literal[
 ]
 
 
-#: Encodings of a call that has other values than ROS messages in it; of such, ROS's own bytes too.
+#: Encodings of calls that are no ROS messages; calls that are may be ROS's own bytes too.
 WITHOUT_RAW: tuple[EncodingName, ...] = tuple(VALUE_ENCODINGS)
 
-#: Seconds between two lines in the log about the same route's errors.
+#: Seconds between two log lines about failed calls at the same topic.
 REPORT_INTERVAL = 60.0
 
 
-#: Bytes that are converted in a microsecond or so, and count for that in the broker's
-#: `Counters.cost`: who sends much then waits for the others.
+#: Bytes that take a microsecond or so to convert, and count as one unit of the broker's
+#: `Counters.cost`: the scheduler lets a client that sends much wait for the others.
 BYTES_PER_COST_UNIT = 16
 
-#: Bytes of a topic, as of every string in MQTT.
-LONGEST_TOPIC = 0xFFFF
+#: The most bytes of a topic, as of every string in MQTT.
+MAX_TOPIC_BYTES = 0xFFFF
 
-#: Bytes of payload of all calls under way, and of those of one user.
-TOTAL_BYTES = 64 * 1024 * 1024
-USER_BYTES = TOTAL_BYTES // 4
+#: The most payload bytes of all calls under way, and of those of one user.
+MAX_BYTES = 64 * 1024 * 1024
+MAX_USER_BYTES = MAX_BYTES // 4
 
 T = TypeVar("T")
 K = TypeVar("K")
 
 
 class CallError(Exception):
-    """A call that fails: the code for programs, and the message for people."""
+    """A call has failed: `code` is for programs, the message for people."""
 
     def __init__(self, code: ErrorCode, message: str) -> None:
         super().__init__(message)
@@ -108,7 +108,7 @@ class CallError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to a call: its payload, how that is encoded, and the ROS type of it, if any."""
+    """The answer to a call: a payload with its encoding, and its ROS type if it is a message."""
 
     payload: bytes
     encoding: EncodingName
@@ -117,8 +117,8 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Calls under way, and as many goals: of one client, of all together, and of one user (None: a
-    quarter of these); and what one call may be."""
+    """The most calls under way, and as many goals, of one client, in total, and of one user (None:
+    a quarter of the total); and the limits on one call's payload."""
 
     client: int = 20
     total: int = 500
@@ -127,22 +127,22 @@ class CallLimits:
 
     @property
     def share(self) -> int:
-        """What one user may have under way."""
+        """The most calls under way of one user."""
         return max(1, self.total // 4) if self.user is None else self.user
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A slot that is taken: by this client, of this user."""
+    """A slot that a client of this user has acquired."""
 
     client: Session
     user: str | None
 
 
 class ConcurrencyLimiter:
-    """Places for what is under way: `what` says what that is, in the plural.
+    """Limits what is under way by client, by user and in total; `what` is its name, in the plural.
 
-    Where a slot is `sure`, what other users have never keeps it from anybody.
+    With `ignore_total`, the slots of other users never exhaust those of a user.
     """
 
     def __init__(self, what: str, *, ignore_total: bool = False) -> None:
@@ -174,7 +174,7 @@ class ConcurrencyLimiter:
         )
 
     def acquire(self, client: Session) -> Slot:
-        """Take a slot, which `check` has found."""
+        """Acquire a slot that `check` has found to be free."""
         slot = Slot(client, user_of(client))
         self._total += 1
         self._clients[slot.client] += 1
@@ -182,15 +182,15 @@ class ConcurrencyLimiter:
         return slot
 
     def release(self, slot: Slot) -> None:
-        """It is free again."""
+        """Release a slot."""
         self._total -= 1
-        _take_off(self._clients, slot.client, 1)
-        _take_off(self._users, slot.user, 1)
+        _subtract(self._clients, slot.client, 1)
+        _subtract(self._users, slot.user, 1)
 
 
 @dataclass(eq=False, slots=True)
 class CallCounters:
-    """What a route counts from its start; `errors` are by code."""
+    """What is counted of a route since its start; `errors` are by code."""
 
     calls: int = 0
     answers: int = 0
@@ -204,8 +204,8 @@ class Call:
     """One call that can be answered.
 
     `topic` is without the token. `reply` is the answer as far as it is known beforehand: its topic,
-    QoS and Correlation Data. `encoding` is the payload's, and will be the answer's; `doubt` says
-    why it may be another.
+    QoS and Correlation Data. `encoding` is that of the payload and of the answer;
+    `encoding_note` ends the error of a payload whose content type was not understood.
     """
 
     caller: Session
@@ -213,24 +213,24 @@ class Call:
     topic: str
     reply: Message
     encoding: EncodingName
-    doubt: str = ""
-    is_late: bool = False
+    encoding_note: str = ""
+    has_timed_out: bool = False
     slot: Slot | None = None
     timer: asyncio.TimerHandle | None = None
     task: asyncio.Task[None] | None = None
 
 
-#: Takes in what a call asks for, at once, and gives what finds the answer. Both raise CallError.
+#: Converts a call at once and returns a function that finds its answer. Both raise CallError.
 Handler: TypeAlias = Callable[[Call], Callable[[], Awaitable[Answer]]]
 
 
 @dataclass(eq=False, slots=True)
 class CallEndpoint:
-    """What can be called under a topic, and how it is handled.
+    """What is called under a topic, and its handler.
 
-    `name` is what the log calls it. `timeout` is in seconds. `encoding` is for what names none, and
-    `encodings` are those that it takes, with `largest` bytes at most if that is said. What cancels
-    (`is_cancel`) has slots of its own.
+    `name` is for the log and for errors. `timeout` is in seconds. `encoding` is that of calls that
+    name none, and `encodings` are those that are accepted. `max_bytes` limits the payload. Calls
+    that cancel goals (`is_cancel`) have slots of their own.
     """
 
     topic: str
@@ -240,7 +240,7 @@ class CallEndpoint:
     handle: Handler
     encoding: EncodingName = "json"
     encodings: tuple[EncodingName, ...] = WITHOUT_RAW
-    largest: int | None = None
+    max_bytes: int | None = None
     is_cancel: bool = False
 
 
@@ -248,7 +248,7 @@ MessageHandler: TypeAlias = Callable[[Session, Message], None]
 
 
 class _Link(InsideLink):
-    """The link of the dispatcher's session: calls, and what `listen` subscribed to."""
+    """The link of the dispatcher's session, for calls and for what `subscribe` is called with."""
 
     def __init__(self, receive: Callable[[Session, Message, int], None]) -> None:
         self._receive = receive
@@ -262,13 +262,13 @@ class _Link(InsideLink):
         retain: bool,
         subscription_ids: list[int] | None,
     ) -> None:
-        """A message to one of the topics that were asked for."""
+        """Receive a message that a client has published to one of the topics."""
         if message.publisher is not None and subscription_ids:
             self._receive(message.publisher, message, subscription_ids[0])
 
 
 class CallDispatcher:
-    """Takes calls from MQTT, has them handled, and answers each of them once."""
+    """Receives calls from MQTT, dispatches them to endpoints and publishes the answers."""
 
     def __init__(self, broker: Broker, entries: Entries, conversions: ConversionQueue) -> None:
         self.limits = CallLimits()
@@ -278,38 +278,38 @@ class CallDispatcher:
         self._entries = entries
         self._loop = entries.loop
         self._session: Session | None = None
-        #: Who gets what comes, by the identifier of the subscription it came through.
-        self._receivers: dict[int, MessageHandler] = {}
+        #: The handlers of messages, by the identifier of the subscription that matched.
+        self._handlers: dict[int, MessageHandler] = {}
         self._identifiers: dict[str, int] = {}
         self._last_identifier = 0
-        #: By topic, the first of those that were offered there; the others wait for it to go.
+        #: By topic; the first is called, the others take its place once it is unregistered.
         self._endpoints: dict[str, list[CallEndpoint]] = {}
         self._slots = ConcurrencyLimiter("calls")
         self._cancel_slots = ConcurrencyLimiter("calls that cancel goals", ignore_total=True)
         self._calls: dict[Call, CallEndpoint] = {}
         self._bytes: Counter[str | None] = Counter()
-        self._report_at: dict[str, float] = {}
+        self._next_log: dict[str, float] = {}
 
     def start(self) -> None:
-        """Let calls come in."""
+        """Subscribe to calls."""
         self._session = self._broker.attach(CLIENT_ID, _Link(self.receive))
         self._broker.departures.append(self._replay_guard.departed)
         for topic_filter in self._identifiers:
-            self._subscribe(topic_filter)
+            self._subscribe_session(topic_filter)
 
     async def stop(self) -> None:
-        """Answer what is under way with `stopping`, and leave the broker; may be called twice."""
+        """Answer calls under way with `stopping`, and leave the broker; may be called twice."""
         for topic in list(self._endpoints):
             del self._endpoints[topic]
-            self._ignore_calls(topic)
+            self._unsubscribe_calls(topic)
         for call in list(self._calls):
-            if call.task is None:  # it waits for its turn
-                self._end(call, _stopping())
+            if call.task is None:  # it is queued to be converted
+                self._reject(call, _stopping())
         tasks = [call.task for call in self._calls if call.task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.sleep(0)  # the answers go out
+        await asyncio.sleep(0)  # lets the answers be published
         session, self._session = self._session, None
         if session is not None:
             self._broker.departures.remove(self._replay_guard.departed)
@@ -317,76 +317,76 @@ class CallDispatcher:
 
     # Topics
 
-    def listen(self, topic_filter: str, receive: MessageHandler) -> None:
-        """Hand what clients publish there to `receive`, with the session that published it."""
+    def subscribe(self, topic_filter: str, handler: MessageHandler) -> None:
+        """Call `handler` with each message that a client publishes there, and its session."""
         self._last_identifier += 1
         self._identifiers[topic_filter] = self._last_identifier
-        self._receivers[self._last_identifier] = receive
-        self._subscribe(topic_filter)
+        self._handlers[self._last_identifier] = handler
+        self._subscribe_session(topic_filter)
 
-    def _subscribe(self, topic_filter: str) -> None:
+    def _subscribe_session(self, topic_filter: str) -> None:
         if self._session is not None:
-            # QoS 0 loses nothing here, as the link takes each message at once. A retained message
-            # may be an old call: it is not carried out again.
+            # QoS 0 loses nothing, as the link receives each message at once. Retained messages are
+            # not sent: they may be old calls, which must not be carried out again.
             identifier = self._identifiers[topic_filter]
             subscription = Subscription(
                 topic_filter, 0, no_local=True, retain_handling=2, identifier=identifier
             )
             self._broker.subscribe(self._session, subscription)
 
-    def ignore(self, topic_filter: str) -> None:
-        """Listen there no longer."""
-        del self._receivers[self._identifiers.pop(topic_filter)]
+    def unsubscribe(self, topic_filter: str) -> None:
+        """End a subscription."""
+        del self._handlers[self._identifiers.pop(topic_filter)]
         if self._session is not None:
             self._broker.unsubscribe(self._session, topic_filter)
 
     def register(self, endpoint: CallEndpoint) -> None:
-        """Let `endpoint.topic`, which may have a `+` in it, be called."""
+        """Dispatch calls at `endpoint.topic`, which may contain a `+`, to the endpoint."""
         endpoints = self._endpoints.setdefault(endpoint.topic, [])
         endpoints.append(endpoint)
         if len(endpoints) == 1:
-            self._listen_for(endpoint)
+            self._subscribe_calls(endpoint)
         else:
             text = "%s cannot be called: calls at %s are for %s"
             log.warning(text, endpoint.name, endpoint.topic, endpoints[0].name)
 
-    def _listen_for(self, endpoint: CallEndpoint) -> None:
-        self.listen(
-            endpoint.topic, lambda caller, message: self._take(endpoint, caller, message, False)
+    def _subscribe_calls(self, endpoint: CallEndpoint) -> None:
+        self.subscribe(
+            endpoint.topic, lambda caller, message: self._dispatch(endpoint, caller, message, False)
         )
-        self.listen(
+        self.subscribe(
             f"{endpoint.topic}/+",
-            lambda caller, message: self._take(endpoint, caller, message, True),
+            lambda caller, message: self._dispatch(endpoint, caller, message, True),
         )
 
     def unregister(self, endpoint: CallEndpoint) -> None:
-        """Offer it no longer; calls under way have their answers yet."""
+        """End the dispatch of new calls to the endpoint; those under way are still answered."""
         endpoints = self._endpoints.get(endpoint.topic, [])
         if endpoint not in endpoints:
-            return  # `stop` has withdrawn all
+            return  # `stop` has removed all
         was_first = endpoints[0] is endpoint
         endpoints.remove(endpoint)
         if not endpoints:
             del self._endpoints[endpoint.topic]
-            self._report_at.pop(endpoint.topic, None)
+            self._next_log.pop(endpoint.topic, None)
         if was_first:
-            self._ignore_calls(endpoint.topic)
+            self._unsubscribe_calls(endpoint.topic)
             if endpoints:
-                self._listen_for(endpoints[0])
+                self._subscribe_calls(endpoints[0])
 
-    def _ignore_calls(self, topic: str) -> None:
-        self.ignore(topic)
-        self.ignore(f"{topic}/+")
+    def _unsubscribe_calls(self, topic: str) -> None:
+        self.unsubscribe(topic)
+        self.unsubscribe(f"{topic}/+")
 
-    def receive(self, origin: Session, message: Message, identifier: int) -> None:
-        """A message came through the subscription with that identifier."""
+    def receive(self, publisher: Session, message: Message, identifier: int) -> None:
+        """Pass a message to the handler of the subscription with that identifier."""
         self._broker.counters.cost += len(message.payload) // BYTES_PER_COST_UNIT
-        receive = self._receivers.get(identifier)
-        if receive is not None:
-            receive(origin, message)
+        handler = self._handlers.get(identifier)
+        if handler is not None:
+            handler(publisher, message)
 
     def publish(self, message: Message) -> ReasonCode:
-        """Publish as the appliance; 0x10 when nobody has subscribed."""
+        """Publish as the appliance; returns 0x10 when there is no matching subscription."""
         if self._session is None:
             return ReasonCode.NO_MATCHING_SUBSCRIBERS
         code = self._broker.publish(message, self._session)
@@ -394,10 +394,10 @@ class CallDispatcher:
         return code
 
     def clear_retained(self, base: str, name: str, below: str) -> None:
-        """Take back what was left retained by a run that was killed.
+        """Clear messages that a run that was killed has left retained.
 
-        That is what is below `base`, where `name` stands for any ROS name, and there matches the
-        regular expression `below`.
+        These are below `base`, in which `name` stands for any ROS name, and the rest of their topic
+        matches the regular expression `below`.
         """
         start, _, end = base.partition(name)
         names = r"(/\w+)+" if name in base else ""
@@ -407,45 +407,48 @@ class CallDispatcher:
                 self.publish(Message(topic, b"", 0, True))
 
     def may_publish(self, caller: Session, topic: str) -> bool:
-        """Whether the rules in force let the caller publish there."""
+        """Whether the ACL in force lets the caller publish there."""
         try:
             return self._broker.route(caller, encode_string(topic)).allowed
         except ProtocolError:
             return False
 
     def now(self) -> float:
-        """Seconds of the broker's clock."""
+        """The time of the broker's clock, in seconds."""
         return self._broker.now
 
     # Calls
 
-    def _take(
+    def _dispatch(
         self, endpoint: CallEndpoint, caller: Session, message: Message, has_token: bool
     ) -> None:
         endpoint.counters.calls += 1
         topic, _, token = message.topic.rpartition("/") if has_token else (message.topic, "", "")
         own = f"{topic.rpartition('/')[0]}/_reply/{caller.client_id}"
-        said = (message.properties or {}).get(Property.CONTENT_TYPE)
-        named = named_encoding(said)
+        content_type = (message.properties or {}).get(Property.CONTENT_TYPE)
+        named = named_encoding(content_type)
         encoding = named or endpoint.encoding
         try:
-            reply = self._way_back(caller, message, own, token)
+            reply = self._reply_for(caller, message, own, token)
         except CallError as error:
             fallback = Message(own, b"", 1) if _is_own_topic(caller, own) else None
             self._fail(endpoint, caller, fallback, encoding, error)
             return
         call = Call(caller, message.payload, topic, reply, encoding)
-        if isinstance(said, str) and named is None:
-            call.doubt = f" (it says to be {quote(said[:60])}, and was read as {encoding})"
+        if isinstance(content_type, str) and named is None:
+            unknown = quote(content_type[:60])
+            call.encoding_note = (
+                f" (its content type {unknown} is unknown, it was read as {encoding})"
+            )
         try:
-            self._admit(endpoint, call, message)
+            self._check_limits(endpoint, call, message)
         except CallError as error:
             self._fail(endpoint, caller, reply, encoding, error)
             return
-        self._enter(endpoint, call)
-        self.conversions.do(caller, len(call.payload), partial(self._begin, endpoint, call))
+        self._add(endpoint, call)
+        self.conversions.do(caller, len(call.payload), partial(self._convert_call, endpoint, call))
 
-    def _enter(self, endpoint: CallEndpoint, call: Call) -> None:
+    def _add(self, endpoint: CallEndpoint, call: Call) -> None:
         slots = self._cancel_slots if endpoint.is_cancel else self._slots
         call.slot = slots.acquire(call.caller)
         endpoint.counters.under_way += 1
@@ -455,25 +458,25 @@ class CallDispatcher:
             "calls.timeout", endpoint.timeout, self._expire, call, served=endpoint.name
         )
 
-    def _begin(self, endpoint: CallEndpoint, call: Call) -> None:
-        """It is the call's turn to be converted."""
-        if call not in self._calls:  # it was given up
+    def _convert_call(self, endpoint: CallEndpoint, call: Call) -> None:
+        """Convert a call, now that its turn has come, and start to find its answer."""
+        if call not in self._calls:  # it has timed out
             return
         try:
-            find = endpoint.handle(call)
+            find_answer = endpoint.handle(call)
         except CallError as error:
-            self._end(call, error)
-        except Exception as problem:  # a fault in here must not leave the caller without an answer
+            self._reject(call, error)
+        except Exception as problem:  # a fault must not leave the caller without an answer
             self._entries.faults.caught("calls.take", problem, endpoint.name)
-            self._end(call, CallError("ros_error", repr(problem)))
+            self._reject(call, CallError("ros_error", repr(problem)))
         else:
             call.task = self._entries.task(
-                "calls.call", self._run(endpoint, call, find), served=endpoint.name
+                "calls.call", self._run(endpoint, call, find_answer), served=endpoint.name
             )
-            self._entries.when_done("calls.end", call.task, self._leave, call)
+            self._entries.when_done("calls.end", call.task, self._remove, call)
 
     async def convert(self, caller: Session, size: int, work: Callable[[], T]) -> T:
-        """What `work` gives, which converts so many bytes, when it is the caller's turn."""
+        """The result of `work`, which converts `size` bytes, once it is the caller's turn."""
         done: asyncio.Future[T] = self._loop.create_future()
 
         def settle() -> None:
@@ -487,8 +490,8 @@ class CallDispatcher:
         self.conversions.do(caller, size, settle)
         return await done
 
-    def _way_back(self, caller: Session, message: Message, own: str, token: str) -> Message:
-        """An empty answer with its topic and correlation. Raises CallError."""
+    def _reply_for(self, caller: Session, message: Message, own: str, token: str) -> Message:
+        """An empty answer with its topic and Correlation Data. Raises CallError."""
         properties = message.properties or {}
         topic = properties.get(Property.RESPONSE_TOPIC)
         correlation = properties.get(Property.CORRELATION_DATA)
@@ -507,14 +510,14 @@ class CallDispatcher:
             topic = f"{own}/{token}"
             if not _is_own_topic(caller, topic):
                 raise CallError("no_response_topic", "the topic of the answer would be too long")
-        # What is below the id of a client `alice/1` belongs to the client `alice`.
+        # A client `alice/1` has no topics of its own: `_reply/alice/1` is of the client `alice`.
         if _is_level(caller.client_id) and (topic == own or topic.startswith(f"{own}/")):
             if not self._broker.may_receive(caller, topic):
                 raise CallError("not_authorized", f"the caller may not read {quote(topic)}")
         else:
             self._check_may_publish(caller, topic)
-        sent_back = {Property.CORRELATION_DATA: correlation} if correlation is not None else None
-        return Message(topic, b"", max(1, message.qos), properties=sent_back)
+        echoed = {Property.CORRELATION_DATA: correlation} if correlation is not None else None
+        return Message(topic, b"", max(1, message.qos), properties=echoed)
 
     def _check_may_publish(self, caller: Session, topic: str) -> None:
         try:
@@ -522,7 +525,7 @@ class CallDispatcher:
         except ProtocolError as error:
             raise CallError("bad_request", f"the Response Topic is not valid: {error}") from None
         if topic in self._broker.guards:
-            # The answer would come some time later, and as the appliance's own message.
+            # The answer would be published later, as a command of the appliance itself.
             raise CallError("not_authorized", f"{quote(topic)} is for commands, not for answers")
         if not route.allowed:
             raise CallError(
@@ -530,8 +533,8 @@ class CallDispatcher:
                 f"the caller may not publish to its Response Topic {quote(topic)}: {route.reason}",
             )
 
-    def _admit(self, endpoint: CallEndpoint, call: Call, message: Message) -> None:
-        """Raises CallError for a call that is not even looked at."""
+    def _check_limits(self, endpoint: CallEndpoint, call: Call, message: Message) -> None:
+        """Raises CallError for a call that is not converted at all."""
         caller = call.caller
         if message.retain:
             raise CallError("bad_request", "a call must not be retained: it would be kept")
@@ -541,8 +544,8 @@ class CallDispatcher:
             self.limits.input.check_size(size, ENCODINGS[call.encoding])
         except TooLargeError as error:
             raise CallError("too_large", str(error)) from None
-        if endpoint.largest is not None and size > endpoint.largest:
-            text = f"it has {size} bytes, {endpoint.name} takes {endpoint.largest} at most"
+        if endpoint.max_bytes is not None and size > endpoint.max_bytes:
+            text = f"it has {size} bytes, {endpoint.name} takes {endpoint.max_bytes} at most"
             raise CallError("too_large", text)
         if endpoint.is_cancel:
             self._cancel_slots.check(caller, self.limits)
@@ -555,12 +558,12 @@ class CallDispatcher:
             raise CallError("bad_request", text)
 
     def _check_age(self, endpoint: CallEndpoint, caller: Session, message: Message) -> None:
-        """Nobody waits for the answer of an old call any more, and what it would do nobody expects.
+        """Raises CallError for an old call: nobody waits for its answer, nor expects its effect.
 
-        To cancel is how an action is stopped: that is done whatever it says of its age, and only
-        not where MQTT itself has expired it [MQTT-3.3.2-5].
+        A call that cancels a goal stops an action, so it is carried out whatever age it claims,
+        unless MQTT itself has expired it [MQTT-3.3.2-5].
         """
-        is_over = message.expires_at is not None and message.expires_at <= self._broker.now
+        is_expired = message.expires_at is not None and message.expires_at <= self._broker.now
         try:
             age = said_age(message.properties, time.time())
         except ValueError as error:
@@ -568,67 +571,67 @@ class CallDispatcher:
                 raise CallError("bad_request", str(error)) from None
             age = 0.0
         if age is None:
-            # Asked also where it does not matter: what comes behind an old one is as old.
+            # Asked for cancels too, as each message tells the guard of the replay it is part of.
             is_old = self._replay_guard.has(message, caller, endpoint.timeout, self._loop.time())
-            is_over |= is_old and not endpoint.is_cancel
+            is_expired |= is_old and not endpoint.is_cancel
         elif age > endpoint.timeout and not endpoint.is_cancel:
             raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")
-        if is_over:
+        if is_expired:
             raise CallError("expired", "it was sent some time ago, before a connection was lost")
 
     def _check_bytes(self, caller: Session, size: int) -> None:
         own, total = self._bytes[user_of(caller)], self._bytes.total()
-        if own and own + size > USER_BYTES:
+        if own and own + size > MAX_USER_BYTES:
             raise CallError("too_many", f"{own} bytes of calls of its user are under way")
-        if total and total + size > TOTAL_BYTES:
+        if total and total + size > MAX_BYTES:
             raise CallError("too_many", f"{total} bytes of calls of all clients are under way")
 
     async def _run(
-        self, endpoint: CallEndpoint, call: Call, find: Callable[[], Awaitable[Answer]]
+        self, endpoint: CallEndpoint, call: Call, find_answer: Callable[[], Awaitable[Answer]]
     ) -> None:
         try:
-            answer = await find()
+            answer = await find_answer()
         except CallError as error:
-            self._tell(endpoint, call, error)
+            self._send_error(endpoint, call, error)
         except asyncio.CancelledError:
-            self._tell(endpoint, call, _too_late(endpoint) if call.is_late else _stopping())
-        except Exception as problem:  # a fault in here must not leave the caller without an answer
+            self._send_error(endpoint, call, _ended(endpoint, call))
+        except Exception as problem:  # a fault must not leave the caller without an answer
             self._entries.faults.caught("calls.handle", problem, endpoint.name)
-            self._tell(endpoint, call, CallError("ros_error", repr(problem)))
+            self._send_error(endpoint, call, CallError("ros_error", repr(problem)))
         else:
             endpoint.counters.answers += 1
-            about = [("status", "ok")]
+            user_properties = [("status", "ok")]
             if answer.type is not None:
-                about.append(("ros-type", answer.type))
-            self._answer(call.reply, answer.payload, answer.encoding, about)
+                user_properties.append(("ros-type", answer.type))
+            self._answer(call.reply, answer.payload, answer.encoding, user_properties)
 
     def _expire(self, call: Call) -> None:
-        """Its time is over."""
-        call.is_late = True
+        """Answer a call that has run into its timeout."""
+        call.has_timed_out = True
         if call.task is not None:
             call.task.cancel()
-        elif call in self._calls:  # it waits for its turn yet
-            self._end(call, _too_late(self._calls[call]))
+        elif call in self._calls:  # it is still queued to be converted
+            self._reject(call, _timeout(self._calls[call]))
 
-    def _end(self, call: Call, error: CallError) -> None:
-        """It fails before anybody was asked."""
-        self._tell(self._calls[call], call, error)
-        self._leave(call)
+    def _reject(self, call: Call, error: CallError) -> None:
+        """Answer a call with an error before its handler has a task."""
+        self._send_error(self._calls[call], call, error)
+        self._remove(call)
 
-    def _leave(self, call: Call) -> None:
+    def _remove(self, call: Call) -> None:
         endpoint = self._calls.pop(call)
         if call.timer is not None:
             call.timer.cancel()
         endpoint.counters.under_way -= 1
         assert call.slot is not None
-        _take_off(self._bytes, call.slot.user, len(call.payload))
+        _subtract(self._bytes, call.slot.user, len(call.payload))
         (self._cancel_slots if endpoint.is_cancel else self._slots).release(call.slot)
-        if call.task is not None and call.task.cancelled():  # before it had begun
-            self._tell(endpoint, call, _too_late(endpoint) if call.is_late else _stopping())
+        if call.task is not None and call.task.cancelled():  # before it has run
+            self._send_error(endpoint, call, _ended(endpoint, call))
 
-    def _tell(self, endpoint: CallEndpoint, call: Call, error: CallError) -> None:
-        if error.code == "bad_request" and call.doubt:
-            error = CallError(error.code, f"{error}{call.doubt}")
+    def _send_error(self, endpoint: CallEndpoint, call: Call, error: CallError) -> None:
+        if error.code == "bad_request" and call.encoding_note:
+            error = CallError(error.code, f"{error}{call.encoding_note}")
         self._fail(endpoint, call.caller, call.reply, call.encoding, error)
 
     def _fail(
@@ -643,37 +646,45 @@ class CallDispatcher:
         counters.errors[error.code] += 1
         counters.last_error = f"{error.code}: {error}"
         now = self._loop.time()
-        if now >= self._report_at.get(endpoint.topic, 0.0):
-            self._report_at[endpoint.topic] = now + REPORT_INTERVAL
+        if now >= self._next_log.get(endpoint.topic, 0.0):
+            self._next_log[endpoint.topic] = now + REPORT_INTERVAL
             count = sum(counters.errors.values())
             text = "a call of %s by %s failed (%d so far): %s: %s"
             log.warning(text, endpoint.name, caller, count, error.code, error)
         if reply is not None:
-            # In a turn of its own: the caller's chunk is still being worked on.
-            about = [("status", "error")]
+            # In a later round of the loop: the caller's chunk is still being processed.
+            user_properties = [("status", "error")]
             self._entries.soon(
-                "calls.answer", self._answer, reply, *error_payload(error, encoding), about
+                "calls.answer",
+                self._answer,
+                reply,
+                *error_payload(error, encoding),
+                user_properties,
             )
 
     def _answer(
-        self, reply: Message, payload: bytes, encoding: EncodingName, about: list[tuple[str, str]]
+        self,
+        reply: Message,
+        payload: bytes,
+        encoding: EncodingName,
+        user_properties: list[tuple[str, str]],
     ) -> None:
         properties = dict(reply.properties or {})
         properties[Property.CONTENT_TYPE] = CONTENT_TYPE[encoding]
-        properties[Property.USER_PROPERTY] = about
+        properties[Property.USER_PROPERTY] = user_properties
         self.publish(Message(reply.topic, payload, reply.qos, properties=properties))
 
 
 def error_payload(
     error: CallError, encoding: EncodingName, **more: str
 ) -> tuple[bytes, EncodingName]:
-    """An error as every answer has it, `{"error": {"code": …, "message": …}}`, and its encoding.
+    """The payload of an error, `{"error": {"code": …, "message": …}}`, and its encoding.
 
-    ROS's own bytes have no words for it: that is JSON then, which no CDR begins like.
+    ROS's own bytes cannot express an error: it is JSON then, which no CDR begins like.
     """
-    about = {"code": error.code, "message": str(error)}
+    details = {"code": error.code, "message": str(error)}
     readable = encoding if encoding in VALUE_ENCODINGS else "json"
-    return VALUE_ENCODINGS[readable].dumps({**more, "error": about}), readable
+    return VALUE_ENCODINGS[readable].dumps({**more, "error": details}), readable
 
 
 def _is_level(client_id: str) -> bool:
@@ -682,18 +693,23 @@ def _is_level(client_id: str) -> bool:
 
 
 def _is_own_topic(caller: Session, topic: str) -> bool:
-    """Whether there can be such a topic with the caller's id, which may be any text, in it."""
-    return _is_level(caller.client_id) and len(topic.encode()) <= LONGEST_TOPIC
+    """Whether there can be such a topic: the caller's id, a level of it, may be any text."""
+    return _is_level(caller.client_id) and len(topic.encode()) <= MAX_TOPIC_BYTES
 
 
-def _take_off(counter: Counter[K], key: K, count: int) -> None:
+def _subtract(counter: Counter[K], key: K, count: int) -> None:
     counter[key] -= count
     if not counter[key]:
         del counter[key]
 
 
-def _too_late(endpoint: CallEndpoint) -> CallError:
+def _timeout(endpoint: CallEndpoint) -> CallError:
     return CallError("timeout", f"no answer from {endpoint.name} within {endpoint.timeout:g} s")
+
+
+def _ended(endpoint: CallEndpoint, call: Call) -> CallError:
+    """Why a call's task was cancelled."""
+    return _timeout(endpoint) if call.has_timed_out else _stopping()
 
 
 def _stopping() -> CallError:

@@ -159,7 +159,7 @@ class ParameterTopics(ABC, Generic[GroupT]):
                 self._counters[route],
                 handle,
                 route.encoding,
-                largest=LARGEST_LENIENT,
+                max_bytes=LARGEST_LENIENT,
             )
             group.endpoints.append(endpoint)
             self._dispatcher.register(endpoint)

@@ -352,7 +352,7 @@ class ProvidedService:
         self._next_log = 0.0
         #: Why ROS does not have the service.
         self._problem: str | None = None
-        self._dispatcher.listen(f"{self._base}/_response/+", self._on_response)
+        self._dispatcher.subscribe(f"{self._base}/_response/+", self._on_response)
         self.server = ServiceServer(
             self._ros, route.type, route.encoding, node, converters, self, post
         )
@@ -481,7 +481,7 @@ class ProvidedService:
 
     def stop(self) -> None:
         """Remove the service; requests under way are answered with `on_error`, if any."""
-        self._dispatcher.ignore(f"{self._base}/_response/+")
+        self._dispatcher.unsubscribe(f"{self._base}/_response/+")
         for token in list(self._pending):
             self._give_up(token, "stopping: the service is offered no longer")
         with contextlib.suppress(BusError):  # without a bus there is no service either

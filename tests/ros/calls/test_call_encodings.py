@@ -181,7 +181,7 @@ async def test_an_unknown_content_type_is_read_as_the_route_s(harness):
     assert status == "ok"
     _, answer = await ask(client, CALL, b"true", "text/pla\nin")
     message = decode(answer, None)["error"]["message"]
-    assert message.endswith("(it says to be 'text/pla\\nin', and was read as json)")
+    assert message.endswith("(its content type 'text/pla\\nin' is unknown, it was read as json)")
 
 
 async def test_numbers_and_bytes_keep_their_form_in_cbor(harness):

@@ -594,7 +594,7 @@ async def test_a_call_that_is_too_large(harness):
 
 
 async def test_calls_are_bounded_in_bytes(harness, monkeypatch):
-    monkeypatch.setattr(calls, "TOTAL_BYTES", 100)
+    monkeypatch.setattr(calls, "MAX_BYTES", 100)
     harness.start(service("/switch"))
     switch = Switch(harness)
     switch.holds = True
