@@ -52,11 +52,11 @@ ENTRY = re.compile(r"[a-z_]+(\.[a-z_]+)?")
 #: By entry: the module and class (or none) of what is called in its `try`, and the caller.
 INLINE = {
     "actions.look": ("ros.calls.action_topics", "ActionSubscriptions", "poll_graph", "poll_graph"),
-    "app.certificates": ("app", "", "keep_server_certificate", ""),
-    "app.reload": ("app", "App", "reload", "_try_reload"),
-    "bridge.look": ("ros.flows", "Flow", "look", ""),
+    "app.certificates": ("app.main", "", "keep_server_certificate", ""),
+    "app.reload": ("app.main", "App", "reload", "_try_reload"),
+    "bridge.look": ("ros.topics.flow", "Flow", "look", ""),
     "bridge.message": ("broker.broker", "Broker", "publish", "ros/bridge.py:_publish"),
-    "bridge.receive": ("ros.to_ros", "ToRos", "receive", "_hand_over"),
+    "bridge.receive": ("ros.topics.to_ros", "ToRos", "receive", "_hand_over"),
     "broker.delivery": ("broker.session", "Session", "deliver", "publish_to"),
     "broker.end": ("broker.client", "ClientHandler", "fault", "fault"),
     "broker.will": ("broker.broker", "Broker", "_publish_late", "_publish_will"),
@@ -67,25 +67,25 @@ INLINE = {
     "client.shut": ("broker.client", "ClientHandler", "_shut", "cut_off"),
     "clock.keep_alive": ("broker.client", "ClientHandler", "tick", "tick"),
     "clock.session": ("broker.broker", "Broker", "_fall_due", "tick"),
-    "commands.stop": ("ros.commands", "_Stop", "cdr", "_publish_stop"),
+    "commands.stop": ("ros.topics.commands", "_Stop", "cdr", "_publish_stop"),
     "commit.release": ("broker.output", "Output", "release", "_committed"),
     "commit.resume": ("broker.client", "ClientHandler", "resume", "_recover"),
-    "connection.begin": ("tls", "", "accept", "begin"),
-    "connection.certificate": ("wire", "ClientProtocol", "check_certificate", ""),
+    "connection.begin": ("net.tls", "", "accept", "begin"),
+    "connection.certificate": ("net.connection", "ClientConnection", "check_certificate", ""),
     "connection.chunk": ("broker.client", "ClientHandler", "receive", "data_received"),
     "connection.last_chunk": ("broker.client", "ClientHandler", "receive", "connection_lost"),
     "connection.last_turn": ("broker.client", "ClientHandler", "send_on", "_leave"),
-    "connection.login": ("wire", "ClientProtocol", "_resume_input", "_log_in"),
-    "connection.turn": ("wire", "ClientProtocol", "take_turn", "_run_turns"),
-    "control.command": ("app", "App", "_answer_status", ""),
-    "control.connection": ("control", "Control", "_answer", "_serve"),
+    "connection.login": ("net.connection", "ClientConnection", "_resume_input", "_log_in"),
+    "connection.turn": ("net.connection", "ClientConnection", "take_turn", "_run_turns"),
+    "control.command": ("app.main", "App", "_answer_status", ""),
+    "control.connection": ("ops.control", "Control", "_answer", "_serve"),
     "flush": ("broker.output", "Output", "flush", "broker/broker.py:flush"),
     "flush.wait": ("broker.output", "Output", "wait", "_hold_back"),
-    "listener.admit": ("listeners", "Listeners", "admit", "_accept"),
-    "listener.open": ("listeners", "_ListeningSocket", "open", "_open_sockets"),
+    "listener.admit": ("net.listeners", "Listeners", "admit", "_accept"),
+    "listener.open": ("net.listeners", "_ListeningSocket", "open", "_open_sockets"),
     "session.replay": ("broker.retained", "RetainedMessages", "find_in_steps", "_find_retained"),
     "session.send": ("broker.output", "Output", "publish", "_send"),
-    "tls.chunk": ("tls", "TlsTransport", "_take", "data_received"),
+    "tls.chunk": ("net.tls", "TlsTransport", "_take", "data_received"),
 }
 
 
@@ -108,6 +108,14 @@ def all_entries() -> set[str]:
                     and ENTRY.fullmatch(each.value)
                 }
     return found
+
+
+def owner_of(module: str, kind: str, name: str) -> Any:
+    """The class or module that has what INLINE names. Raises ImportError or AttributeError."""
+    owner: Any = importlib.import_module(f"appliance.{module}")
+    owner = getattr(owner, kind) if kind else owner
+    getattr(owner, name)
+    return owner
 
 
 class SabotageError(Exception):
@@ -223,8 +231,8 @@ class Saboteur:
         monkeypatch.setattr(entries.PeriodicCallback, "__init__", repeated)
         monkeypatch.setattr(entries._ContainedProxy, "__init__", shielded)
         monkeypatch.setattr(Faults, "run", ran)
-        for name in ("wire", "tls", "websocket"):
-            module = importlib.import_module(f"appliance.{name}")
+        for name in ("connection", "tls", "websocket"):
+            module = importlib.import_module(f"appliance.net.{name}")
             for kind in vars(module).values():
                 if isinstance(kind, type) and kind.__module__ == module.__name__:
                     for method in vars(kind).values():
@@ -242,9 +250,7 @@ class Saboteur:
     def _patch_inline(
         self, monkeypatch: pytest.MonkeyPatch, place: tuple[str, str, str], callers: dict[str, str]
     ) -> None:
-        module, kind, name = place
-        owner: Any = importlib.import_module(f"appliance.{module}")
-        owner = getattr(owner, kind) if kind else owner
+        owner, name = owner_of(*place), place[2]
         own = getattr(owner, name)
 
         def entered(*args: Any, **more: Any) -> Any:

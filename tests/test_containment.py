@@ -27,7 +27,7 @@ import uvloop
 import yaml
 from amqtt.plugins.base import BasePlugin
 from harness import Harness, Peer, check_scheduler, make_contexts
-from saboteur import INLINE, SabotageError, Saboteur, all_entries
+from saboteur import INLINE, SabotageError, Saboteur, all_entries, owner_of
 from waiting import PATIENCE, until
 
 from appliance import config
@@ -612,7 +612,7 @@ async def _rests(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("connection.look")
 async def _looks_whether_all_is_read(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
-    protocol._look_after(0.01)
+    protocol._schedule_look(0.01)
 
 
 @reach("connection.abort")
@@ -718,7 +718,7 @@ async def _sweeps(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("connection.probe")
 async def _probed(site: Site, patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(wire, "PROBED", 0.05)
+    patch.setattr(wire, "PROBE_DURATION", 0.05)
     _, protocol = await site.victim()
     protocol.probe()
 
@@ -815,7 +815,7 @@ async def _asks_plugins(site: Site, patch: pytest.MonkeyPatch) -> None:
     access: Any = site.broker.access
     with pytest.MonkeyPatch.context() as asked:
         asked.setattr(access, "decide", lambda *question: Decision(False, "", pending=True))
-        assert access.waits(("nobody", "asks", "this"), lambda: None)
+        assert access.is_pending(("nobody", "asks", "this"), lambda: None)
 
 
 @reach("calls.take", "calls.call", "calls.end", "calls.timeout", "calls.answer", "calls.handle")
@@ -1115,6 +1115,8 @@ def test_every_entry_is_let_fail_somewhere() -> None:
     assert len(names) > 100
     assert not ELSEWHERE.keys() - names and not INLINE.keys() - names
     assert not REACH.keys() - names, REACH.keys() - names
+    for place in INLINE.values():
+        owner_of(*place[:3])
     here = Path(__file__).parent
     for name, file in ELSEWHERE.items():
         assert f'"{name}"' in (here / file).read_text(), f"{name} is not in {file}"
