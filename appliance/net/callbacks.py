@@ -1,8 +1,9 @@
-"""What the event loop calls back: each an entry with a name, contained and always set up anew.
+"""Callbacks of the event loop, each an entry with a name, whose exceptions are contained.
 
-The parts of the appliance never hand a callback to the loop itself, but here. What escapes from one
-is caught, counted and reported (`Faults`), what it served is ended by `failed`, and nothing else
-is. `tests/net/test_callbacks.py` finds callbacks that pass this by.
+No part of the appliance hands a callback to the loop itself; it uses `Entries` or `contained`. An
+exception that escapes from a callback is caught, counted and reported (`Faults`). Only what the
+callback served is ended, by `failed`, and nothing else. `tests/net/test_callbacks.py` finds
+callbacks that bypass this module.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from appliance.broker.faults import Faults
 P = ParamSpec("P")
 T = TypeVar("T")
 
-#: Ends what a callback served that has failed.
+#: Ends what a failed callback served.
 Failed = Callable[[], object]
 
 
 class Entries:
-    """A loop's entries. `served` is what a callback is for, in the words of the log."""
+    """The entries of one event loop. `served` is what a callback serves, as the log names it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, faults: Faults) -> None:
         self.loop = loop
@@ -38,7 +39,7 @@ class Entries:
         callback: Callable[..., object],
         args: tuple[Any, ...],
     ) -> None:
-        """Call it; what escapes is caught, and what it served ended."""
+        """Call it; catch what escapes, and end what it served."""
         try:
             callback(*args)
         except Exception as error:
@@ -89,9 +90,9 @@ class Entries:
     def every(
         self, entry: str, interval: float, callback: Callable[[], float | None], delay: float = -1
     ) -> PeriodicCallback:
-        """Call it again and again, also when it fails; for the first time after `delay`.
+        """Call it periodically, also after it has failed; the first time after `delay` seconds.
 
-        It returns when it is to be called next, by the loop's clock, or None: after `interval`.
+        It returns when to call it next, by the loop's clock; None means after `interval`.
         """
         return PeriodicCallback(self, entry, interval, callback, interval if delay < 0 else delay)
 
@@ -103,7 +104,7 @@ class Entries:
         served: object = "",
         failed: Failed | None = None,
     ) -> None:
-        """Call it in the loop's next round; to be called from any thread.
+        """Call it in the loop's next round; may be called from any thread.
 
         Raises:
             RuntimeError: the loop is closed.
@@ -118,7 +119,7 @@ class Entries:
         served: object = "",
         failed: Failed | None = None,
     ) -> asyncio.Task[T]:
-        """Run it beside everything else; what it fails with is caught, whoever waits for it."""
+        """Run it as a task; its exception is caught, whether or not somebody awaits the task."""
         task = self.loop.create_task(work)
         self._tasks.add(task)
 
@@ -150,9 +151,9 @@ class Entries:
         served: object = "",
         failed: Failed | None = None,
     ) -> None:
-        """Call it whenever the file can be read.
+        """Call it whenever the file is readable.
 
-        `failed` has to see to it that it no longer can: it would be called again at once.
+        `failed` has to remove the reader, or it would be called again at once.
         """
         self.loop.add_reader(file, self.run, entry, served, failed, callback, ())
 
@@ -162,7 +163,7 @@ class Entries:
 
 
 class PeriodicCallback:
-    """A callback that is called again and again, see `Entries.every`."""
+    """A callback that is called periodically, see `Entries.every`."""
 
     def __init__(
         self,
@@ -192,14 +193,14 @@ class PeriodicCallback:
                 )
 
     def cancel(self) -> None:
-        """Call it no more; may be called twice."""
+        """Stop calling it; may be called twice."""
         timer, self._timer = self._timer, None
         if timer is not None:
             timer.cancel()
 
 
 class FaultHandler(Protocol):
-    """A connection, which a fault ends."""
+    """A connection, which a fault in one of its callbacks ends."""
 
     def fault(self, entry: str, error: Exception) -> None:
         """Count the fault and end the connection; never raises."""
@@ -213,7 +214,7 @@ def contained(
 ) -> Callable[
     [Callable[Concatenate[HandlerT, P], T]], Callable[Concatenate[HandlerT, P], T | None]
 ]:
-    """For what the loop calls of a connection: what escapes ends that connection."""
+    """Decorate a connection's callback: an exception that escapes ends that connection."""
 
     def decorate(
         method: Callable[Concatenate[HandlerT, P], T],
@@ -237,9 +238,9 @@ def contained_made(
     [Callable[[HandlerT, asyncio.BaseTransport], None]],
     Callable[[HandlerT, asyncio.BaseTransport], None],
 ]:
-    """`contained`, for `connection_made`: it also cuts the transport, of which nobody else knows.
+    """`contained` for `connection_made`: it also aborts the transport, which nobody else knows.
 
-    So no bytes come to what was not made to the end.
+    Otherwise a connection that was set up halfway would receive bytes.
     """
 
     def decorate(
@@ -258,26 +259,26 @@ def contained_made(
     return decorate
 
 
-def contained_proxy(entry: str, faults: Faults, told: T) -> T:
-    """A part that is told of what happens, so that its faults are not those of who tells it."""
-    return cast(T, _ContainedProxy(entry, faults, told))
+def contained_proxy(entry: str, faults: Faults, observer: T) -> T:
+    """A proxy whose methods never raise, so that an observer's faults do not reach its caller."""
+    return cast(T, _ContainedProxy(entry, faults, observer))
 
 
 class _ContainedProxy:
-    def __init__(self, entry: str, faults: Faults, told: object) -> None:
+    def __init__(self, entry: str, faults: Faults, observer: object) -> None:
         self._entry = entry
         self._faults = faults
-        self._told = told
+        self._observer = observer
 
     def __getattr__(self, name: str) -> object:
-        method = getattr(self._told, name)
+        method = getattr(self._observer, name)
 
-        def tell(*args: Any, **kwargs: Any) -> object:
+        def call(*args: Any, **kwargs: Any) -> object:
             try:
                 return method(*args, **kwargs)
             except Exception as error:
                 self._faults.caught(self._entry, error)
                 return None
 
-        setattr(self, name, tell)  # it is not asked for again
-        return tell
+        setattr(self, name, call)  # the next look-up does not come here
+        return call

@@ -1,4 +1,8 @@
-"""One network connection: an `asyncio.Protocol` that is a client's `Wire`."""
+"""One network connection: an `asyncio.Protocol` that is the `Transport` of its client.
+
+Input goes from `data_received` to `ClientHandler.receive`, in portions when there is much of it or others
+wait. Output is handed to the transport at once, or queued here while the client reads too slowly.
+"""
 
 from __future__ import annotations
 
@@ -26,46 +30,46 @@ from appliance.net.scheduler import PUBLISH_BURST, Scheduler
 from appliance.net.sockets import Probe, peer_status, receive_buffer
 from appliance.net.websocket import WebSocket
 
-#: Bytes that wait for a client from which on it counts as slow, and is sent no more until it has
-#: read them: what a healthy one takes in one round of the event loop, with room to spare.
+#: Bytes of output from which on a client counts as slow, and is sent no more until it has read
+#: them. A healthy client reads less than this in one round of the event loop.
 OUTPUT_HIGH_WATER = 1024 * 1024
 
 #: The same while the output of all clients takes more than a quarter of `limits.memory`. Less than
-#: this in a transport is not counted, so that writing costs nothing as long as clients read.
+#: this in a transport is not counted, so that writing costs nothing while clients read.
 OUTPUT_LOW_WATER = 16 * 1024
 
-#: Bytes that the system keeps, beside those that are on their way, for a client that is sent large
-#: messages of QoS 0.
+#: Bytes that the system buffers, beside those in flight, for a client that is sent large messages
+#: of QoS 0.
 SYSTEM_OUTPUT = 128 * 1024
 
-#: Bytes that a transport is given in one go: of a large message it holds a part, not a copy.
+#: The most bytes that a transport is given at once: of a large message it holds a part, not a copy.
 WRITE_PORTION = 512 * 1024
 
-#: A chunk this large means that more is waiting. The loop would read on without writing out, up to
-#: 32 chunks in one go; reading is paused for the rest of the round, so that the receivers get
-#: theirs before they count as slow.
+#: A chunk this large means that more is waiting. The loop would read up to 32 such chunks before it
+#: writes; reading is paused for the rest of the round, so that the receivers are written to before
+#: they count as slow.
 LARGE_CHUNK = 128 * 1024
 
-#: Bytes of a chunk that are little: after more than these it is checked whether who sends them has
-#: to wait.
+#: A chunk of at most this many bytes is small; a client that sends more may have to wait for a
+#: turn.
 SMALL_CHUNK = 16 * 1024
 
-#: Turns that a client takes, without a second's rest, until the log is told.
+#: Turns that a client takes without a second's rest before that is logged.
 MANY_TURNS = 200
 
-#: Seconds that a publisher is not read, after each check, while memory is short.
+#: Seconds that a publisher is not read after each check while memory is short.
 SHORT_OF_MEMORY_PAUSE = 0.05
 
-#: Seconds that a client is slow before the log is told.
+#: Seconds that a client is slow before that is logged.
 SLOW_AFTER = 1.0
 
-#: Seconds that a client gets to read the last bytes before its connection is cut.
+#: Seconds that a client has to read the last bytes before its connection is aborted.
 CLOSE_TIMEOUT = 10.0
 
-#: Seconds that a client's computer is asked for a sign of life.
+#: Seconds that a client's computer is probed with TCP keep-alives.
 PROBE_DURATION = 3.0
 
-#: Seconds that one gets whose certificate was revoked.
+#: The same for a client whose certificate was revoked.
 REVOKED_TIMEOUT = 1.0
 
 
@@ -73,7 +77,7 @@ _NOTHING = memoryview(b"")
 
 
 class ClientConnection:
-    """One connection: bytes to the `ClientHandler`, and as its `Wire` bytes from it.
+    """One connection: hands received bytes to its `ClientHandler`, and is the `Transport` of that.
 
     It is an `asyncio.Protocol` without being derived from it, which makes it faster when compiled.
     """
@@ -82,12 +86,12 @@ class ClientConnection:
         self, scheduler: Scheduler, address: str, host: str, anonymous: bool | None = None
     ) -> None:
         self.address = address
-        self._anonymous = anonymous  # what its listener says of clients without a user name
-        #: The part of it that all connections of one computer share; empty for a Unix socket.
+        self._anonymous = anonymous  # whether its listener admits clients without a name
+        #: The host part of `address`; empty for a Unix socket.
         self.host = host
-        #: Who is charged for what waits here: nobody in particular until the login.
+        #: The account that is charged for what is buffered here; that of strangers until the login.
         self.account = scheduler.broker.accounting.accounts.strangers
-        #: What was accepted, until there is a transport for it.
+        #: The accepted socket, until there is a transport for it.
         self._accepted: socket.socket | None = None
         self._scheduler = scheduler
         self._broker = scheduler.broker
@@ -99,47 +103,53 @@ class ClientConnection:
         self._client = ClientHandler(self._broker, self)
         self._closing = False
         self._is_lost = False
-        # Input: what was received and waits, and what it waits for.
+        # Input: what was received and waits, and the reasons why it waits.
         self._backlog = _NOTHING
         self._backlog_size = 0  # bytes of the chunk that it is the rest of, in the accounting
-        self._frame_size = 0  # bytes of a WebSocket frame that is not complete
-        self._is_record_cut = False  # the same of TLS
-        self._below_size = 0  # bytes that TLS and WebSocket have not taken apart
-        self._has_more = False  # the client has more to do, and wants its turn
+        self._frame_size = 0  # bytes of an incomplete WebSocket frame
+        self._is_record_cut = False  # TLS buffers an incomplete record
+        self._below_size = 0  # bytes that TLS and WebSocket have not decoded
+        self._has_more = False  # the client has more to do in its next turn
         self._turn_queued = False
         self._in_turn = False
         self._turns_taken = 0  # without a second's rest
         self._turned_at = 0.0
         self._rest_timer: asyncio.TimerHandle | None = None
-        self._look_timer: asyncio.TimerHandle | None = None  # whether it has caught up
+        self._look_timer: asyncio.TimerHandle | None = (
+            None  # for the next look whether it has caught up
+        )
         self._look_at = 0.0
         self._input_blocked = False
         self._logging_in = False
-        self._login_result: Identity | Refusal | None = None  # what came of it, not told yet
-        self._stopped = False  # the client takes in nothing until its next turn
-        self._wait_timer: asyncio.TimerHandle | None = None  # for that, unless it comes before
-        # How fast it publishes.
+        self._login_result: Identity | Refusal | None = None  # the client has not been told yet
+        self._stopped = False  # nothing is read until the client's next turn
+        self._wait_timer: asyncio.TimerHandle | None = (
+            None  # for that turn, if it does not come earlier
+        )
+        # The rate at which it publishes.
         self._small_chunk = min(SMALL_CHUNK, scheduler.portion)
         self._countdown = scheduler.check_every  # of messages, to the next check
         self._checked_at = self._loop.time()
         self._allowed = PUBLISH_BURST * scheduler.publish_rate  # messages, at the last check
-        # Output: what the transport was not given yet, and what of it is counted.
+        # Output: what the transport was not given yet, and how much of it is accounted.
         self._waiting: deque[bytes] = deque()
         self._waiting_size = 0  # bytes that are left of them
-        self._begun = 0  # bytes of the first chunk that the transport was given
-        self._unshared = 0  # bytes of the chunks that wait for this client only
+        self._begun = 0  # bytes of the first chunk that the transport has
+        self._unshared = 0  # bytes of chunks that wait for this client only
         self._paused = False
-        self._withheld: asyncio.TimerHandle | None = None  # paused until then, on purpose
+        self._withheld: asyncio.TimerHandle | None = (
+            None  # output is held back until then, on purpose
+        )
         self._counted = 0  # bytes in the accounting
         self._slow_timer: asyncio.TimerHandle | None = None
         self._is_system_limited = False
         self._probe: Probe | None = None
-        self._reported_behind = False  # and the client wants to know when it has caught up
-        #: Bytes in the output from which on the client is not listened to.
+        self._reported_behind = False  # the client is to be told when it has caught up
+        #: Bytes of output from which on nothing is read from the client.
         self._output_limit = 0
-        #: The connection under the transport, to be closed after it.
+        #: A copy of the transport's socket, which outlives it for a lingering close.
         self._connection: socket.socket | None = None
-        # Slow strangers: the whole way to the end of CONNECT has one time limit.
+        # One time limit for the whole way to a complete CONNECT, against slow strangers.
         self._timeout = self._entries.later(
             "connection.login_timeout",
             scheduler.connect_timeout,
@@ -157,15 +167,15 @@ class ClientConnection:
         self, connection: socket.socket, context: ssl.SSLContext | None, *, websocket: bool
     ) -> None:
         """Take over an accepted connection, with TLS through its handshake."""
-        # Not left to asyncio's own server for one reason: when a handshake fails, that would
-        # say nothing, and who it was and why is what the log is asked for.
+        # asyncio's own server would not report a failed handshake, and the log has to say whose it
+        # was and why it failed.
         scheduler = self._scheduler
         protocol = cast(asyncio.Protocol, WebSocket(self, scheduler) if websocket else self)
         self._accepted = connection
         try:
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                # A client without keep alive whose computer is gone is found out by the system.
+                # Detects that the computer of a client without keep alive is gone.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             if context is None:
                 await self._loop.connect_accepted_socket(lambda: protocol, connection)
@@ -175,20 +185,20 @@ class ClientConnection:
                     connection, context, protocol, timeout, scheduler, scheduler.linger
                 )
         except (OSError, asyncio.TimeoutError) as error:
-            if self in self._scheduler.connections:  # else it had to make room
+            if self in self._scheduler.connections:  # else it was aborted to make room
                 self.log_refusal(f"no {'TLS ' if context else ''}connection", tls.reason(error))
             connection.close()
             self._forget()
         except Exception as error:
             self._broker.faults.caught("connection.begin", error, self)
-            self.abort()  # it may have been made: nobody would know of it
+            self.abort()  # the transport may exist, and nobody else knows it
             if self._transport is None:
                 connection.close()
         finally:
             self._accepted = None
 
     def fault(self, entry: str, error: Exception) -> None:
-        """End this connection, as something that nobody expected escaped while it was served."""
+        """End this connection because an unexpected exception escaped while it was served."""
         broker, client = self._broker, self._client
         broker.fault(entry, error, client)
         broker.faults.run("connection.flush", broker.flush, otherwise=None)
@@ -196,7 +206,7 @@ class ClientConnection:
             client.cut_off()
             self._forget()
         elif not self._closing:
-            # Its last bytes wait for a commit; or not even the flush went well.
+            # Its last bytes wait for a commit, or even the flush has failed.
             self._cut_after(CLOSE_TIMEOUT)
 
     @contained_made("connection.made")
@@ -204,7 +214,7 @@ class ClientConnection:
         """The connection is there, its TLS handshake done."""
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=OUTPUT_LOW_WATER)
-        if self not in self._scheduler.connections:  # the handshake ended just after its time
+        if self not in self._scheduler.connections:  # the handshake ended after its time limit
             self._transport.abort()
         else:
             self.check_certificate()
@@ -217,9 +227,9 @@ class ClientConnection:
         return cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object"))
 
     def check_certificate(self) -> None:
-        """Close the connection when the client's certificate is not, or no longer, accepted.
+        """Close the connection if the client's certificate is not, or no longer, accepted.
 
-        One that has logged in is told why, and has a second to read it.
+        A client that has logged in is sent the reason, and has a second to read it.
         """
         certificates, tls_object = self._scheduler.certificates, self._tls
         if certificates is None or tls_object is None or self._closing:
@@ -241,7 +251,7 @@ class ClientConnection:
         self.abort()
 
     def log_refusal(self, what: str, why: str) -> None:
-        """Tell the log, unless it is a flood of the same from the same host."""
+        """Log why the connection is refused or ended, at a limited rate for each host and kind."""
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
         self._broker.rate_limited_log.warning(now, (self.host, what), "%s", message)
@@ -250,11 +260,11 @@ class ClientConnection:
 
     @contained("connection.eof")
     def eof_received(self) -> None:
-        """The client sends no more; the transport closes."""
+        """The client sends nothing more; the transport closes itself."""
 
     @contained("connection.lost")
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection ended, whoever ended it."""
+        """The connection has ended, from either side."""
         self._is_lost = True
         self._forget()
         while self._waiting:
@@ -292,13 +302,13 @@ class ClientConnection:
             self._leave()
 
     def _leave_later(self) -> None:
-        """Let the others have their turn, then end the client."""
+        """End the client in a later turn."""
         if not self._turn_queued:
             self._turn_queued = True
             self._scheduler.queue_turn(self)
 
     def _leave(self) -> None:
-        """End the client when what it said before it left is done, in as many turns as it takes."""
+        """Finish what the client sent before it left, in as many turns as needed, then end it."""
         if self._has_more:
             self._has_more = False
             try:
@@ -310,8 +320,8 @@ class ClientConnection:
         else:
             self._client.lost()
             self._broker.flush()
-            # The client and its wire know each other: this lets both, and the TLS connection with
-            # them, go now, and not when all that lives here is searched for garbage.
+            # The client and its transport refer to each other. Breaking the cycle frees both, and
+            # the TLS connection, now and not at the next garbage collection.
             self._client.let_go(_ClosedTransport(self.address))
 
     def _forget(self) -> None:
@@ -328,25 +338,25 @@ class ClientConnection:
         self._forget()
 
     def _cut_after(self, seconds: float) -> None:
-        """However its end goes on, and whether or not it reads: then it is over."""
+        """Abort the connection after so many seconds, whether or not the client has read all."""
         self._timeout.cancel()
         self._timeout = self._entries.later(
             "connection.cut", seconds, self.abort, served=self, failed=self.abort
         )
 
     def make_room(self) -> None:
-        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+        """Close at once to make room: it has not logged in, or is closing anyway."""
         if not self._closing:
             self.log_refusal("makes room for others", "it has not logged in (broker.limits)")
         if self._transport is None and self._accepted is not None:
-            with contextlib.suppress(OSError):  # so the handshake fails
+            with contextlib.suppress(OSError):  # this makes the handshake fail
                 self._accepted.shutdown(socket.SHUT_RDWR)
         self.abort()
 
     # --- bytes in ------------------------------------------------------------------------------
 
     def data_received(self, data: bytes) -> None:
-        """Hand the chunk to the client; then everyone is written to, once, what it caused."""
+        """Hand the chunk to the client, then flush once what it has caused for all clients."""
         try:
             counters = self._counters
             if (
@@ -361,19 +371,19 @@ class ClientConnection:
             published -= counters.publish_received
             if self._broker.unflushed:
                 self._broker.flush()
-            if published:  # so many less than none
+            if published:  # a negative number
                 self._countdown += published
                 if self._countdown <= 0:
                     self._check_publisher()
             if self._slow_timer is not None and self._output_size() > self._output_limit:
-                # It asks on, and does not read the answers.
+                # It goes on sending requests without reading the answers.
                 self._input_blocked = True
                 self._pause_reading()
         except Exception as error:
             self.fault("connection.chunk", error)
 
     def _receive_in_turn(self, data: bytes) -> bytes:
-        """Let who sends much wait where that is due; returns what is to be taken in now."""
+        """Make a client that sends much wait if necessary; returns what is to be received now."""
         scheduler, account = self._scheduler, self.account
         if len(data) <= self._small_chunk:
             if not scheduler.is_round_over():
@@ -395,11 +405,11 @@ class ClientConnection:
         return data[:portion]
 
     def _check_publisher(self) -> None:
-        """Let a publisher wait that is too fast, by its own limit or by everyone's."""
+        """Throttle a publisher that exceeds its own rate, or the memory of all."""
         scheduler = self._scheduler
         rate = scheduler.publish_rate
         now = self._accounting.now
-        # What it may publish grows with time, and shrinks by what it has published since the last
+        # A token bucket: it fills with time, and is emptied by what was published since the last
         # check.
         allowed = min(self._allowed + (now - self._checked_at) * rate, PUBLISH_BURST * rate)
         self._allowed = allowed - (scheduler.check_every - self._countdown)
@@ -412,7 +422,7 @@ class ClientConnection:
 
     def _check_memory(self) -> None:
         if self._accounting.queued_bytes > self._scheduler.high_memory and self._rest_timer is None:
-            # Not for longer: it may be this client that has to acknowledge what takes the memory.
+            # No longer: it may be this client's acknowledgements that would free the memory.
             self._rest(SHORT_OF_MEMORY_PAUSE)
             self._broker.rate_limited_log.warning(
                 self._accounting.now,
@@ -424,7 +434,7 @@ class ClientConnection:
             )
 
     def _rest(self, seconds: float) -> None:
-        """Read nothing for so long."""
+        """Read nothing for so many seconds."""
         if self._rest_timer is not None:
             self._rest_timer.cancel()
         self._rest_timer = self._entries.later(
@@ -440,14 +450,14 @@ class ClientConnection:
             self._resume_input()
 
     def _resume_input_later(self) -> None:
-        """Let the others have their turn, then read on."""
+        """Read on in a later turn, when the others had theirs."""
         self._pause_reading()
         if not self._turn_queued:
             self._turn_queued = True
             self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
-        """The others have had their turn."""
+        """Continue: the others have had their turn."""
         self._turn_queued = False
         if self._is_lost:
             self._leave()
@@ -460,7 +470,7 @@ class ClientConnection:
             self._transport.pause_reading()
 
     def _resume_input(self) -> None:
-        """Go on with what waits, in its order, unless there is a reason to wait."""
+        """Continue with what waits, in order, unless there is another reason to wait."""
         if (
             self._turn_queued
             or self._rest_timer
@@ -474,7 +484,7 @@ class ClientConnection:
         if self._login_result is not None:
             who, self._login_result = self._login_result, None
             # What the client sends because of the answer is not older than the answer. Once that
-            # is written, nobody can tell it from what has come during the login.
+            # is written, it cannot be distinguished from what has come during the login.
             self.input_resumed()
             self.input_paused()
             self._answer_connect(who)
@@ -486,7 +496,7 @@ class ClientConnection:
         elif self._backlog:
             portion = bytes(self._backlog[: self._scheduler.portion])
             self._backlog = self._backlog[self._scheduler.portion :]
-            if not self._backlog:  # an empty part would keep the whole
+            if not self._backlog:  # an empty slice would keep the whole chunk alive
                 self._release_backlog()
             self._take_portion(portion)
             self._resume_input_later()
@@ -495,18 +505,18 @@ class ClientConnection:
             self._transport.resume_reading()
 
     def input_paused(self) -> None:
-        """What has come waits: here, or in a layer below that has told so."""
+        """Received bytes wait, here or in a layer below."""
         self._client.inflow.not_read(self._loop.time())
 
     def input_resumed(self) -> None:
-        """It waits no longer."""
+        """Nothing that was received waits any more."""
         inflow = self._client.inflow
         inflow.read(self._loop.time())
         if inflow.is_behind:
             self._check_caught_up()
 
     def _check_caught_up(self) -> None:
-        """Look whether all is read of what the client has said while it was not, now and later."""
+        """Check, now and later, whether all is read that came while reading was paused."""
         if self._transport is None:
             return
         known = receive_buffer(self._transport.get_extra_info("socket"))
@@ -518,7 +528,7 @@ class ClientConnection:
             self._schedule_look(seconds)
 
     def _schedule_look(self, seconds: float) -> None:
-        """Look again, then or before."""
+        """Check again after so many seconds, or earlier."""
         looks_at = self._loop.time() + seconds
         if self._look_timer is not None:
             if self._look_at <= looks_at:
@@ -534,7 +544,7 @@ class ClientConnection:
         self._check_caught_up()
 
     def _keep_backlog(self, data: bytes, begin: int) -> None:
-        """Let a chunk wait from that byte on; it takes memory until the last one is taken in."""
+        """Keep a chunk from that byte on; all of it takes memory until its last byte is used."""
         self._backlog = memoryview(data)[begin:]
         self._accounting.take(self.account, len(data) - self._backlog_size)
         self._backlog_size = len(data)
@@ -545,7 +555,7 @@ class ClientConnection:
         self._backlog_size = 0
 
     def _take_portion(self, data: bytes) -> None:
-        """Take in what is not to wait for a turn, or has had it."""
+        """Receive a portion that need not wait for a turn, or had one."""
         self._in_turn = True
         self.data_received(data)  # which never raises
         self._in_turn = False
@@ -562,19 +572,19 @@ class ClientConnection:
         self._resume_input()
 
     def frame_limit(self) -> int:
-        """The largest WebSocket frame, in bytes: a stranger's is not kept beyond a CONNECT."""
+        """The largest WebSocket frame, in bytes: a stranger's may be as large as a CONNECT."""
         if self._client.session is None:
             return MAXIMUM_CONTROL
         return self._client.protocol.maximum_packet_size + MAXIMUM_CONTROL
 
     def count_buffered(self, size: int) -> None:
-        """Count what TLS and WebSocket keep: no more of either than the loop reads in one go."""
+        """Account for what TLS and WebSocket buffer: at most what the loop reads at once, each."""
         if not self._is_lost:
             self._accounting.take(self.account, size - self._below_size)
             self._below_size = size
 
     def count_partial_frame(self, size: int) -> None:
-        """Count the bytes of a WebSocket frame that is not complete; without room, close."""
+        """Account for an incomplete WebSocket frame; close when there is no memory for it."""
         accounting = self._accounting
         grown = size - self._frame_size
         if size or self._frame_size:
@@ -590,22 +600,22 @@ class ClientConnection:
             self._broker.flush()
 
     def partial_record(self, part: bool) -> None:
-        """Whether TLS keeps the beginning of a record."""
+        """Whether TLS buffers the beginning of a record."""
         self._is_record_cut = part
         self._note_partial_input(part or self._frame_size > 0)
 
     def _note_partial_input(self, is_kept: bool) -> None:
-        """Know since when the beginning of something is kept below: what it holds is as old."""
+        """Record since when an incomplete record or frame is buffered: its content is as old."""
         inflow, protocol = self._client.inflow, self._client.protocol
         if is_kept:
             inflow.unfinished = inflow.unfinished or self._loop.time()
         elif not (protocol.unfinished or protocol.paused or self._backlog):
-            inflow.unfinished = 0.0  # what it held is done, or it was a ping
+            inflow.unfinished = 0.0  # its content is processed, or it was a ping
 
     # --- bytes out -----------------------------------------------------------------------------
 
     def _write_on(self) -> None:
-        """Give the transport what waits, until it asks for a pause."""
+        """Give the transport the queued output, until it asks for a pause."""
         assert self._transport is not None
         while self._waiting and not self._paused and not self._transport.is_closing():
             portion = [self._take_waiting(WRITE_PORTION)]
@@ -619,7 +629,7 @@ class ClientConnection:
             self._close_transport()
 
     def _take_waiting(self, most: int) -> bytes | memoryview:
-        """What is left of the first chunk that waits, or so many bytes of it."""
+        """Take the rest of the first queued chunk, or at most so many bytes of it."""
         chunk, begun = self._waiting[0], self._begun
         left = len(chunk) - begun
         if left > most:
@@ -640,7 +650,7 @@ class ClientConnection:
         return self._waiting_size + (0 if transport is None else transport.get_write_buffer_size())
 
     def _count_output(self) -> None:
-        """Enter in the accounting what waits for this client, and tell it when that is too much."""
+        """Account for the output that waits, and stop sending when that is too much."""
         scheduler = self._scheduler
         counted = self._unshared
         if self._paused and self._transport is not None:
@@ -651,7 +661,7 @@ class ClientConnection:
         size = self._output_size()
         if size > limit and self._slow_timer is None:
             self._client.output.writable = False
-            # From here on its output grows by what it is answered only, and by no more than this.
+            # From here on its output grows only by answers, and by no more than `limit`.
             self._output_limit = size + limit
             self._slow_timer = self._entries.later("connection.slow", SLOW_AFTER, self._log_slow)
 
@@ -666,7 +676,7 @@ class ClientConnection:
 
     @contained("connection.pause")
     def pause_writing(self) -> None:
-        """The client reads slower than it is written to."""
+        """The client reads more slowly than it is written to."""
         self._paused = True
         self._count_output()
 
@@ -695,10 +705,10 @@ class ClientConnection:
         self._broker.flush()
         self._resume_input()
 
-    # --- the client's Wire ---------------------------------------------------------------------
+    # --- the client's transport ----------------------------------------------------------------
 
     def authenticate(self, connect: Connect) -> None:
-        """Find out in the background who sent the CONNECT; read nothing more until then."""
+        """Authenticate the CONNECT in the background; nothing more is read until then."""
         self._logging_in = True
         self._pause_reading()
         self._scheduler.in_background(self._log_in(connect))
@@ -709,7 +719,7 @@ class ClientConnection:
                 connect, self.address, self._tls, self._anonymous
             )
             self._logging_in = False
-            if self._scheduler.is_busy():  # crowds come at once, when the robot's network is back
+            if self._scheduler.is_busy():  # crowds reconnect at once when a network is back
                 self._resume_input_later()
             else:
                 self._resume_input()
@@ -733,7 +743,7 @@ class ClientConnection:
         return self._loop.time()
 
     def admit(self, account: Account) -> str:
-        """The client has logged in as this user, and may be silent now; or why it may not."""
+        """Admit the client as this user and end its time limit; or return why it is refused."""
         refusal = self._scheduler.admission_policy.admit(self, account)
         if refusal:
             return refusal
@@ -747,7 +757,7 @@ class ClientConnection:
         return ""
 
     def holds(self, size: int) -> None:
-        """A chunk is not little that may be the last byte of a large packet."""
+        """A large packet is incomplete: its last chunk, however small, does not count as small."""
         self._small_chunk = 0 if size > SMALL_CHUNK else min(SMALL_CHUNK, self._scheduler.portion)
 
     def tls_info(self) -> TlsInfo:
@@ -758,7 +768,7 @@ class ClientConnection:
         return TlsInfo(peer.version() or "", tls.name_in(peer.getpeercert()))
 
     def later(self) -> None:
-        """Let the others have their turn, then let the client go on; it is not read before that."""
+        """Continue the client in a later turn; nothing is read before that."""
         self._has_more = True
         self._resume_input_later()
         now = self._accounting.now
@@ -776,12 +786,12 @@ class ClientConnection:
             )
 
     def stop_reading(self) -> None:
-        """Read nothing more until the client had its turn."""
+        """Read nothing more until the client's next turn."""
         self._stopped = True
         self._pause_reading()
 
     def wait(self, seconds: float) -> None:
-        """Let the client have a turn after so many seconds."""
+        """Give the client a turn after so many seconds."""
         if self._wait_timer is not None:
             self._wait_timer.cancel()
         self._wait_timer = self._entries.later(
@@ -789,7 +799,7 @@ class ClientConnection:
         )
 
     def proceed(self) -> None:
-        """Let the others have their turn, then the client."""
+        """Give the client a turn when the others had theirs."""
         if self._wait_timer is not None:
             self._wait_timer.cancel()
             self._wait_timer = None
@@ -797,7 +807,7 @@ class ClientConnection:
         self._resume_input_later()
 
     def write(self, chunks: list[bytes]) -> None:
-        """Write the chunks, joined when they are small; to who is slow, in portions."""
+        """Write the chunks, joined if they are small; to a slow client in portions."""
         if not self._paused:
             data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
             size = len(data)
@@ -809,7 +819,7 @@ class ClientConnection:
         self._write_later(chunks)
 
     def _write_later(self, chunks: list[bytes]) -> None:
-        if len(chunks[-1]) <= WRITE_PORTION:  # a large payload is one object for all its receivers
+        if len(chunks[-1]) <= WRITE_PORTION:  # a large payload is shared by all its receivers
             chunks = [b"".join(chunks)]
         self._counters.bytes_sent += sum(map(len, chunks))
         if self._transport is None or self._transport.is_closing():
@@ -831,8 +841,8 @@ class ClientConnection:
         return self._paused
 
     def _limit_system_output(self) -> None:
-        """What the system has taken cannot be overtaken any more, and for a slow client it takes
-        megabytes, some seconds' worth."""
+        """Limit what the system buffers: nothing can overtake that, and for a slow client it is
+        megabytes, seconds' worth."""
         self._is_system_limited = True
         if self._transport is None:
             return
@@ -856,7 +866,7 @@ class ClientConnection:
         return replace(known, has_unread=has_unread, flowing=flowing, held=held)
 
     def probe(self) -> None:
-        """Have it answer within two seconds, if it can."""
+        """Make it answer within two seconds, if it can."""
         if self._transport is not None and self._probe is None:
             self._probe = Probe(self._transport.get_extra_info("socket"))
             self._entries.later("connection.probe", PROBE_DURATION, self._end_probe, served=self)
@@ -867,7 +877,7 @@ class ClientConnection:
             probe.end()
 
     def withhold(self, seconds: float) -> None:
-        """Write nothing for so long; with 0, no longer."""
+        """Write nothing for so many seconds; 0 ends that."""
         if self._withheld is not None:
             self._withheld.cancel()
             self._withheld = None
@@ -882,7 +892,7 @@ class ClientConnection:
             self.resume_writing()
 
     def close(self) -> None:
-        """Write out what waits, then close."""
+        """Write what is queued, then close."""
         if self._transport is None or self._closing:
             return
         self._closing = True
@@ -898,7 +908,7 @@ class ClientConnection:
         if not self._transport.get_write_buffer_size():
             self._cut_after(lingering.TIMEOUT)
         if self._connection is None and not self._transport.is_closing():
-            # A transport closes its socket as soon as it has written: of that only a copy is left.
+            # A transport closes its socket as soon as it has written; only a copy stays open.
             with contextlib.suppress(OSError):
                 file = os.dup(self._transport.get_extra_info("socket").fileno())
                 self._connection = socket.socket(fileno=file)
@@ -907,7 +917,7 @@ class ClientConnection:
 
 
 class _ClosedTransport:
-    """The wire of a client whose connection has ended: nothing comes of what it is told."""
+    """The transport of a client whose connection has ended: it does nothing."""
 
     def __init__(self, address: str) -> None:
         self.address = address

@@ -1,4 +1,8 @@
-"""Whose turn it is: what the layers of a connection know of all the other connections."""
+"""What the layers of a connection (TCP, TLS, WebSocket, MQTT) require of each other.
+
+TLS and WebSocket are below `ClientConnection`. They report to the layer above them what they
+buffer, and ask the scheduler before they decode much at once.
+"""
 
 from __future__ import annotations
 
@@ -9,48 +13,48 @@ from appliance.net.callbacks import Entries
 
 
 class Schedulable(Protocol):
-    """Who waits for a turn: a connection, or a layer of one."""
+    """What can be queued for a turn: a connection, or a layer of one."""
 
     def take_turn(self) -> None:
-        """The others have had their turn."""
+        """Continue: the others have had their turn."""
 
     def fault(self, entry: str, error: Exception) -> None:
-        """Count what escaped while it was served, and end it; never raises."""
+        """Count an exception that escaped during the turn and end the connection; never raises."""
 
 
 class UpperLayer(Protocol):
-    """Who is charged for what a layer below it does, and for what that keeps."""
+    """The layer above TLS or WebSocket: it accounts for their work and their buffers."""
 
     @property
     def account(self) -> Account:
-        """The user it has logged in as, or that of strangers."""
+        """The user that has logged in, or the account of strangers."""
 
     def count_buffered(self, size: int) -> None:
-        """The layers below keep so many bytes that were received and not taken apart yet."""
+        """The layers below buffer so many received bytes that they have not decoded."""
 
     def input_paused(self) -> None:
-        """What has come waits below for a turn, and nothing more is read."""
+        """Received bytes wait below for a turn, and no more are read."""
 
     def input_resumed(self) -> None:
-        """It waits no longer."""
+        """Nothing waits below any more."""
 
     def partial_record(self, part: bool) -> None:
-        """Whether a layer below keeps the beginning of a record that has not come whole."""
+        """Whether a layer below buffers the beginning of an incomplete record."""
 
 
 class LayerScheduler(Protocol):
-    """What all connections share: who has much to do waits until others have had their turn."""
+    """The scheduler as the layers see it: whoever has much to do waits until others had a turn."""
 
     entries: Entries
 
     def count_cost(self, cost: int, charged: UpperLayer) -> None:
-        """So much was done for it, see `Counters.cost`."""
+        """Add to `Counters.cost` what was done for this connection."""
 
     def must_wait(self, charged: UpperLayer, *, is_small: bool) -> bool:
-        """Whether a chunk is to be taken apart in a turn, as so much else was done in this round.
+        """Whether a chunk has to wait for a turn, as this round's cost is used up.
 
-        A little one has to wait only when its user has had a share beyond the end of the round.
+        A small chunk waits only when its user has also used up its share beyond the round.
         """
 
     def queue_turn(self, member: Schedulable) -> None:
-        """Call `take_turn` when it is the member's."""
+        """Call `take_turn` once, when it is the member's turn."""

@@ -1,4 +1,4 @@
-"""The end of a connection whose last bytes are on their way, so that they arrive."""
+"""Closing a connection so that its last bytes arrive (a lingering close)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from appliance.net.callbacks import Entries
 
-#: Seconds that a closed connection is listened to, and the bytes that may come.
+#: Limits of one lingering close: seconds, and bytes that are received and discarded.
 TIMEOUT = 2.0
 BYTES = 64 * 1024 * 1024
 
@@ -15,11 +15,11 @@ _SCRATCH = bytearray(256 * 1024)
 
 
 class LingeringClose:
-    """A connection after its last byte was written, until the other side has closed it as well.
+    """A connection after its last byte was written, until the peer has closed it as well.
 
-    To close a socket that has unread input is to reset the connection, and that may take from the
-    other side what it has not read yet: the reason why it was disconnected. So this side says that
-    nothing more will come, and what still comes in is thrown away, for a while.
+    Closing a socket that has unread input resets the connection, and a reset can discard what the
+    peer has not read yet: the reason why it was disconnected. Therefore only the sending direction
+    is shut down, and what still comes in is discarded until a limit is reached.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class LingeringClose:
         try:
             self._socket.shutdown(socket.SHUT_WR)
             self._entries.reader("lingering.chunk", self._socket, self._discard, failed=self.end)
-        except OSError:  # the other side was quicker
+        except OSError:  # the peer has closed it already
             self.end()
 
     def _discard(self) -> None:

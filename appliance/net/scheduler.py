@@ -1,4 +1,9 @@
-"""All network connections together: whose turn it is, and what their output takes in all."""
+"""The scheduler of all network connections: whose turn it is, and how much output is buffered.
+
+A *round* is one iteration of the event loop. Work is measured as cost (`Counters.cost`), not as
+time, so that no clock has to be read for each message. When a round's cost is used up, connections
+with much input wait for a turn; small chunks are still served, up to a limit for each user.
+"""
 
 from __future__ import annotations
 
@@ -20,29 +25,29 @@ from appliance.net.callbacks import Entries
 from appliance.net.layers import Schedulable, UpperLayer
 from appliance.net.lingering import LingeringClose
 
-#: Messages that are few: after more than these it is checked whether who sends them has to wait.
+#: The most messages of one client between two checks of its rate and of the memory in use.
 FEW_MESSAGES = 64
 
-#: Bytes that a client is handed in one go: of a large WebSocket frame, a part.
+#: The most bytes that a client decodes at once: of a large WebSocket frame, a part.
 LARGEST_PORTION = 256 * 1024
 
-#: What all clients may cause in one round of the event loop, see `Counters.cost`: some six
-#: milliseconds. And what each user may cause beyond that with little chunks: who sends little does
-#: not wait for who sends much, or are many.
+#: The cost of all clients in one round of the event loop, see `Counters.cost`: some six
+#: milliseconds. And the cost of each user beyond that, with small chunks: a client that sends
+#: little does not wait for those that send much, or are many.
 COST_PER_ROUND = 1500
 COST_BEYOND_ROUND = 100
 
 #: Cost after which the start of the round is taken anew.
 COST_BETWEEN_CHECKS = 300
 
-#: Seconds that a client may publish ahead of `limits.publish_rate`.
+#: Seconds by which a client may exceed `limits.publish_rate` in a burst.
 PUBLISH_BURST = 1.0
 
-#: Closed connections that are listened to at a time, see `LingeringClose`.
+#: The most lingering closes at a time; further connections are closed at once.
 LINGERING_CLOSES = 256
 
-#: Who sent this CONNECT, from this address, over this TLS connection, if it is one; and does its
-#: listener let in who gives no user name (None: as everywhere)?
+#: Finds out who sent a CONNECT: its address, its TLS connection if it has one, and whether its
+#: listener admits clients without a user name (None: as configured for all).
 Authenticate: TypeAlias = Callable[
     [Connect, str, "ssl.SSLObject | None", "bool | None"], Awaitable["Identity | Refusal"]
 ]
@@ -53,48 +58,48 @@ BeginExchange: TypeAlias = Callable[[str, "str | None", "ssl.SSLObject | None"],
 
 
 class CertificatePolicy(Protocol):
-    """What is to be known of a client's certificate, of a connection with TLS."""
+    """Decides whether the certificate of a client is accepted."""
 
     def refusal(self, tls: ssl.SSLObject) -> str:
-        """Why the client is not, or no longer, let in with it; empty when it is."""
+        """Why the certificate is not, or no longer, accepted; empty when it is."""
 
 
 class ScheduledConnection(Schedulable, Protocol):
-    """One of the connections."""
+    """A connection as the scheduler and the listeners see it."""
 
-    #: What all connections of one computer share; empty for a Unix socket.
+    #: The host part of the client's address; empty for a Unix socket.
     host: str
-    #: The user it has logged in as, or that of strangers.
+    #: The user that has logged in, or the account of strangers.
     account: Account
 
     def check_certificate(self) -> None:
-        """Close the connection when the client's certificate is not, or no longer, accepted."""
+        """Close the connection if the client's certificate is not, or no longer, accepted."""
 
     def close(self) -> None:
-        """Write out what waits, then close."""
+        """Write what is queued, then close."""
 
     def abort(self) -> None:
         """Close at once."""
 
     def make_room(self) -> None:
-        """Close at once, for somebody else: it has not logged in, or is closing anyway."""
+        """Close at once, to make room for another connection."""
 
 
 class AdmissionPolicy(Protocol):
-    """Who lets connections in, and knows how many may be there."""
+    """Limits how many connections an address may have."""
 
     def admit(self, member: ScheduledConnection, account: Account) -> str:
-        """A connection logs in as that user: why it may not, or nothing."""
+        """Count the connection as one of this user; or return why the limits refuse it."""
 
     def closing(self, member: ScheduledConnection) -> None:
-        """It is told its last bytes."""
+        """The connection writes its last bytes, and no longer counts as its user's."""
 
     def ended(self, member: ScheduledConnection) -> None:
-        """It has ended, once."""
+        """The connection has ended; called once."""
 
 
 class Scheduler:
-    """All connections, and what they share; the doorkeeper is told what becomes of each.
+    """All connections, their turns, and the memory that their output takes.
 
     `connect_timeout` is in seconds, `publish_rate` in messages a second from one client.
     """
@@ -118,49 +123,48 @@ class Scheduler:
         self.entries = Entries(asyncio.get_running_loop(), broker.faults)
         self.use(connect_timeout, publish_rate)
         self.connections: set[ScheduledConnection] = set()
-        #: What runs in the background for a connection: TLS handshakes and logins.
+        #: Background tasks of connections: TLS handshakes and logins.
         self.tasks: set[asyncio.Task[None]] = set()
-        #: Bytes in the output of all clients, as far as they are counted.
+        #: Bytes of output that wait for all clients, as far as they are counted.
         self.output = 0
         self.admission_policy = admission_policy
-        #: For how many clients a large chunk waits, by its id: in all, and of each account.
+        #: How many clients a large chunk waits for, by its id and the id of an account (0: in all).
         self._shared: dict[tuple[int, int], int] = {}
-        #: Who has more to do than there was time for; in turn, with all others in between.
+        #: What waits for a turn, served round-robin, with all other work in between.
         self._turn_queue: deque[Schedulable] = deque()
-        #: `Counters.cost` from which on it is to be asked whether the round is over.
+        #: The value of `Counters.cost` beyond which `is_round_over` has to be asked.
         self.checkpoint = 0
         self._next_turns: asyncio.Handle | None = None
         self._round_begun = False
-        #: What each account has caused beyond the end of the round.
+        #: The cost of each account since the round was used up.
         self._excess: dict[Account, int] = {}
         self._lingering: set[LingeringClose] = set()
         self._all_closed: asyncio.Event | None = None
 
     def use(self, connect_timeout: float, publish_rate: float) -> None:
-        """Let these limits hold from now on, and those that the broker has now."""
+        """Apply these limits, and those that the broker has now, from now on."""
         self.connect_timeout = connect_timeout
-        self.publish_rate = min(publish_rate, 1e12)  # infinity times no time is no number
-        #: Messages of a client after which it is checked.
+        self.publish_rate = min(publish_rate, 1e12)  # infinity times 0 s is NaN
+        #: Messages of a client between two checks of its rate.
         self.check_every = int(min(max(publish_rate, 1), FEW_MESSAGES))
-        #: Bytes that hold no more messages than may come at once: the smallest one takes five.
+        #: Bytes that cannot hold more messages than a burst allows: the smallest takes five.
         self.portion = int(min(max(5 * PUBLISH_BURST * publish_rate, 256), LARGEST_PORTION))
-        #: `Accounting.queued_bytes` from which on publishers are slowed.
+        #: `Accounting.queued_bytes` from which on publishers are throttled.
         self.high_memory = self.broker.limits.memory * 3 // 4
-        #: Bytes in the output of all clients from which on less is allowed to each of them.
+        #: Bytes of output of all clients from which on each of them may have less.
         self.high_output = self.broker.limits.memory // 4
 
     def is_busy(self) -> bool:
-        """Whether as much was done in this round of the event loop as one round is for, or others
-        wait for the next one.
+        """Whether this round's cost is used up, or others wait for a turn already.
 
-        Who sends much then waits, too.
+        A connection with much input then waits as well.
         """
         return self.is_round_over() or bool(self._turn_queue)
 
     def is_round_over(self) -> bool:
-        """Whether as much was done in this round of the event loop as one round is for.
+        """Whether this round's cost is used up.
 
-        To be asked when `Counters.cost` is beyond the `checkpoint`, by who sends little.
+        A connection with little input asks when `Counters.cost` is beyond `checkpoint`.
         """
         cost = self.broker.counters.cost
         if not self._round_begun:
@@ -175,22 +179,22 @@ class Scheduler:
         self._excess.clear()
 
     def may_exceed_round(self, account: Account) -> bool:
-        """Whether its clients have sent little since the round is over."""
+        """Whether the account has cost left beyond the round, for small chunks."""
         return self._excess.get(account, 0) < COST_BEYOND_ROUND
 
     def count_excess(self, account: Account, cost: int) -> None:
-        """So much was done for one of them nevertheless."""
+        """Add what was done for a client of the account beyond the round."""
         self._excess[account] = self._excess.get(account, 0) + cost
 
     def count_cost(self, cost: int, charged: UpperLayer) -> None:
-        """So much was done for it, see `Counters.cost`."""
+        """Add to `Counters.cost` what was done for this connection."""
         counters = self.broker.counters
         counters.cost += cost
         if self._round_begun and counters.cost > self.checkpoint:
             self.count_excess(charged.account, cost)
 
     def must_wait(self, charged: UpperLayer, *, is_small: bool) -> bool:
-        """Whether a chunk is to be taken apart in a turn, see `LayerScheduler`."""
+        """Whether a chunk has to wait for a turn, see `LayerScheduler`."""
         if not is_small:
             return self.is_busy()
         if self.broker.counters.cost <= self.checkpoint or not self.is_round_over():
@@ -198,13 +202,13 @@ class Scheduler:
         return not self.may_exceed_round(charged.account)
 
     def queue_turn(self, member: Schedulable) -> None:
-        """Call `take_turn` when it is the member's."""
+        """Call `take_turn` once, when it is the member's turn."""
         self._turn_queue.append(member)
         if len(self._turn_queue) == 1:
             self._schedule_turns()
 
     def _schedule_turns(self) -> None:
-        """Run them in the next round, once: also when a fault comes after they were scheduled."""
+        """Run the turns in the next round, once, even if a fault has scheduled them before."""
         if self._next_turns is not None:
             self._next_turns.cancel()
         self._next_turns = self.entries.soon(
@@ -223,7 +227,7 @@ class Scheduler:
                 except Exception as error:
                     member.fault("connection.turn", error)
                 finally:
-                    # After its turn, so that no entry meanwhile is the first, to be scheduled.
+                    # Only now: `queue_turn` schedules when it finds the queue empty.
                     self._turn_queue.popleft()
                 if self.broker.counters.cost > end:
                     break
@@ -232,13 +236,13 @@ class Scheduler:
                 self._schedule_turns()
 
     def in_background(self, work: Coroutine[object, object, None]) -> None:
-        """Run a connection's handshake or login beside everything else."""
+        """Run a connection's handshake or login as a background task."""
         task = self.entries.task("scheduler.background", work)
         self.tasks.add(task)
         self.entries.when_done("scheduler.background_end", task, self.tasks.discard, task)
 
     def count_output(self, account: Account, size: int) -> None:
-        """So many bytes more, or less, wait to be read by a client of the account."""
+        """Add bytes (or subtract, if negative) that wait to be read by a client of the account."""
         self._count_in_all(size)
         self._count_for(account, size)
 
@@ -251,9 +255,9 @@ class Scheduler:
         account.bytes += size
 
     def is_output_high(self, account: Account) -> bool:
-        """Whether so much output waits that less is allowed to the account's clients.
+        """Whether so much output waits that the account's clients may have less.
 
-        Those of a user with less than most have of it are not the reason.
+        Accounts with less than an average share are not restricted.
         """
         return (
             self.output > self.high_output
@@ -263,7 +267,7 @@ class Scheduler:
     def share(self, account: Account, chunk: bytes) -> None:
         """Count a large chunk that waits for a client of the account.
 
-        It is counted once for however many it waits, and once for each account of these.
+        However many clients wait for it, it is counted once in all, and once for each account.
         """
         for key, count in self._sharers(account, chunk):
             clients = self._shared.get(key, 0)
@@ -272,7 +276,7 @@ class Scheduler:
             self._shared[key] = clients + 1
 
     def unshare(self, account: Account, chunk: bytes) -> None:
-        """It waits for one client of the account less."""
+        """One client of the account less waits for the chunk."""
         for key, count in self._sharers(account, chunk):
             clients = self._shared.pop(key) - 1
             if clients:
@@ -289,19 +293,19 @@ class Scheduler:
         )
 
     def closing(self, member: ScheduledConnection) -> None:
-        """A connection is told its last bytes; one that has ended is nobody's guest any more."""
+        """A connection writes its last bytes; one that has ended already is ignored."""
         if member in self.connections:
             self.admission_policy.closing(member)
 
     def closed(self, member: ScheduledConnection) -> None:
-        """A connection ended."""
+        """A connection has ended."""
         if member in self.connections:
             self.connections.discard(member)
             self.admission_policy.ended(member)
-        self._tell_when_all_closed()
+        self._signal_when_all_closed()
 
     def linger(self, connection: socket.socket) -> None:
-        """Close a connection whose last bytes are on their way, see `LingeringClose`."""
+        """Close a socket whose last bytes are on their way, see `LingeringClose`."""
         if len(self._lingering) < LINGERING_CLOSES:
             lingering = LingeringClose(connection, self._lingering_ended, self.entries)
             self._lingering.add(lingering)
@@ -311,14 +315,14 @@ class Scheduler:
 
     def _lingering_ended(self, lingering: LingeringClose) -> None:
         self._lingering.discard(lingering)
-        self._tell_when_all_closed()
+        self._signal_when_all_closed()
 
-    def _tell_when_all_closed(self) -> None:
+    def _signal_when_all_closed(self) -> None:
         if self._all_closed is not None and not self.connections and not self._lingering:
             self._all_closed.set()
 
     async def close(self, timeout: float) -> None:
-        """Close everything; who does not read the last bytes in so many seconds is cut off."""
+        """Close all connections; abort those that are not read to the end within `timeout`."""
         for member in list(self.connections):
             member.close()
         for task in list(self.tasks):
