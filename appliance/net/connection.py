@@ -1,7 +1,8 @@
 """One network connection: an `asyncio.Protocol` that is the `Transport` of its client.
 
-Input goes from `data_received` to `ClientHandler.receive`, in portions when there is much of it or others
-wait. Output is handed to the transport at once, or queued here while the client reads too slowly.
+Input goes from `data_received` to `ClientHandler.receive`, in portions when there is much of it, or
+others wait. Output is handed to the transport at once, or queued here while the
+client reads too slowly.
 """
 
 from __future__ import annotations
