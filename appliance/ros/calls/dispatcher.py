@@ -572,7 +572,7 @@ class CallDispatcher:
             age = 0.0
         if age is None:
             # Asked for cancels too, as each message tells the guard of the replay it is part of.
-            is_old = self._replay_guard.has(message, caller, endpoint.timeout, self._loop.time())
+            is_old = self._replay_guard.is_old(message, caller, endpoint.timeout, self._loop.time())
             is_expired |= is_old and not endpoint.is_cancel
         elif age > endpoint.timeout and not endpoint.is_cancel:
             raise CallError("expired", f"it was sent {age:.1f} s before, by its {SENT_AT}")

@@ -1,4 +1,4 @@
-"""A bounded table that many users share: when it is full, who has most in it loses the oldest."""
+"""A bounded cache that users share fairly: when it is full, the largest user loses its oldest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ V = TypeVar("V")
 
 
 class _UserEntries(Generic[K, V]):
-    """What one user has: values with their sizes, the oldest first."""
+    """The entries of one user, the oldest first: values with their sizes."""
 
     def __init__(self) -> None:
         self.entries: OrderedDict[K, tuple[V, int]] = OrderedDict()
@@ -20,13 +20,16 @@ class _UserEntries(Generic[K, V]):
 
 
 class FairCache(Generic[K, V]):
-    """Values by keys, each of a user (None: of all without one). It has up to `entries` of them,
-    and up to `size` in all of what `put` says each has."""
+    """Values by keys, each of a user (None: all clients without one).
+
+    Beyond `entries`, evict the oldest entry of the user with the most entries; beyond a total of
+    `size`, that of the user with the largest sum of sizes.
+    """
 
     def __init__(self, entries: int, size: float = math.inf) -> None:
-        self._most = entries
-        self._largest = size
-        self._shares: dict[str | None, _UserEntries[K, V]] = {}
+        self._max_entries = entries
+        self._max_size = size
+        self._users: dict[str | None, _UserEntries[K, V]] = {}
         self._user_of: OrderedDict[K, str | None] = OrderedDict()
         self._size = 0
 
@@ -40,43 +43,43 @@ class FairCache(Generic[K, V]):
         return iter(self._user_of)
 
     def get(self, key: K) -> V | None:
-        """The value; None if there is none, or no more."""
+        """The value; None if there is none, or it was evicted."""
         if key not in self._user_of:
             return None
-        return self._shares[self._user_of[key]].entries[key][0]
+        return self._users[self._user_of[key]].entries[key][0]
 
     def put(self, user: str | None, key: K, value: V, size: int = 0) -> list[tuple[K, V]]:
-        """Add a value; returns what had to go for it."""
+        """Add or replace a value; returns the evicted keys and values."""
         self.remove(key)
-        share = self._shares.setdefault(user, _UserEntries())
-        share.entries[key] = value, size
-        share.size += size
+        own = self._users.setdefault(user, _UserEntries())
+        own.entries[key] = value, size
+        own.size += size
         self._user_of[key] = user
         self._size += size
-        dropped = []
-        while len(self) > 1 and (len(self) > self._most or self._size > self._largest):
-            by_size = self._size > self._largest
-            share = max(
-                self._shares.values(), key=lambda one: one.size if by_size else len(one.entries)
+        evicted = []
+        while len(self) > 1 and (len(self) > self._max_entries or self._size > self._max_size):
+            by_size = self._size > self._max_size
+            own = max(
+                self._users.values(), key=lambda one: one.size if by_size else len(one.entries)
             )
-            oldest, (old, _) = next(iter(share.entries.items()))
-            dropped.append((oldest, old))
+            oldest, (old, _) = next(iter(own.entries.items()))
+            evicted.append((oldest, old))
             self.remove(oldest)
-        return dropped
+        return evicted
 
     def remove(self, key: K) -> None:
-        """Take a value out, if it is there."""
+        """Remove a value, if it is there."""
         if key not in self._user_of:
             return
         user = self._user_of.pop(key)
-        share = self._shares[user]
-        _, size = share.entries.pop(key)
-        share.size -= size
+        own = self._users[user]
+        _, size = own.entries.pop(key)
+        own.size -= size
         self._size -= size
-        if not share.entries:
-            del self._shares[user]
+        if not own.entries:
+            del self._users[user]
 
     def items(self) -> Iterator[tuple[K, V]]:
-        """All of them, the oldest first."""
+        """All keys and values, the oldest first."""
         for key, user in self._user_of.items():
-            yield key, self._shares[user].entries[key][0]
+            yield key, self._users[user].entries[key][0]

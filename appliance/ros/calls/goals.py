@@ -1,9 +1,10 @@
-"""What an action's messages are on MQTT: goals, feedback, results, status, and what to cancel.
+"""Converts an action's messages for MQTT: goals, feedback, results, status, and cancels.
 
-In JSON and CBOR a goal's id is 32 hex digits and its status a word. In ROS's own bytes they are
-what ROS 2 has for them, on ROS 1 packed as there (ros1_actions.py): the answers, and what `_cancel`
-takes, are `action_msgs/msg/GoalInfo` and `action_msgs/srv/CancelGoal_Response`, a result is the
-whole response of `get_result`, and the status is `action_msgs/msg/GoalStatusArray`.
+In JSON and CBOR a goal's id is 32 hex digits and its status a word. In ROS's own bytes they are the
+messages of ROS 2, on ROS 1 serialized as there (ros1/actions.py): the answers to a goal and to
+`_cancel` are `action_msgs/msg/GoalInfo`, which `_cancel` also takes, and
+`action_msgs/srv/CancelGoal_Response`; a result is the whole response of `get_result`, and the
+status is `action_msgs/msg/GoalStatusArray`.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ CANCEL = "action_msgs/srv/CancelGoal"
 GOAL_INFO = "action_msgs/msg/GoalInfo"
 STATUS = "action_msgs/msg/GoalStatusArray"
 
-#: Stands for all goals.
+#: The id that stands for all goals.
 ALL = bytes(16)
 
 #: By the numbers of action_msgs/msg/GoalStatus.
 STATES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
-#: Of these, those of a goal that goes on.
+#: The numbers of the states of a goal that runs: accepted and executing.
 _RUNNING = (1, 2)
 
 _WHICH = (
@@ -37,18 +38,18 @@ _WHICH = (
 )
 
 
-# An id's 16 bytes come first, and are twice the largest alignment: what follows them is aligned as
-# it is by itself.
+# The 16 bytes of an id come first and are twice the largest alignment, so the message behind them
+# has the alignment that it has by itself.
 
 
 def with_id(goal: bytes, id_: bytes, serialization: Serialization) -> bytes:
-    """The serialized request of `send_goal`."""
+    """The serialized request of `send_goal`, of a serialized goal and its id."""
     start = len(serialization.header)
     return goal[:start] + id_ + goal[start:]
 
 
 def split_id(cdr: bytes, serialization: Serialization) -> tuple[bytes, bytes]:
-    """The goal's id and the serialized feedback, of a message with both."""
+    """The goal's id and the serialized feedback, out of a message with both."""
     start = len(serialization.header)
     return cdr[start : start + 16], cdr[:start] + cdr[start + 16 :]
 
@@ -87,7 +88,7 @@ def result(converters: Converters, action: str, cdr: bytes, encoding: EncodingNa
 
 
 def statuses(converters: Converters, cdr: bytes, encoding: EncodingName) -> bytes:
-    """The payload of what a server says of its goals. Raises ConversionError."""
+    """The payload of a server's status message. Raises ConversionError."""
     if encoding in RAW:
         return cdr
     goals: list[dict[str, Any]] = [
@@ -102,7 +103,7 @@ def statuses(converters: Converters, cdr: bytes, encoding: EncodingName) -> byte
 
 
 def running(converters: Converters, cdr: bytes) -> list[bytes]:
-    """The ids of the goals that go on, of what a server says. Raises ConversionError."""
+    """The ids of the running goals in a server's status message. Raises ConversionError."""
     return [
         id_of(one["goal_info"]["goal_id"])
         for one in converters.get(STATUS).to_dict(cdr)["status_list"]
@@ -113,17 +114,17 @@ def running(converters: Converters, cdr: bytes) -> list[bytes]:
 def which(
     converters: Converters, payload: bytes, encoding: EncodingName
 ) -> tuple[bytes, dict[str, int]]:
-    """The goals that a call of `_cancel` means, in ROS's words: the id of one; or ALL, of those
-    that were accepted up to a time, and for the time 0 of all there are. Raises CallError.
+    """The goals that a call of `_cancel` names: the id of one; or ALL with a time, for those that
+    were accepted up to then, and with the time 0 for all. Raises CallError.
 
-    With an id and a time ROS cancels that goal and all before it. Here it is that goal alone: who
-    sends back what its goal was answered with means no other.
+    With an id and a time ROS cancels that goal and all before it. Here that goal alone is
+    cancelled: a client that sends back the answer to its goal means no other.
     """
     info = converters.get(GOAL_INFO)
     try:
         if encoding in RAW:
-            said = info.to_dict(payload)
-            id_: object = id_of(said["goal_id"])
+            goal_info = info.to_dict(payload)
+            id_: object = id_of(goal_info["goal_id"])
         else:
             value = VALUE_ENCODINGS[encoding].loads(payload)
             if value == {"all": True}:
@@ -133,14 +134,14 @@ def which(
             id_ = value.get("goal_id", ALL)
             if isinstance(id_, str):
                 id_ = binascii.unhexlify(id_.replace("-", ""))
-            said = info.to_dict(info.from_dict({"stamp": value.get("stamp", {})}))
+            goal_info = info.to_dict(info.from_dict({"stamp": value.get("stamp", {})}))
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
     except ValueError:
         raise CallError("bad_request", f"goal_id: {_WHICH}") from None
     if not isinstance(id_, bytes) or len(id_) != len(ALL):
         raise CallError("bad_request", f"goal_id: {_WHICH}")
-    return id_, said["stamp"] if id_ == ALL else {}
+    return id_, goal_info["stamp"] if id_ == ALL else {}
 
 
 def _state(number: int) -> str:

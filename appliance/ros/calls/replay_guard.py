@@ -1,6 +1,6 @@
-"""Which calls clients had queued while they had no connection, told from what they say now.
+"""Recognizes calls that a client queued while it had no connection and replays afterwards.
 
-For commands that move a robot there is more at stake, and more is asked: see `arrivals`.
+Commands that move a robot are checked more strictly, see topics/staleness.py.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 
-#: Messages that follow each other within so many seconds, and how many of them in a row: nobody
-#: commands like that, but a queue is emptied so.
-BURST = 0.005
+#: So many messages, each within so many seconds of the one before, are a queue that is emptied:
+#: nobody calls that fast.
+BURST_INTERVAL = 0.005
 BURST_MESSAGES = 3
 
-#: Seconds after which a backlog is over, however fast its client goes on.
-LONGEST = 60.0
+#: Seconds after which a replay is over, however fast its client goes on.
+MAX_DURATION = 60.0
 
 
 @dataclass(slots=True)
 class _Replay:
-    """A client that sends what it had queued, until some time, and how fast."""
+    """The replay of one client: when it ends, at the latest too, and how fast it is."""
 
     until: float
     end: float
@@ -30,35 +30,39 @@ class _Replay:
 
 
 class ReplayGuard:
-    """Who has sent old messages, and until when its others are taken for such.
+    """Tracks the clients that have sent old messages, and until when their others count as old.
 
-    What is sent again after a lost connection tells how old it is. What its client queued in the
-    meantime comes right behind it, and looks like new: so what comes within the time that makes a
-    message old is taken for old, and what comes in bursts, for as long as these take.
+    A message that is sent again after a lost connection has an age. The messages that its client
+    queued in the meantime follow it and look new. So after an old message, all of its client's
+    count as old for the time that makes a message old, and longer while they come in bursts.
     """
 
     def __init__(self) -> None:
-        self._behind: dict[Session, _Replay] = {}
+        self._replays: dict[Session, _Replay] = {}
 
-    def has(self, message: Message, origin: Session | None, oldest: float, now: float) -> bool:
-        """Whether the message is older than `oldest`, in seconds, or comes behind such a one."""
-        is_old = message.age > oldest
-        if origin is None:
+    def is_old(
+        self, message: Message, publisher: Session | None, max_age: float, now: float
+    ) -> bool:
+        """Whether the message is older than `max_age`, in seconds, or part of a replay."""
+        is_old = message.age > max_age
+        if publisher is None:
             return is_old
-        behind = self._behind.get(origin)
-        if behind is None:
+        replay = self._replays.get(publisher)
+        if replay is None:
             if is_old:
-                self._behind[origin] = _Replay(now + oldest, now + max(LONGEST, oldest), now)
+                self._replays[publisher] = _Replay(
+                    now + max_age, now + max(MAX_DURATION, max_age), now
+                )
             return is_old
-        behind.in_a_row = behind.in_a_row + 1 if now - behind.last < BURST else 1
-        behind.last = now
-        if is_old or behind.in_a_row >= BURST_MESSAGES:
-            behind.until = max(behind.until, min(now + oldest, behind.end))
-        if now >= behind.until and not is_old:
-            del self._behind[origin]
+        replay.in_a_row = replay.in_a_row + 1 if now - replay.last < BURST_INTERVAL else 1
+        replay.last = now
+        if is_old or replay.in_a_row >= BURST_MESSAGES:
+            replay.until = max(replay.until, min(now + max_age, replay.end))
+        if now >= replay.until and not is_old:
+            del self._replays[publisher]
             return False
         return True
 
     def departed(self, session: Session) -> None:
-        """Its connection has ended: what it sends on the next one tells its own age."""
-        self._behind.pop(session, None)
+        """Forget a client whose connection has ended: what it sends next tells its age again."""
+        self._replays.pop(session, None)

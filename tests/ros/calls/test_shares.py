@@ -377,7 +377,7 @@ def test_a_fair_table_takes_from_who_has_most(puts, entries, size):
     for key in list(known):
         assert key in table and table.get(key) == key
         table.remove(key)
-    assert len(table) == 0 and table._size == 0 and table._shares == {}
+    assert len(table) == 0 and table._size == 0 and table._users == {}
 
 
 # turns

@@ -810,26 +810,26 @@ class TestBacklog:
     NEW = Message(TOPIC, GO)
 
     def begin(self):
-        backlog = ReplayGuard()
-        assert backlog.has(DelayedMessage(self.NEW, math.inf), self, 0.5, 100.0)
-        return backlog
+        guard = ReplayGuard()
+        assert guard.is_old(DelayedMessage(self.NEW, math.inf), self, 0.5, 100.0)
+        return guard
 
     def test_it_takes_longer_than_a_command_may(self):
         """Bursts of it, as the acknowledgements let them through, over a slow network."""
-        backlog, now = self.begin(), 100.0
+        guard, now = self.begin(), 100.0
         for burst in range(20):
             now = 100.0 + 0.4 * burst
-            assert all(backlog.has(self.NEW, self, 0.5, now + 0.001 * n) for n in range(5))
+            assert all(guard.is_old(self.NEW, self, 0.5, now + 0.001 * n) for n in range(5))
         # Commands as they are made, of which one or the other pair comes together.
-        assert backlog.has(self.NEW, self, 0.5, now + 0.4)
-        assert backlog.has(self.NEW, self, 0.5, now + 0.401)
-        assert not backlog.has(self.NEW, self, 0.5, now + 0.52)
-        assert not backlog.has(self.NEW, self, 0.5, now + 0.521)
+        assert guard.is_old(self.NEW, self, 0.5, now + 0.4)
+        assert guard.is_old(self.NEW, self, 0.5, now + 0.401)
+        assert not guard.is_old(self.NEW, self, 0.5, now + 0.52)
+        assert not guard.is_old(self.NEW, self, 0.5, now + 0.521)
 
     def test_who_is_always_fast_is_heard_again(self):
-        backlog = self.begin()
+        guard = self.begin()
         times = [100.0 + 0.002 * n for n in range(40_000)]
-        heard = next(now for now in times if not backlog.has(self.NEW, self, 0.5, now))
+        heard = next(now for now in times if not guard.is_old(self.NEW, self, 0.5, now))
         assert 150 < heard < 161
 
 
