@@ -368,7 +368,7 @@ class App:
         # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
         assert self._status is not None
         pulse = Pulse(self.broker, self._listeners.scheduler, self._inside, loop.time)
-        self._notifier.start(self._entries, self._status.line, pulse.is_there)
+        self._notifier.start(self._entries, self._status.line, pulse.is_alive)
         try:
             await self._stopping.wait()
             log.info("stopping")

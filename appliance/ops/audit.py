@@ -1,8 +1,8 @@
 """The audit log: who connected, was refused, changed what; JSON, one object a line, in files.
 
-The event loop puts events into a bounded queue, and a thread of its own writes them: a slow disk
-delays nobody, and a full one loses lines, which are counted and told in the file as soon as it can
-be written again. A flood is told in part, and counted.
+The event loop puts events into a bounded queue and a thread writes them, so that a slow disk delays
+nobody. Lines that a full disk loses are counted; the file says how many as soon as it can be
+written again. Floods of similar events are rate-limited: the rest is counted and summarised.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Events that wait to be written; more are lost, and counted.
-WAITING: Final = 10_000
+#: Events in the queue; more are lost, and counted.
+QUEUE_LIMIT: Final = 10_000
 
-#: Events of one kind from one address, or of one user, that are written in one interval, and its
-#: seconds. More are counted. And of how many kinds and addresses this is known.
+#: The rate limit: events of one kind from one source (an address or a user) that are written in an
+#: interval, and its seconds. More are counted.
 BURST: Final = 100
 INTERVAL: Final = 10.0
+#: Kinds and sources that the rate limit remembers; beyond that it evicts the least recent.
 SOURCES: Final = 1024
 
 #: Characters of one value: client ids and topics are up to 64 KiB.
@@ -46,10 +47,10 @@ LONGEST: Final = 256
 #: Seconds between two tries while the file cannot be written.
 RETRY: Final = 1.0
 
-#: Seconds that the end of the process waits for the last lines.
-PARTING: Final = 2.0
+#: Seconds that `close` waits for the last lines.
+CLOSE_TIMEOUT: Final = 2.0
 
-#: What is written about one event, in the order of the line.
+#: The keys and values of one line, in their order.
 Fields: TypeAlias = dict[str, Any]
 
 
@@ -59,56 +60,56 @@ class AuditError(ValueError):
 
 @dataclass(slots=True)
 class _Flood:
-    """What came from one source in an interval."""
+    """Events of one kind from one source in an interval."""
 
     since: float
-    told: int = 0
-    untold: int = 0
+    written: int = 0
+    suppressed: int = 0
     last: Fields | None = None
 
 
 class Audit:
-    """Writes the audit log: the broker's `AuditLog`, and `changed` for what is done to it.
+    """Writes the audit log: the broker's `AuditLog`, and `changed` for changes of its settings.
 
-    All methods but `_write_all` and what that calls are the event loop's.
+    All methods run on the event loop, except `_write_all` and what it calls.
     """
 
     def __init__(self, path: Path, size: int, keep: int) -> None:
-        """Opens the file; `size` in bytes is its limit, `keep` how many full ones are kept.
+        """Open the file; `size` in bytes is its limit, `keep` the number of rotated files.
 
         Raises:
             AuditError: it cannot be written there.
         """
         self._file = _File(path, size, keep)
-        self._queue: queue.Queue[Fields | None] = queue.Queue(WAITING)
-        self._overflowed = 0  # events that found no place, counted by the event loop
-        self._counted = 0  # and how many of these the thread has seen
-        self._lost = 0  # lines that are not in the file, nor told there
-        self._broken = False
-        self._over = threading.Event()
+        self._queue: queue.Queue[Fields | None] = queue.Queue(QUEUE_LIMIT)
+        self._overflowed = 0  # events that the full queue refused, counted by the event loop
+        self._counted = 0  # how many of these the thread has added to `_lost`
+        self._lost = 0  # lines that are missing in the file, which does not say so yet
+        self._is_failing = False
+        self._is_closing = threading.Event()
         self._floods: OrderedDict[tuple[str, str], _Flood] = OrderedDict()
         self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, for two seconds at most, and close the file. May be called twice."""
+        """Write what is queued, within two seconds, and close the file; may be called twice."""
         if not self._thread.is_alive():
             return
-        self._over.set()
+        self._is_closing.set()
         with contextlib.suppress(queue.Full):
-            self._queue.put(None, timeout=PARTING)
-        self._thread.join(PARTING)
+            self._queue.put(None, timeout=CLOSE_TIMEOUT)
+        self._thread.join(CLOSE_TIMEOUT)
 
-    # --- what happens --------------------------------------------------------------------------
+    # --- events --------------------------------------------------------------------------------
 
     def connected(self, session: Session, address: str, version: int, tls_info: TlsInfo) -> None:
-        """A client came in."""
+        """A client connected."""
         self._put(
             "connected",
-            **_who(session.identity),
+            **_identity(session.identity),
             address=address,
             mqtt=VERSION_NAMES[version],
-            **_how(tls_info),
+            **_tls(tls_info),
         )
 
     def refused(
@@ -120,18 +121,18 @@ class Audit:
         username: str | None = None,
         tls_info: TlsInfo | None = None,
     ) -> None:
-        """A client, or a connection, did not come in; what it said of itself is not proven."""
-        said: Fields = {}
+        """A connection, or the client on it, was refused; its names are its own claim."""
+        claimed: Fields = {}
         if client_id is not None:
-            said = {"client": client_id, "user": username}
-        how = _how(tls_info) if tls_info is not None else {}
-        self._put("refused", **said, address=address, **how, **_code(code), reason=reason)
+            claimed = {"client": client_id, "user": username}
+        tls = _tls(tls_info) if tls_info is not None else {}
+        self._put("refused", **claimed, address=address, **tls, **_code(code), reason=reason)
 
     def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
-        """A client may not do what it wanted to do with a topic."""
+        """The access rules did not let a client publish or subscribe."""
         self._put(
             "denied",
-            **_who(session.identity),
+            **_identity(session.identity),
             action=action.value,
             topic=topic,
             reason=reason,
@@ -139,18 +140,18 @@ class Audit:
 
     def disconnected(self, session: Session, address: str, reason: str) -> None:
         """A client's connection ended."""
-        self._put("disconnected", **_who(session.identity), address=address, reason=reason)
+        self._put("disconnected", **_identity(session.identity), address=address, reason=reason)
 
     def changed(self, what: str, **details: Any) -> None:
-        """Something was changed, or was not, as `details` say: users, rules, certificates."""
+        """Users, rules, certificates or settings were changed, or could not be: see `details`."""
         self._put("changed", what=what, **details)
 
     def began(self) -> None:
-        """The appliance began to listen."""
+        """The appliance started."""
         self._put("started", pid=os.getpid())
 
     def ended(self) -> None:
-        """It stops."""
+        """The appliance stops."""
         self._put("stopped", pid=os.getpid())
 
     def _put(self, event: str, **fields: Any) -> None:
@@ -181,12 +182,12 @@ class Audit:
             self._file.close()
 
     def _admit(self, event: Fields, now: float) -> list[Fields]:
-        """What is to be written of an event: nothing when there were too many like it."""
+        """The lines to write for an event: none when its source has reached the rate limit."""
         if event["event"] in ("changed", "started", "stopped"):
             return [event]
-        # Client ids are free to choose: of who is in, it is the user that counts.
-        whose = event["address"].rpartition(":")[0] if "address" in event else event["user"]
-        source = event["event"], whose or ""
+        # Clients choose their ids, so without an address the source is the user.
+        origin = event["address"].rpartition(":")[0] if "address" in event else event["user"]
+        source = event["event"], origin or ""
         flood = self._floods.get(source)
         written: list[Fields] = []
         if flood is None or now - flood.since >= INTERVAL:
@@ -196,10 +197,10 @@ class Audit:
             if len(self._floods) > SOURCES:
                 written += _summary(*self._floods.popitem(last=False))
         self._floods.move_to_end(source)
-        if flood.told < BURST:
-            flood.told += 1
+        if flood.written < BURST:
+            flood.written += 1
             return [*written, event]
-        flood.untold += 1
+        flood.suppressed += 1
         flood.last = event
         return written
 
@@ -225,28 +226,28 @@ class Audit:
                 left -= 1
         except OSError as error:
             self._lost += left
-            if not self._broken:
-                self._broken = True
+            if not self._is_failing:
+                self._is_failing = True
                 log.error(
-                    "%s: cannot be written (%s); what happens meanwhile is counted, not kept",
+                    "%s: cannot be written (%s); events until then are counted, not stored",
                     self._file.path,
                     error.strerror,
                 )
-            self._over.wait(RETRY)
+            self._is_closing.wait(RETRY)
         else:
-            if self._broken:
-                self._broken = False
+            if self._is_failing:
+                self._is_failing = False
                 log.warning("%s: can be written again", self._file.path)
 
 
 class _File:
-    """A file that lines are added to, and that is moved out of the way when it is full."""
+    """A file that lines are appended to, and that is rotated when it is full."""
 
     def __init__(self, path: Path, size: int, keep: int) -> None:
         self.path = path
         self._size = size
         self._keep = keep
-        self._torn = False
+        self._ends_within_line = False
         self._descriptor = -1
         self._open()
         if not os.access(path.parent, os.W_OK):
@@ -257,7 +258,7 @@ class _File:
 
     def _open(self) -> None:
         try:
-            # Not to wait for a reader, should it be a pipe.
+            # O_NONBLOCK: if it is a pipe, do not wait for its reader.
             flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
             self._descriptor = os.open(self.path, flags, 0o600)
             status = os.fstat(self._descriptor)
@@ -277,21 +278,21 @@ class _File:
             )
 
     def write(self, line: bytes) -> None:
-        """Add a line. OSError: it is not there, or a part of it only."""
-        if self._torn:
+        """Append a line. OSError: it was not written, or only a part of it."""
+        if self._ends_within_line:
             line = b"\n" + line
-        if self._is_elsewhere():
+        if self._was_moved():
             self._reopen()
         elif os.fstat(self._descriptor).st_size + len(line) > self._size:
             self._rotate()
         written = os.write(self._descriptor, line)
         if written < len(line):
-            self._torn = True
+            self._ends_within_line = True
             raise OSError(0, "there is no room")
-        self._torn = False
+        self._ends_within_line = False
 
-    def _is_elsewhere(self) -> bool:
-        """Whether somebody has moved or deleted the file: logrotate, most likely."""
+    def _was_moved(self) -> bool:
+        """Whether another program has moved or deleted the file, most likely logrotate."""
         try:
             return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
         except FileNotFoundError:
@@ -316,15 +317,15 @@ class _File:
         os.close(before)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the file."""
         os.close(self._descriptor)
 
 
 def note(path: Path | None, what: str, **details: Any) -> None:
-    """Add one change to the audit log of an appliance that may be running, from a command.
+    """Append one change, made by a command, to the audit log of an appliance that may be running.
 
-    Only to a file that is there: one that another user made would be none that the appliance could
-    write. A link is not followed. OSError: it cannot be written.
+    The file is not created, because the appliance could not write a file of another user. A link is
+    not followed. OSError: it cannot be written.
     """
     if path is None:
         return
@@ -333,18 +334,18 @@ def note(path: Path | None, what: str, **details: Any) -> None:
         descriptor = os.open(path, flags)
     except FileNotFoundError:
         return
-    line = {"time": _now(), "event": "changed", "what": what, **details, "by": _who_types()}
+    line = {"time": _now(), "event": "changed", "what": what, **details, "by": _typist()}
     try:
         os.write(descriptor, _encode(line))
     finally:
         os.close(descriptor)
 
 
-def _who_types() -> str:
-    """The user of this computer, and behind sudo the one who used it."""
+def _typist() -> str:
+    """The user who typed the command, with sudo as "alice as root"."""
     user = getpass.getuser()
-    behind = os.environ.get("SUDO_USER", user)
-    return user if behind == user else f"{behind} as {user}"
+    caller = os.environ.get("SUDO_USER", user)
+    return user if caller == user else f"{caller} as {user}"
 
 
 def _now() -> str:
@@ -352,13 +353,13 @@ def _now() -> str:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _who(identity: Identity | None) -> Fields:
+def _identity(identity: Identity | None) -> Fields:
     if identity is None:
         return {}
     return {"client": identity.client_id, "user": identity.username}
 
 
-def _how(tls_info: TlsInfo) -> Fields:
+def _tls(tls_info: TlsInfo) -> Fields:
     if not tls_info.version:
         return {"tls": None}
     return {"tls": tls_info.version, "certificate": tls_info.certificate or None}
@@ -372,15 +373,15 @@ def _code(code: int) -> Fields:
 
 
 def _summary(source: tuple[str, str], flood: _Flood) -> list[Fields]:
-    if not flood.untold:
+    if not flood.suppressed:
         return []
-    event, whose = source
-    more = {"time": _now(), "event": "more", "of": event, "from": whose}
-    return [{**more, "count": flood.untold, "last": flood.last}]
+    event, origin = source
+    more = {"time": _now(), "event": "more", "of": event, "from": origin}
+    return [{**more, "count": flood.suppressed, "last": flood.last}]
 
 
 def _encode(line: Fields) -> bytes:
-    # In ASCII: nothing that a stranger calls itself is more than text to who shows the file.
+    # In ASCII, so that no name that a stranger chose controls the terminal that shows the file.
     return json.dumps(_cut(line)).encode() + b"\n"
 
 

@@ -1,8 +1,8 @@
-"""The way to a running appliance for commands on its computer: a Unix socket beside its state.
+"""The control socket: a Unix socket by which commands on the same computer reach the appliance.
 
-A request is one line of JSON, `{"command": "reload"}`, and so is the answer: `{"ok": …}` with what
-the command returned, or `{"error": "…"}`. Who may open the socket is decided by its mode, 0600: the
-appliance's own user, and root.
+A request is one line of JSON, `{"command": "reload"}`, and so is the response: `{"ok": …}` with the
+command's result, or `{"error": "…"}`. The socket's mode, 0600, lets only the appliance's own user
+and root open it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from appliance.net.sockets import listen_on_path
 
 log = logging.getLogger(__name__)
 
-#: What a command does, and what it answers; ControlError tells the caller why it was not done.
+#: Runs a command and returns its result; a ControlError is the response when it was not done.
 Command: TypeAlias = Callable[[], Awaitable[object]]
 
-#: Bytes of a request, and seconds to send one: it is a line, and not from the network.
+#: Limits of a request in bytes, and in seconds to send it: it is one line of a local program.
 LONGEST_REQUEST = 64 * 1024
 REQUEST_TIMEOUT = 10.0
 
@@ -51,7 +51,7 @@ class Control:
         self._server: asyncio.Server | None = None
 
     async def start(self) -> None:
-        """Listen.
+        """Listen on the socket.
 
         Raises:
             OSError: another appliance listens there, or the folder cannot be written to.
@@ -63,7 +63,7 @@ class Control:
         )
 
     async def stop(self) -> None:
-        """Listen no more; may be called twice."""
+        """Stop listening; may be called twice."""
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -75,8 +75,8 @@ class Control:
             writer.write(json.dumps(answer).encode() + b"\n")
             await asyncio.wait_for(writer.drain(), REQUEST_TIMEOUT)
         except (OSError, asyncio.TimeoutError) as error:
-            log.debug("no answer could be given: %s", error)
-            writer.transport.abort()  # else the rest of it waits for a reader for ever
+            log.debug("the response could not be sent: %s", error)
+            writer.transport.abort()  # otherwise its rest would wait for a reader for ever
         except Exception as error:
             self._faults.caught("control.connection", error)
             writer.transport.abort()
@@ -105,11 +105,11 @@ class Control:
 
 
 def ask(path: Path, command: str, timeout: float = 30.0) -> Any:
-    """What the appliance that listens there answers to a command; waits up to `timeout` seconds.
+    """Send a command to the appliance that listens there, and return its result.
 
     Raises:
-        NotRunningError: none listens there.
-        ControlError: it answers that it could not do it, or does not answer.
+        NotRunningError: no appliance listens there.
+        ControlError: it could not do it, or did not respond within `timeout` seconds.
     """
     try:
         with _short(path) as short, socket.socket(socket.AF_UNIX) as connection:
@@ -137,7 +137,7 @@ def ask(path: Path, command: str, timeout: float = 30.0) -> Any:
 
 @contextmanager
 def _short(path: Path) -> Iterator[Path]:
-    """The same place by a path that is short enough for a Unix socket."""
+    """The same file by a path that is short enough for a Unix socket."""
     if len(os.fsencode(path)) <= LONGEST_PATH:
         yield path
         return

@@ -1,7 +1,8 @@
-"""What systemd is told of the service: sd_notify(3) and sd_watchdog_enabled(3), by a socket.
+"""Notifies systemd of the service's state: sd_notify(3) and sd_watchdog_enabled(3), by a socket.
 
-A message is a datagram of `NAME=value` lines to the Unix socket that NOTIFY_SOCKET names. Nothing
-here ever fails: without systemd nobody is told, and what systemd does not take is left out.
+A notification is a datagram of `NAME=value` lines to the Unix socket that NOTIFY_SOCKET names.
+Nothing here raises an error: without systemd there are no notifications, and one that systemd does
+not accept is dropped.
 """
 
 from __future__ import annotations
@@ -18,39 +19,39 @@ from appliance.net.callbacks import Entries, PeriodicCallback
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at what STATUS= is to say.
+#: Seconds between two updates of STATUS=.
 STATUS_INTERVAL = 10.0
 
-#: Characters of a line, which may take four bytes each: of datagrams with more than 4096 systemd
-#: takes nothing at all (NOTIFY_BUFFER_MAX), not even READY=1.
+#: Characters of a line, each of which may take four bytes: systemd ignores datagrams of more than
+#: 4096 bytes (NOTIFY_BUFFER_MAX), with the READY=1 in them.
 LONGEST_LINE = 900
 
-#: What systemd takes for a line's end, which in a value would begin another one, and the character
-#: with which it takes nothing of a datagram.
+#: Characters that would end a line within a value, and the null byte, for which systemd ignores the
+#: whole datagram.
 _ENDS = dict.fromkeys(map(ord, "\n\r\0"), " ")
 
-#: Seconds that a change of state may wait for systemd to take it; a sign of life never waits.
+#: Seconds that a change of state may wait for systemd to accept it; keep-alives never wait.
 PATIENCE = 1.0
 
 
 class Notifier:
-    """Tells systemd that the service is ready, reloads, stops, is alive, and how it is.
+    """Notifies systemd that the service is ready, reloads, stops and is alive, and of its status.
 
-    Belongs to the event loop's thread. `watchdog` is the silence in seconds after which systemd
-    takes the service for hung and restarts it, None when it does not.
+    Belongs to the event loop's thread. `watchdog` is the number of seconds without a keep-alive
+    after which systemd restarts the service, None when it never does.
     """
 
     def __init__(self, address: str | None = None, watchdog: float | None = None) -> None:
-        """`address` is a path, or a name behind `@` of an abstract socket; None tells nobody."""
+        """`address` is a path, `@` and the name of an abstract socket, or None for no systemd."""
         self.watchdog = watchdog if address else None
         self._socket = _connect(address) if address else None
         self._timer: PeriodicCallback | None = None
         self._status = ""
-        self._owes_ready = False
+        self._is_ready_pending = False
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str]) -> Notifier:
-        """As systemd has set the variables, which are taken out: they are not for our children."""
+        """Take systemd's variables out of the environment, as they are not for child processes."""
         address = environment.pop("NOTIFY_SOCKET", "")
         microseconds = environment.pop("WATCHDOG_USEC", "")
         watched = environment.pop("WATCHDOG_PID", "")
@@ -63,58 +64,58 @@ class Notifier:
     def start(
         self, entries: Entries, status: Callable[[], str], is_alive: Callable[[], bool]
     ) -> None:
-        """Tell that the service is ready; from now on, that it is alive, and what `status` says."""
+        """Notify that the service is ready, and from now on send keep-alives and the status."""
         self._status = status()
-        self._tell_ready(f"STATUS={self._status}")
+        self._notify_ready(f"STATUS={self._status}")
         if self._socket is None:
             return
-        # Half of it is what systemd asks for; one that is late, or lost, is not to be the end.
+        # systemd recommends half the time; with a quarter, one may be late or lost.
         interval = min(STATUS_INTERVAL, self.watchdog / 4 if self.watchdog else STATUS_INTERVAL)
-        looked = entries.time()
+        updated = entries.time()
 
         def beat() -> None:
-            nonlocal looked
+            nonlocal updated
             if self.watchdog and is_alive():
-                self._tell("WATCHDOG=1", wait=False)
-            if self._owes_ready:
-                self._tell_ready(wait=False)
-            if entries.time() >= looked + STATUS_INTERVAL:
-                looked = entries.time()
+                self._notify("WATCHDOG=1", wait=False)
+            if self._is_ready_pending:
+                self._notify_ready(wait=False)
+            if entries.time() >= updated + STATUS_INTERVAL:
+                updated = entries.time()
                 text = status()  # last: should it fail, the service still lives
-                if text != self._status and self._tell(f"STATUS={text}", wait=False):
+                if text != self._status and self._notify(f"STATUS={text}", wait=False):
                     self._status = text
 
         self._timer = entries.every("notify", interval, beat, 0)
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
-        """Tell that files are being taken over, and when that is done, well or not."""
-        # With Type=notify-reload (systemd 253) it waits for a RELOADING=1 later than its signal.
-        self._tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        """Notify that a reload begins, and that it has ended, whether it failed or not."""
+        # With Type=notify-reload (systemd 253) RELOADING=1 has to be later than systemd's signal.
+        self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
             yield
         finally:
-            self._tell_ready()
+            self._notify_ready()
 
     def stopping(self) -> None:
-        """Tell that the service ends because it was asked to."""
-        self._owes_ready = False
-        self._tell("STOPPING=1", "STATUS=stopping")
+        """Notify that the service ends because it was asked to."""
+        self._is_ready_pending = False
+        self._notify("STOPPING=1", "STATUS=stopping")
 
     def close(self) -> None:
-        """Tell nothing any more; may be called twice."""
+        """Send no more notifications; may be called twice."""
         if self._timer is not None:
             self._timer.cancel()
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    def _tell_ready(self, *lines: str, wait: bool = True) -> None:
-        """Now, or with a later sign of life: systemd waits for it, and then ends the service."""
-        self._owes_ready = not self._tell("READY=1", *lines, wait=wait)
+    def _notify_ready(self, *lines: str, wait: bool = True) -> None:
+        """Notify now, or with the next keep-alive: without READY=1 systemd ends the service."""
+        self._is_ready_pending = not self._notify("READY=1", *lines, wait=wait)
 
-    def _tell(self, *lines: str, wait: bool = True) -> bool:
-        """Returns whether systemd takes it."""
+    def _notify(self, *lines: str, wait: bool = True) -> bool:
+        """Send a datagram; returns whether systemd accepted it."""
         if self._socket is None:
             return False
         text = "\n".join(line[:LONGEST_LINE].translate(_ENDS) for line in lines)
@@ -122,14 +123,14 @@ class Notifier:
             self._socket.settimeout(PATIENCE if wait else 0)
             self._socket.send(text.encode(errors="replace"))
         except OSError as error:
-            log.debug("systemd was not told %s: %s", lines[0], error)
+            log.debug("systemd did not accept %s: %s", lines[0], error)
             return False
         return True
 
 
 def _connect(address: str) -> socket.socket | None:
-    if address[0] not in "/@":  # vsock:…, which tells a hypervisor
-        log.warning("NOTIFY_SOCKET is %s: only Unix sockets are told anything", address)
+    if address[0] not in "/@":  # vsock:…, for a hypervisor
+        log.warning("NOTIFY_SOCKET is %s: only Unix sockets are supported", address)
         return None
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:

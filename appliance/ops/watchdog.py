@@ -1,4 +1,4 @@
-"""Whether the broker works: what the watchdog is told depends on it."""
+"""The health check behind systemd's watchdog: whether the broker still delivers messages."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from appliance.net.scheduler import Scheduler
 
 log = logging.getLogger(__name__)
 
-#: Where the messages go; nobody subscribes, and nobody may publish there.
+#: The topic of the check's messages, which nobody may subscribe or publish to.
 TOPIC = "$appliance/pulse"
 
-#: Seconds that the broker's clock may stand still: it ticks once a second.
+#: Seconds after which the broker's clock has stopped: it ticks once a second.
 CLOCK_PATIENCE = 5.0
 
 
 class Pulse:
-    """Sends a message through a turn now and then, as a client's go, and looks at the clock.
+    """Publishes a message in a turn of the scheduler now and then, and checks the broker's clock.
 
-    An event loop that turns is not enough: it also does so when no turn comes and no will is sent.
-    `time` gives the seconds that `Broker.tick` is given.
+    That the event loop runs is not enough: it also does when the scheduler gives no turns and no
+    will is published. `time` is the clock that `Broker.tick` is called with.
     """
 
     def __init__(
@@ -33,37 +33,37 @@ class Pulse:
         self._scheduler = scheduler
         self._session = session
         self._time = time
-        #: Whether the last message is on its way, and whether one has gone through.
-        self._is_sent = self._came_through = False
-        #: What was last found to be wrong; None before it was asked for the first time.
+        #: Whether a turn is queued, and whether one has come since the last call of `is_alive`.
+        self._is_queued = self._has_passed = False
+        #: What the last call found, empty for nothing; None before the first call.
         self._problem: str | None = None
 
-    def is_there(self) -> bool:
-        """Whether a message has gone through a turn since this was last asked, and the clock goes.
+    def is_alive(self) -> bool:
+        """Whether the clock ticks and a message was published in a turn since the last call.
 
-        Tells the log when it is not so any more.
+        A new problem is logged.
         """
         problem = ""
         if self._time() - self._broker.ticked_at > CLOCK_PATIENCE:
             problem = "the broker's clock stands still"
-        elif not self._came_through:
+        elif not self._has_passed:
             problem = "no message has gone through a turn"
         if problem and self._problem not in (None, problem):
             log.error("no sign of life for the watchdog: %s", problem)
         self._problem = problem
-        self._came_through = False
-        if not self._is_sent:
-            self._is_sent = True
+        self._has_passed = False
+        if not self._is_queued:
+            self._is_queued = True
             self._scheduler.queue_turn(self)
         return not problem
 
     def take_turn(self) -> None:
-        """Its turn, as of any client that has much to do."""
-        self._is_sent = False
+        """See `scheduler`: a turn as that of any client with work to do."""
+        self._is_queued = False
         self._broker.publish(Message(TOPIC, b""), self._session)
         self._broker.flush()
-        self._came_through = True
+        self._has_passed = True
 
     def fault(self, entry: str, error: Exception) -> None:
-        """The turn went wrong: the next message says whether that was all."""
+        """Count the fault; the next turn shows whether it was the only one."""
         self._broker.faults.caught(entry, error, "the watchdog's message")

@@ -170,7 +170,7 @@ def test_a_flood_is_told_in_part_and_counted(tmp_path: Path) -> None:
 def test_what_waits_is_bounded_and_what_is_lost_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(audit_module, "WAITING", 100)
+    monkeypatch.setattr(audit_module, "QUEUE_LIMIT", 100)
     monkeypatch.setattr(audit_module, "RETRY", 0.01)
     monkeypatch.setattr(audit_module, "BURST", 10_000)
     path = tmp_path / "audit.log"

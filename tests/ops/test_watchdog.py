@@ -63,11 +63,11 @@ async def lives(pulse: Pulse) -> bool:
     """Asked as the watchdog's timer does: the loop has turned meanwhile."""
     for _ in range(5):
         await asyncio.sleep(0)
-    return pulse.is_there()
+    return pulse.is_alive()
 
 
 async def test_it_is_there_when_nothing_happens(pulse: Pulse, clock: Time):
-    assert not pulse.is_there()  # none has gone through yet
+    assert not pulse.is_alive()  # none has gone through yet
     for _ in range(10):
         clock.pass_by(1)
         assert await lives(pulse)
@@ -76,17 +76,17 @@ async def test_it_is_there_when_nothing_happens(pulse: Pulse, clock: Time):
 async def test_and_under_load(harness: Harness, pulse: Pulse, clock: Time):
     """Large messages take turn after turn; it has its own in between."""
     peers = [await harness.log_in(f"c{n}") for n in range(10)]
-    pulse.is_there()
+    pulse.is_alive()
     for peer in peers:
         peer.writer.write(Publish("x", bytes(3_000_000)).encode(5))
     await until(lambda: harness.scheduler._turn_queue, "somebody's turn")
     clock.pass_by(1)
-    await until(lambda: pulse._came_through, "the message to go through")
-    assert pulse.is_there()
+    await until(lambda: pulse._has_passed, "the message to go through")
+    assert pulse.is_alive()
 
 
 async def test_not_when_no_turn_comes(harness: Harness, pulse: Pulse, clock: Time, caplog):
-    pulse.is_there()
+    pulse.is_alive()
     assert await lives(pulse)
     harness.scheduler._schedule_turns = lambda: None  # type: ignore[method-assign]
     assert await lives(pulse)  # the last one went through before that
@@ -102,7 +102,7 @@ async def test_not_when_no_turn_comes(harness: Harness, pulse: Pulse, clock: Tim
 
 
 async def test_not_when_the_clock_stands_still(pulse: Pulse, clock: Time, caplog):
-    pulse.is_there()
+    pulse.is_alive()
     assert await lives(pulse)
     clock.pass_by(CLOCK_PATIENCE + 0.1, tick=False)
     assert not await lives(pulse)
@@ -114,7 +114,7 @@ async def test_not_when_the_clock_stands_still(pulse: Pulse, clock: Time, caplog
 async def test_a_turn_that_fails_is_no_sign_of_life(
     harness: Harness, pulse: Pulse, clock: Time, monkeypatch: pytest.MonkeyPatch, escaped
 ):
-    pulse.is_there()
+    pulse.is_alive()
     assert await lives(pulse)
     with monkeypatch.context() as broken:
         broken.setattr(harness.broker, "publish", None)
