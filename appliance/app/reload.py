@@ -178,7 +178,7 @@ class Reload:
         if parts.bridge is not None:
             parts.bridge.replace(ros_settings.routes(settings))
             parts.bridge.calls.replace(ros_settings.call_routes(settings))
-            parts.bridge.forget_leftovers()
+            parts.bridge.clean_up_retained()
         if before.log != settings.log:
             logs.setup(settings.log.level, settings.log.levels, settings.log.format)
         parts.broker.rules_changed()

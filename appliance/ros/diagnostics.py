@@ -1,4 +1,4 @@
-"""The bridge's say on `/diagnostics`: how the broker, the bridge and each of its routes are doing.
+"""Publishes on `/diagnostics` how the broker, the bridge and each of its routes are doing.
 
 Names, levels and keys are as diagnostic_aggregator and rqt_robot_monitor show them.
 """
@@ -22,13 +22,14 @@ TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
 log = logging.getLogger(__name__)
 
-_Told: TypeAlias = dict[str, dict[str, int]]
+#: The counts of the last report, by the name of the status.
+_Counts: TypeAlias = dict[str, dict[str, int]]
 
 # diagnostic_msgs/msg/DiagnosticStatus
 OK, WARN, ERROR = 0, 1, 2
 
-#: What makes a route a warning while it goes on, and what is said of it.
-_COMPLAINTS = (
+#: Counters whose growth makes a route's status a warning, and its message.
+_WARNINGS = (
     ("errors", "messages that could not be carried"),
     ("lost", "messages lost by ROS's middleware before they came here"),
     ("dropped", "messages dropped"),
@@ -38,7 +39,7 @@ _COMPLAINTS = (
 
 
 class StatusSource(Protocol):
-    """The bridge, as far as it is told of here."""
+    """The bridge, as far as it is reported on here."""
 
     @property
     def node_name(self) -> str:
@@ -48,46 +49,56 @@ class StatusSource(Protocol):
         """Every route's state and counters."""
 
 
+class DiagnosticsTopic:
+    """The publisher of `/diagnostics`; `output` is for the loop's thread, all else for the ROS
+    thread."""
+
+    def __init__(self, node: RosNode, converters: Converters, log_line: LogFunction) -> None:
+        self._node = node
+        self._converters = converters
+        self._log = log_line
+        self._was_opened = False
+        #: What to publish with, None without a bus; replaced as a whole by the ROS thread.
+        self.output: tuple[Converter, RosPublisher] | None = None
+
+    def poll_graph(self) -> None:
+        """Make the publisher, once each time the bus is joined."""
+        if self._was_opened:
+            return
+        self._was_opened = True
+        try:
+            converter = self._converters.get(TYPE)
+            self.output = converter, self._node.create_publisher(TOPIC, TYPE, QosProfile())
+        except (BusError, UnknownTypeError) as error:
+            self._log(logging.WARNING, "nothing is published on %s: %s", TOPIC, error)
+
+    def on_bus_lost(self) -> None:
+        """The bus is gone."""
+        self.output = None
+        self._was_opened = False
+
+
 class Diagnostics:
-    """Publishes a DiagnosticArray every `interval` seconds.
+    """Publishes a DiagnosticArray every `interval` seconds; for the loop's thread."""
 
-    `look` and `lost` are for the ROS thread, all else is for the event loop's.
-    """
-
-    def __init__(self, robot: str, broker: Broker, bridge: StatusSource, interval: float) -> None:
+    def __init__(
+        self,
+        robot: str,
+        broker: Broker,
+        bridge: StatusSource,
+        topic: DiagnosticsTopic,
+        interval: float,
+    ) -> None:
         self._robot = robot
         self._broker = broker
         self._bridge = bridge
+        self._topic = topic
         self._interval = interval
-        #: Replaced as one by the ROS thread.
-        self._out: tuple[Converter, RosPublisher] | None = None
-        self._has_looked = False
         self._timer: PeriodicCallback | None = None
-        #: What had been counted when it was last told, by the name of the status.
-        self._told: _Told = {}
-
-    # The ROS thread
-
-    def look(self, node: RosNode, converters: Converters, tell: LogFunction) -> None:
-        """Get ready to publish, once on each bus."""
-        if self._has_looked:
-            return
-        self._has_looked = True
-        try:
-            converter = converters.get(TYPE)
-            self._out = converter, node.create_publisher(TOPIC, TYPE, QosProfile())
-        except (BusError, UnknownTypeError) as error:
-            tell(logging.WARNING, "nothing is told on %s: %s", TOPIC, error)
-
-    def lost(self) -> None:
-        """The bus is gone."""
-        self._out = None
-        self._has_looked = False
-
-    # The loop's thread
+        self._reported: _Counts = {}
 
     def start(self, entries: Entries) -> None:
-        """Publish from now on, when there is ROS."""
+        """Publish from now on, while the bus is joined."""
         self._timer = entries.every("diagnostics", self._interval, self._tick)
 
     def stop(self) -> None:
@@ -97,11 +108,12 @@ class Diagnostics:
             self._timer = None
 
     def _tick(self) -> None:
-        if self._out is None:
+        output = self._topic.output
+        if output is None:
             return
-        converter, publisher = self._out
+        converter, publisher = output
         routes = self._bridge.status()
-        before, self._told = self._told, {}
+        before, self._reported = self._reported, {}
         statuses = [
             self._of_broker(before),
             self._of_bridge(routes),
@@ -112,7 +124,7 @@ class Diagnostics:
         except (BusError, ConversionError) as error:
             log.debug("%s: %s", TOPIC, error)
 
-    def _of_broker(self, before: _Told) -> dict[str, Any]:
+    def _of_broker(self, before: _Counts) -> dict[str, Any]:
         broker = self._broker
         counters = broker.counters
         counts = {
@@ -140,7 +152,7 @@ class Diagnostics:
         values = {"node": self._bridge.node_name, "routes": len(routes), "topics bridged": topics}
         return self._status("bridge", OK, f"topics bridged: {topics}", values)
 
-    def _of_routes(self, routes: list[RouteStatus], before: _Told) -> Iterator[dict[str, Any]]:
+    def _of_routes(self, routes: list[RouteStatus], before: _Counts) -> Iterator[dict[str, Any]]:
         known: dict[str, int] = {}
         for route in routes:
             arrow = "to MQTT" if route.direction == "to_mqtt" else "to ROS"
@@ -150,9 +162,9 @@ class Diagnostics:
                 name += f" ({known[name]})"
             yield self._of_route(name, route, before)
 
-    def _of_route(self, name: str, route: RouteStatus, before: _Told) -> dict[str, Any]:
-        grown = self._grown(name, {key: getattr(route, key) for key, _ in _COMPLAINTS}, before)
-        complaints = [f"{text}: {grown[key]}" for key, text in _COMPLAINTS if grown[key]]
+    def _of_route(self, name: str, route: RouteStatus, before: _Counts) -> dict[str, Any]:
+        grown = self._grown(name, {key: getattr(route, key) for key, _ in _WARNINGS}, before)
+        complaints = [f"{text}: {grown[key]}" for key, text in _WARNINGS if grown[key]]
         if complaints:
             level, message = WARN, ", ".join(complaints)
         elif route.topics:
@@ -190,8 +202,8 @@ class Diagnostics:
                 values["commanded by"] = ", ".join(holders) or "nobody"
         return self._status(name, level, message, values)
 
-    def _grown(self, name: str, counts: dict[str, int], before: _Told) -> dict[str, int]:
-        self._told[name] = counts
+    def _grown(self, name: str, counts: dict[str, int], before: _Counts) -> dict[str, int]:
+        self._reported[name] = counts
         # A route that was replaced counts anew.
         last = before.get(name, counts)
         return {key: max(0, count - last[key]) for key, count in counts.items()}

@@ -1,32 +1,38 @@
-"""Retained messages of routes that there are no more: nobody would ever take them back."""
+"""Deletes retained messages of routes that were removed: nobody else ever would."""
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
+from appliance.net.callbacks import Entries
 from appliance.ros.calls.routes import CallRoutes
 from appliance.ros.patterns import Names
 from appliance.ros.topics.flow import TopicSettings
+
+log = logging.getLogger(__name__)
 
 _OF_ACTION = re.compile(r"/(_status|_result/[^/]+)\Z")
 _PARAMETER = "/_param/"
 
 
 def is_of_route(message: Message) -> bool:
-    """Whether a message that the appliance has retained came over a route, once."""
+    """Whether a message that the appliance has retained came from a route."""
     if "/_appliance/" in message.topic:
         return False
-    told = (message.properties or {}).get(Property.USER_PROPERTY, [])
-    entries = told if isinstance(told, list) else []
+    pairs = (message.properties or {}).get(Property.USER_PROPERTY, [])
+    entries = pairs if isinstance(pairs, list) else []
     names = [entry[0] for entry in entries if isinstance(entry, tuple)]
     return "ros-type" in names or _PARAMETER in message.topic
 
 
 class TopicOwners:
-    """The routes that there are now, and which topics may still be theirs."""
+    """Knows which topics the present routes may publish on."""
 
     def __init__(self, routes: Iterable[TopicSettings], calls: CallRoutes) -> None:
         self._topics = [
@@ -40,7 +46,7 @@ class TopicOwners:
         ]
 
     def has(self, topic: str) -> bool:
-        """Whether it may be the topic of a route, be its ROS node there or not."""
+        """Whether it may be the topic of a route, whether or not its ROS node is there."""
         if any(template.name(topic) is not None for template in self._topics):
             return True
         above, is_action = _OF_ACTION.subn("", topic)
@@ -54,6 +60,56 @@ class TopicOwners:
         return False
 
 
+class RetainedCleanup:
+    """Deletes the retained messages that no route owns any more; for the loop's thread.
+
+    The retained messages are gone through in steps, so that other callbacks have their turn.
+    """
+
+    def __init__(self, broker: Broker, entries: Entries) -> None:
+        self._broker = broker
+        self._entries = entries
+        self._owners: TopicOwners | None = None
+
+    def start(self, session: Session, owners: TopicOwners) -> None:
+        """Delete what is not theirs; a cleanup that is still going on for other owners ends."""
+        self._owners = owners
+        self._step(session, owners, self._broker.retained.find_in_steps("#"), 0)
+
+    def stop(self) -> None:
+        """Delete nothing any more."""
+        self._owners = None
+
+    def _step(
+        self,
+        session: Session,
+        owners: TopicOwners,
+        steps: Iterator[tuple[str, Message] | None],
+        count: int,
+    ) -> None:
+        if owners is not self._owners:  # the routes have changed again
+            return
+        retained = self._broker.retained
+        orphans = []
+        has_more = False
+        for found in steps:
+            if found is None:
+                has_more = True
+                break
+            topic, message = found
+            is_ours = retained.owner(topic).is_inside and is_of_route(message)
+            if is_ours and not owners.has(topic):
+                orphans.append(topic)
+        for topic in orphans:  # not while iterating over the retained messages
+            self._broker.publish(Message(topic, b"", 0, True), session)
+        count += len(orphans)
+        if has_more:
+            self._entries.soon("bridge.sweep", self._step, session, owners, steps, count)
+        elif count:
+            log.info("retained messages of routes that are gone, taken back: %d", count)
+        self._broker.flush()
+
+
 class _Template:
     """The MQTT topic of a route, in which a placeholder may stand for the ROS name."""
 
@@ -63,7 +119,7 @@ class _Template:
         self._only = names[0] if len(names) == 1 and "*" not in names[0] else None
 
     def name(self, topic: str) -> str | None:
-        """The ROS name that the topic is for; None when it is of another route."""
+        """The ROS name that the topic is for; None when it belongs to another route."""
         match = self._pattern.fullmatch(topic)
         if match is None:
             return None

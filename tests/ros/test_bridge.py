@@ -16,8 +16,9 @@ from waiting import until
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
-from appliance.ros.bridge import THOROUGH_LOOK, Bridge, BridgedTopic, TopicSettings
+from appliance.ros.bridge import Bridge, BridgedTopic, TopicSettings
 from appliance.ros.calls.routes import ParameterSettings
+from appliance.ros.graph_follower import THOROUGH_POLL
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, Reliability
 from appliance.ros.topics.flow import BridgeRoute, EchoFilter
@@ -766,8 +767,8 @@ async def test_a_bus_that_comes_back_is_joined_again(harness, monkeypatch):
 
 async def test_another_node_of_the_same_name_is_told_once(harness, caplog, monkeypatch):
     """Two bridges on one domain carried everything twice, and nothing said so."""
-    monkeypatch.setattr("appliance.ros.bridge.COUNTED_LOOK", 1)
-    monkeypatch.setattr("appliance.ros.bridge.TWIN_LOOKS", 3)
+    monkeypatch.setattr("appliance.ros.graph_follower.NODE_COUNT_POLL", 1)
+    monkeypatch.setattr("appliance.ros.bridge.TWIN_COUNTS", 3)
     harness.start(to_mqtt("/a"))
     name = harness.node.name
 
@@ -962,7 +963,7 @@ async def test_what_the_middleware_lost_is_counted_with_the_route(harness):
     harness.node.add_publisher("/chatter", STRING)
     await until(lambda: harness.node.subscriptions)
     harness.node.subscriptions[0].lost = 88
-    for _ in range(THOROUGH_LOOK):
+    for _ in range(THOROUGH_POLL):
         harness.node.spin()
     assert harness.bridge.status()[0].lost == 88
     assert harness.bridge.topics()[0].lost == 88

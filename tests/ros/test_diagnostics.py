@@ -164,7 +164,7 @@ async def test_without_the_message_type_there_is_one_warning(harness, caplog):
         await asyncio.sleep(0.05)
     told = [r.getMessage() for r in caplog.records if "/diagnostics" in r.getMessage()]
     assert told == [
-        "nothing is told on /diagnostics: no diagnostic_msgs/msg/DiagnosticArray: "
+        "nothing is published on /diagnostics: no diagnostic_msgs/msg/DiagnosticArray: "
         "the package diagnostic_msgs is not installed here"
     ]
 

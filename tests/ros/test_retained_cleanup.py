@@ -48,7 +48,7 @@ async def test_at_a_reload(harness, caplog):
     await until(lambda: others(harness) == ["r2d2/camera/a", "r2d2/map"])
     harness.client.received.clear()
     harness.bridge.replace([to_mqtt("/camera/*")])
-    harness.bridge.forget_leftovers()
+    harness.bridge.clean_up_retained()
     harness.node.spin()
     await until(lambda: others(harness) == ["r2d2/camera/a"])
     assert harness.client.payloads("r2d2/map") == [b""], "who subscribes is told that it is gone"

@@ -155,10 +155,10 @@ class Commands(ToRos):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: LogFunction,
+        log: LogFunction,
         around: ToRosContext,
     ) -> None:
-        super().__init__(route, ros, converters, tell, around)
+        super().__init__(route, ros, converters, log, around)
         assert route.settings.rules is not None
         self.rules: CommandRules = route.settings.rules
         #: Both replaced as one by the ROS thread.
@@ -194,8 +194,8 @@ class Commands(ToRos):
 
     # The ROS thread
 
-    def look(self, node: RosNode, thorough: bool) -> bool:
-        has_changed = super().look(node, thorough)
+    def poll_graph(self, node: RosNode, thorough: bool) -> bool:
+        has_changed = super().poll_graph(node, thorough)
         if self._looks < LOOKS_TO_MATCH and self._out is not None and node.count(self.ros)[1]:
             self._looks += 1
             if self._looks == LOOKS_TO_MATCH:
@@ -633,7 +633,7 @@ class Commands(ToRos):
         if is_free and origin is not None and origin.link and not self.stops(cdr):
             lease.holder = origin
             self._around.broker.guards_changed()
-            self._tell(logging.INFO, "%s: %s commands now, alone", self, origin)
+            self._log(logging.INFO, "%s: %s commands now, alone", self, origin)
         if origin is lease.holder:
             lease.heard_at = now
         # Also when it waits for something later: a lease that began with zeros, or another's.
@@ -672,7 +672,7 @@ class Commands(ToRos):
     def _release(self, why: str) -> None:
         holder, self._lease.holder = self._lease.holder, None
         self._around.broker.guards_changed()
-        self._tell(logging.INFO, "%s: %s %s and commands no more", self, holder, why)
+        self._log(logging.INFO, "%s: %s %s and commands no more", self, holder, why)
 
     # Silence
 
@@ -869,4 +869,4 @@ class Commands(ToRos):
         now = self._around.entries.time()
         if now >= self._told.get(what, -math.inf):
             self._told[what] = now + REPORT_INTERVAL
-            self._tell(level, text, self, *args)
+            self._log(level, text, self, *args)

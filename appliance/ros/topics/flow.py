@@ -36,7 +36,7 @@ REPORT_INTERVAL = 60.0
 ECHO_TIME = 2.0
 ECHO_SAMPLES = 1000
 
-_TURNS = itertools.count()
+_NUMBERS = itertools.count()
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ class Flow(ABC):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: LogFunction,
+        log: LogFunction,
     ) -> None:
         self.route = route
         self.settings = settings = route.settings
@@ -191,11 +191,11 @@ class Flow(ABC):
         self.meter = Meter()
         self.bridged: BridgedTopic | None = None
         #: A number of its own: of so many flows, not all take their time at the same look.
-        self.turn = next(_TURNS)
+        self.number = next(_NUMBERS)
         #: Whether a pattern found the topic: it is then bridged while it has other ends.
         self.is_matched = route.is_pattern
         self._converters = converters
-        self._tell = tell
+        self._log = log
         self._count: tuple[int, int] | None = None
         #: Type, QoS and type hash that were last set up, or refused.
         self._wanted: tuple[str, QosProfile, str | None] | None = None
@@ -206,7 +206,7 @@ class Flow(ABC):
         self._foreign: set[str] = set()
         self._report_at = 0.0
 
-    def look(self, node: RosNode, thorough: bool) -> bool:
+    def poll_graph(self, node: RosNode, thorough: bool) -> bool:
         """Follow the graph; True when what is bridged has changed.
 
         The endpoints are asked for only when their number has changed, or the look is thorough.
@@ -233,7 +233,7 @@ class Flow(ABC):
             type_name = known
         else:
             return False
-        self._tell_foreign(found - {type_name}, type_name)
+        self._log_foreign(found - {type_name}, type_name)
         endpoints = [endpoint for endpoint in endpoints if endpoint.type == type_name]
         if not endpoints and self._wanted is not None and self._wanted[0] == type_name:
             return False  # they have left; all stays as it is for their return
@@ -265,13 +265,13 @@ class Flow(ABC):
             problem = self.counters.last_error = str(error)
             if problem != self._problem:
                 self._problem = problem
-                self._tell(logging.ERROR, "%s is not bridged: %s", self, problem)
+                self._log(logging.ERROR, "%s is not bridged: %s", self, problem)
             return
         self._problem = None
         self.bridged = BridgedTopic(self.ros, self.mqtt, type_name, self.direction, encoding)
-        self._tell(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
+        self._log(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 
-    def begin_anew(self, problem: str) -> None:
+    def reset(self, problem: str) -> None:
         """A fault: what was set up is closed, and the next look sets it up again."""
         self._problem = self.counters.last_error = problem
         self._wanted, self._is_due = None, True
@@ -296,11 +296,11 @@ class Flow(ABC):
         type_name = self.settings.type or ""
         return [Skipped(self.ros, self.direction, type_name, "absent", self.absence)]
 
-    def _tell_foreign(self, types: set[str], chosen: str) -> None:
+    def _log_foreign(self, types: set[str], chosen: str) -> None:
         if types != self._foreign:
             self._foreign = types
             for name in sorted(types):
-                self._tell(
+                self._log(
                     logging.WARNING,
                     "%s carries %s; the %s that is there too is left out",
                     self,
@@ -311,19 +311,19 @@ class Flow(ABC):
     def fail(self, problem: str) -> None:
         """Count a message that could not be carried, and say so once a minute."""
         self.counters.errors += 1
-        self._tell_uncarried(problem, self.counters.errors)
+        self._log_uncarried(problem, self.counters.errors)
 
     def refuse(self, problem: str) -> None:
         """Count a message that the route's rules forbid, and say so once a minute."""
         self.counters.refused += 1
-        self._tell_uncarried(problem, self.counters.refused)
+        self._log_uncarried(problem, self.counters.refused)
 
-    def _tell_uncarried(self, problem: str, count: int) -> None:
+    def _log_uncarried(self, problem: str, count: int) -> None:
         self.counters.last_error = problem
         now = monotonic()
         if now >= self._report_at:
             self._report_at = now + REPORT_INTERVAL
-            self._tell(
+            self._log(
                 logging.WARNING,
                 "%s: a message %s (%d so far)",
                 self,
@@ -350,7 +350,7 @@ class Flow(ABC):
     def close(self) -> None:
         """Carry nothing any more."""
 
-    def lost(self) -> None:
+    def on_bus_lost(self) -> None:
         """The bus is gone, and with it all that was set up."""
         self.bridged = self._count = self._wanted = None
 

@@ -36,12 +36,12 @@ class ToMqtt(Flow):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: LogFunction,
+        log: LogFunction,
         mailbox: Mailbox,
         publish: Callable[[Iterable[tuple[Lane, Message]]], None],
     ) -> None:
         """`publish` is how messages leave that are on the loop's thread already."""
-        super().__init__(route, ros, converters, tell)
+        super().__init__(route, ros, converters, log)
         settings = route.settings
         self.echo: EchoFilter | None = None
         self._mailbox = mailbox
@@ -118,16 +118,16 @@ class ToMqtt(Flow):
             self._subscription.destroy()
             self._subscription = None
 
-    def look(self, node: RosNode, thorough: bool) -> bool:
-        has_changed = super().look(node, thorough)
+    def poll_graph(self, node: RosNode, thorough: bool) -> bool:
+        has_changed = super().poll_graph(node, thorough)
         if thorough and self._subscription is not None:
             self.counters.lost += self._subscription.take_lost()
         if self._held is not None:
             self._catch_up(monotonic())
         return has_changed
 
-    def lost(self) -> None:
-        super().lost()
+    def on_bus_lost(self) -> None:
+        super().on_bus_lost()
         self._send_held()
         self._subscription = self._transforms = None
 

@@ -57,10 +57,10 @@ class ToRos(Flow):
         route: BridgeRoute,
         ros: str,
         converters: Converters,
-        tell: LogFunction,
+        log: LogFunction,
         around: ToRosContext,
     ) -> None:
-        super().__init__(route, ros, converters, tell)
+        super().__init__(route, ros, converters, log)
         self._around = around
         self._is_left = True
         self.echo: EchoFilter | None = None
@@ -105,8 +105,8 @@ class ToRos(Flow):
         if before is not None:
             before[1].destroy()
 
-    def lost(self) -> None:
-        super().lost()
+    def on_bus_lost(self) -> None:
+        super().on_bus_lost()
         self._out = None
 
     @property
@@ -148,7 +148,7 @@ class ToRos(Flow):
             return None
         if self._lease.is_overtaken(number, origin):  # while it waited for its turn
             self.counters.expired += 1
-            self._tell_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
+            self._log_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
             return None
         cdr = self._convert(message, origin)
         return (

@@ -1696,7 +1696,7 @@ async def test_a_large_queue_behind_connect(harness):
     driver.drive(large(0.2))
     await until(lambda: harness.counters().expired == 2)
     single = Driver(harness.broker, "b")
-    await until(lambda: not harness.bridge._turns.is_busy)
+    await until(lambda: not harness.bridge._conversions.is_busy)
     make_busy(harness)
     single.drive(large(0.3))
     await until(lambda: harness.robot.received == [twist(0.3)])
@@ -1710,7 +1710,7 @@ async def test_a_stop_is_heard_whoever_has_filled_the_queue(harness, has_own, pa
     loader, driver = Driver(harness.broker, "loader"), Driver(harness.broker, "a")
     if has_own:
         driver.steer(large(0.2))
-    turns = harness.bridge._turns
+    turns = harness.bridge._conversions
     session = loader.client.session
     for size in (1_000_000, 50_000, 1100):
         while turns.has_room(session, size + 100):
@@ -1735,7 +1735,7 @@ async def test_what_may_become_large_is_not_converted_out_of_turn(harness, monke
     harness.start(CommandRules(expire=5.0, on_silence=OnSilence(5.0)), compression="zstd")
     make_busy(harness)
     driver = Driver(harness.broker, "a")
-    monkeypatch.setattr(harness.bridge._turns, "has_room", lambda *_: False)
+    monkeypatch.setattr(harness.bridge._conversions, "has_room", lambda *_: False)
     monkeypatch.setattr(harness.commands, "_read", lambda *_: pytest.fail("it was converted"))
     huge = b"{}" + b" " * 1_000_000
     silent = ZstdCompressor(write_content_size=False).compress(b"{}")
@@ -2275,7 +2275,7 @@ async def test_a_single_command_behind_one_that_was_dropped(harness, monkeypatch
     if way.endswith("reload"):
         bridge.replace([TopicSettings("/cmd_vel", "ros", TOPIC, TWIST, rules=FRESH)])
         harness.node.spin()
-        await until(lambda: not bridge._turns.is_busy)
+        await until(lambda: not bridge._conversions.is_busy)
     elif way.endswith("overtaken"):
         stop_beside(other, properties=made(0))
         await until(lambda: total(harness, "expired") == 1)
@@ -2318,7 +2318,7 @@ async def test_a_qos_2_command_that_is_refused_is_counted_once(
         driver.drive(payload + b" " * size, qos=2)
     driver.say(Pubrel(7))
     await until(lambda: getattr(harness.counters(), counter))
-    await until(lambda: not harness.bridge._turns.is_busy)
+    await until(lambda: not harness.bridge._conversions.is_busy)
     counters = harness.counters()
     assert (counters.refused, counters.errors, counters.expired) == tuple(
         int(name == counter) for name in ("refused", "errors", "expired")
@@ -2366,7 +2366,7 @@ async def test_an_idle_stick_overtakes_no_command_of_others(harness, size, stick
         one.say(REPEATED)
     for number in range(3):
         driver = Driver(harness.broker, f"driver {number}")
-        await until(lambda: not harness.bridge._turns.is_busy)
+        await until(lambda: not harness.bridge._conversions.is_busy)
         if size:
             make_busy(harness)
             for one in idle:  # what moved the robot came before
