@@ -54,7 +54,7 @@ INLINE = {
     "actions.look": ("ros.calls.action_topics", "ActionSubscriptions", "poll_graph", "poll_graph"),
     "app.certificates": ("app.main", "", "keep_server_certificate", ""),
     "app.reload": ("app.main", "App", "reload", "_try_reload"),
-    "bridge.look": ("ros.topics.flow", "Flow", "look", ""),
+    "bridge.look": ("ros.topics.flow", "Flow", "poll_graph", ""),
     "bridge.message": ("broker.broker", "Broker", "publish", "ros/bridge.py:_publish"),
     "bridge.receive": ("ros.topics.to_ros", "ToRos", "receive", "_hand_over"),
     "broker.delivery": ("broker.session", "Session", "deliver", "publish_to"),
