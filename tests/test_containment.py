@@ -471,7 +471,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is waited for comes soon."""
     for module, name, value in (
         (app_module, "TICK", 0.05),
-        (app_module, "BESIDE_AGAIN", 0.05),
+        (app_module, "TASK_RESTART_DELAY", 0.05),
         (wire, "SLOW_AFTER", 0.05),
         (wire, "REVOKED_TIMEOUT", 0.05),
         (lingering, "TIMEOUT", 0.2),
@@ -690,7 +690,7 @@ async def _beside(site: Site, patch: pytest.MonkeyPatch) -> None:
             raise SabotageError
         await asyncio.Event().wait()
 
-    site.app._beside(work)
+    site.app._run_in_background(work)
 
 
 @reach("websocket.made")

@@ -56,18 +56,17 @@ from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two ticks of the broker's clock, the grain of keep alive and expiry; fewer when
-#: a will or a session falls due before, but never fewer than the second of these.
+#: Seconds between two ticks of the broker's clock: the resolution of keep alive and expiry. A will
+#: or a session that is due sooner shortens one, but not below SHORTEST_TICK.
 TICK = 1.0
 SHORTEST_TICK = 0.01
 
-#: Objects that are made before Python looks for garbage among them, some 0.2 ms of work; and how
-#: often it has to have done so, in tens, before it looks through those that have grown old.
+#: Thresholds of Python's garbage collector: new objects per collection of the youngest generation,
+#: which takes some 0.2 ms, and a threshold that the oldest generation never reaches.
 YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
 
-
-#: What keeps the appliance from starting and a user can mend; each says what and how.
+#: Errors that prevent the start and that a user can fix; each message says how.
 START_ERRORS = (
     AccessFileError,
     AuditError,
@@ -77,19 +76,18 @@ START_ERRORS = (
     StoreError,
 )
 
-#: Seconds between two looks at the server's certificate, this computer's names and addresses, and
-#: the certificates of who is connected; and after which the log is told again of what has run out
-#: or does soon.
+#: Seconds between two checks of the server's certificate, this computer's names and addresses, and
+#: the certificates of connected clients; and between two warnings in the log about the same
+#: certificate that has expired or will soon.
 CERTIFICATE_CHECK = 300.0
 CERTIFICATE_WARNING = 86400.0
 
-
-#: Seconds until what runs beside everything else begins again, when it failed.
-BESIDE_AGAIN = 5.0
+#: Seconds until a background task is restarted after it failed.
+TASK_RESTART_DELAY = 5.0
 
 
 class App:
-    """The whole appliance, on the running event loop."""
+    """The whole appliance; it runs on the current event loop."""
 
     def __init__(
         self,
@@ -108,13 +106,13 @@ class App:
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
-        #: A SIGHUP came during the start.
-        self._reload_waits = asyncio.Event()
+        #: Set when a SIGHUP came during the start, before a reload was possible.
+        self._reload_requested = asyncio.Event()
         self._certificates_due = asyncio.Event()
         self._status: status.Status | None = None
 
     async def start(self) -> None:
-        """Start everything, or nothing.
+        """Start all parts; when one fails, stop those that run.
 
         Raises:
             AccessFileError, CertificateError: a file is missing or wrong.
@@ -205,9 +203,9 @@ class App:
             )
         )
         if tls is not None:
-            self._beside(partial(self._keep_certificates, tls))
+            self._run_in_background(partial(self._renew_certificates, tls))
         if settings.file is not None:
-            await self._open_to_commands()
+            await self._open_control_socket()
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
@@ -223,29 +221,29 @@ class App:
         self._stack.push_async_callback(store.close)
         return store
 
-    def _beside(self, work: Callable[[], Coroutine[object, object, None]]) -> None:
-        """Run this beside everything else, until the stop; when it fails it begins again."""
+    def _run_in_background(self, work: Callable[[], Coroutine[object, object, None]]) -> None:
+        """Run a task until the appliance stops; a failed task is reported and restarted."""
 
-        async def go_on() -> None:
+        async def restart_forever() -> None:
             while True:
                 try:
                     await work()
                 except Exception as error:
                     self.broker.faults.caught("app.beside", error)
-                await asyncio.sleep(BESIDE_AGAIN)
+                await asyncio.sleep(TASK_RESTART_DELAY)
 
-        task = self._entries.task("app.task", go_on())
+        task = self._entries.task("app.task", restart_forever())
 
         async def end() -> None:
-            while not task.done():  # up to Python 3.11 `wait_for` may lose a cancellation
+            while not task.done():  # up to Python 3.11, `wait_for` can lose a cancellation
                 task.cancel()
                 await asyncio.wait({task}, timeout=1)
 
         self._stack.push_async_callback(end)
 
-    async def _keep_certificates(self, tls: TlsContexts) -> None:
-        """Renew the server's certificate when that is due, and tell of what has run out."""
-        told: dict[str, float] = {}
+    async def _renew_certificates(self, tls: TlsContexts) -> None:
+        """Renew the server's certificate when it is due, and warn of certificates that expire."""
+        logged_at: dict[str, float] = {}
         due = self._certificates_due
         loop = asyncio.get_running_loop()
         reason = ""
@@ -262,19 +260,21 @@ class App:
             except Exception as error:
                 self.broker.faults.caught("app.certificates", error)
             now = loop.time()
-            told = {text: at for text, at in told.items() if now - at < CERTIFICATE_WARNING}
+            logged_at = {
+                text: at for text, at in logged_at.items() if now - at < CERTIFICATE_WARNING
+            }
             for text in (*problems, *tls.warnings()):
-                if text not in told:
-                    told[text] = now
+                if text not in logged_at:
+                    logged_at[text] = now
                     log.warning("%s", text)
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
             due.clear()
-            # Clients' certificates run out, too.
+            # Clients' certificates expire, too.
             await self._listeners.check_certificates()
 
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Join the bus in the background: MQTT answers before ROS is there, and without it."""
+        """Join the ROS bus in the background: MQTT does not wait for ROS."""
         settings = self.settings
         if settings.bridge.bus == "none":
             return
@@ -284,9 +284,9 @@ class App:
         if bridge.bus == "ros1":
             node = Ros1Node(bridge.node, bridge.namespace, arguments)
         else:
-            unheeded = discovery.use(bridge.discovery, os.environ)
-            if unheeded:
-                log.warning("%s", unheeded)
+            warning = discovery.use(bridge.discovery, os.environ)
+            if warning:
+                log.warning("%s", warning)
             node = Ros2Node(
                 bridge.node, bridge.namespace, bridge.domain_id, arguments, bridge.use_sim_time
             )
@@ -303,7 +303,7 @@ class App:
         self.bridge.start()
 
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Tick once a second; publish `$SYS` every `broker.sys_interval`."""
+        """Tick every TICK seconds; publish `$SYS` every `broker.sys_interval`."""
         process = psutil.Process()
         sys_topics = SysTopics(
             self.broker, version("ros-mqtt-appliance"), lambda: process.memory_info().rss
@@ -313,7 +313,7 @@ class App:
         steps = StepWatch(loop.time())
         run = self.broker.faults.run
 
-        def look_at_clock(now: float) -> None:
+        def check_clock(now: float) -> None:
             step = steps.look(now)
             if step:
                 self._clock_was_set(step)
@@ -325,7 +325,7 @@ class App:
         def tick() -> float:
             nonlocal next_sys
             now = loop.time()
-            run("clock.step", look_at_clock, now, otherwise=None)
+            run("clock.step", check_clock, now, otherwise=None)
             due = run("clock.broker", self.broker.tick, now, otherwise=now + TICK)
             if self._status is not None:
                 run("clock.status", self._status.tick, now, otherwise=None)
@@ -337,7 +337,7 @@ class App:
         self._stack.callback(self._entries.every("clock", TICK, tick).cancel)
 
     def _clock_was_set(self, step: float) -> None:
-        """The wall clock says something else; only dates depend on it."""
+        """The wall clock was set: only dates depend on it, so certificates are checked again."""
         text = f"the computer's clock was set {'forward' if step > 0 else 'back'} by "
         text += f"{timedelta(seconds=round(abs(step)))}"
         log.warning("%s, or the computer slept: nothing expires by that", text)
@@ -351,21 +351,22 @@ class App:
         self.broker.flush()
 
     async def stop(self) -> None:
-        """Stop everything, in reverse order; may be called twice."""
+        """Stop all parts in reverse order; may be called twice."""
         await self._stack.aclose()
 
     async def run(self) -> None:
         """Start, run until SIGTERM or SIGINT (or `request_stop`), stop."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.request_stop)  # sets an event, and no more
-        # It would end the process; the start goes on with the files that it has read.
-        loop.add_signal_handler(signal.SIGHUP, self._reload_waits.set)
+            loop.add_signal_handler(number, self.request_stop)  # it only sets an event
+        # Unhandled, SIGHUP would end the process. The start goes on with the files it has read; the
+        # reload follows.
+        loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)
         await self.start()
         self._entries.signal("signal.reload", signal.SIGHUP, self._on_hangup)
-        if self._reload_waits.is_set():
+        if self._reload_requested.is_set():
             self._on_hangup()
-        # MQTT answers, and ROS may come when it likes: whoever waits for this waits no longer.
+        # Report readiness now that MQTT answers: the bridge joins ROS whenever ROS is there.
         assert self._status is not None
         pulse = Pulse(self.broker, self._listeners.scheduler, self._inside, loop.time)
         self._notifier.start(self._entries, self._status.line, pulse.is_alive)
@@ -377,12 +378,12 @@ class App:
             await self.stop()
 
     async def reload(self) -> list[str]:
-        """Take over all files as they are now; see `Reload.run`."""
+        """Apply the files as they are now; see `Reload.run`."""
         with self._notifier.reloading():
             return await self._reload.run()
 
     async def _try_reload(self) -> None:
-        with contextlib.suppress(ReloadError):  # the log was told
+        with contextlib.suppress(ReloadError):  # it was logged
             try:
                 await self.reload()
             except (ReloadError, asyncio.CancelledError):
@@ -398,19 +399,19 @@ class App:
             changed = await self.reload()
         except ReloadError as error:
             raise ControlError(f"nothing was reloaded: {error}") from None
-        if not changed and self._reload.last_change:  # mostly by itself, before anybody could ask
+        if not changed and self._reload.last_change:  # the file watcher was probably faster
             return [f"nothing has changed since the last reload, {self._reload.last_change}"]
         return changed
 
     async def _answer_routes(self) -> list[dict[str, object]]:
-        bridge = self._bridge_that_runs()
+        bridge = self._running_bridge()
         topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
         return topics + [dict(entry) for entry in bridge.calls.bridged()]
 
     async def _answer_skipped(self) -> list[dict[str, object]]:
-        return [asdict(skip) for skip in self._bridge_that_runs().skips()]
+        return [asdict(skip) for skip in self._running_bridge().skips()]
 
-    def _bridge_that_runs(self) -> Bridge:
+    def _running_bridge(self) -> Bridge:
         if self.bridge is None:
             raise ControlError("there is no bridge (bridge.bus is none)")
         if self.bridge.problem is not None:
@@ -419,10 +420,10 @@ class App:
 
     async def _answer_status(self) -> dict[str, object]:
         assert self._status is not None
-        return await self._status.tell()
+        return await self._status.report()
 
-    async def _open_to_commands(self) -> None:
-        """Answer commands of this computer, and follow the files."""
+    async def _open_control_socket(self) -> None:
+        """Answer commands such as `appliance status`, and watch the files for changes."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         commands = {
@@ -435,26 +436,26 @@ class App:
         try:
             await control.start()
         except OSError as error:
-            # MQTT does without, and a robot's disk that has errors is mounted read-only.
+            # Go on without it: a robot's disk with errors is mounted read-only.
             if error.errno not in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
                 raise
             log.error("`appliance status`, `reload` and `routes` are not answered: %s", error)
         self._stack.push_async_callback(control.stop)
         if settings.reload_on_change:
-            self._beside(partial(watch, self._reload.files, self._try_reload))
+            self._run_in_background(partial(watch, self._reload.files, self._try_reload))
 
     def request_stop(self) -> None:
-        """Let `run` end."""
+        """Make `run` return."""
         self._stopping.set()
 
 
 def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
-    """Run the appliance until it is told to stop; returns the exit code of the command.
+    """Run the appliance until a signal stops it; returns the exit code of the command.
 
-    `ros_arguments` are those that stood behind `--ros-args`; they come after the configuration's.
+    `ros_arguments` are those behind `--ros-args`; they come after those of the configuration.
     """
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until `App.run` knows it: it would end us
-    _spare_the_old()
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until `App.run` handles it: it would end us
+    _tune_garbage_collector()
     notifier = Notifier.from_environment(os.environ)
     crashes = CrashReports(settings.crash_reports, settings)
     crashes.start()
@@ -471,12 +472,13 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
     return 0
 
 
-def _spare_the_old() -> None:
-    """Let Python look for garbage among young objects only.
+def _tune_garbage_collector() -> None:
+    """Let Python collect young objects only.
 
-    To look through all sessions, subscriptions and retained messages stops everything for a tenth
-    of a second and more, each time that there are a quarter more of them. None of these needs it:
-    what ends here is let go by who holds it. Garbage that does dies young, in tasks and exceptions.
+    A full collection traverses all sessions, subscriptions and retained messages, which stops the
+    loop for 0.1 s and more, and is due whenever their number has grown by a quarter. Sessions and
+    the like are no reference cycles, and are freed without it; cycles are in tasks and exceptions,
+    which are young.
     """
     gc.collect()
     gc.freeze()

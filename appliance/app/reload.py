@@ -1,4 +1,4 @@
-"""Taking over changed files while everything runs: all of them, or none."""
+"""Reload: apply changed files while everything runs, either all of them or none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from appliance.ros.bridge import Bridge
 
 log = logging.getLogger(__name__)
 
-#: What holds from the start on, for as long as the process runs.
+#: Keys that take effect at the start only.
 NEEDS_RESTART: Final = (
     "robot",
     "control",
@@ -53,12 +53,12 @@ NEEDS_RESTART: Final = (
 
 
 class ReloadError(Exception):
-    """Nothing was taken over; the text says all that is in the way."""
+    """Nothing was applied; the text has every reason."""
 
 
 @dataclass(slots=True)
 class ReloadParts:
-    """What a reload changes."""
+    """The parts that a reload changes."""
 
     settings: Settings
     access: FileAccess
@@ -71,7 +71,7 @@ class ReloadParts:
 
 @dataclass(frozen=True, slots=True)
 class ReloadOutcome:
-    """How a reload went: when by the loop's clock, whether it was done, and what was said of it."""
+    """The result of a reload: its time by the loop's clock, whether it succeeded, and the text."""
 
     at: float
     done: bool
@@ -79,8 +79,8 @@ class ReloadOutcome:
 
 
 @dataclass(frozen=True, slots=True)
-class _Read:
-    """What all files say now, checked, and not in force yet."""
+class _LoadedFiles:
+    """The content of all files, checked but not applied yet."""
 
     settings: Settings
     rules: Rules
@@ -88,23 +88,23 @@ class _Read:
 
 
 class Reload:
-    """Reloads the parts, one time after the other; belongs to the event loop's thread."""
+    """Runs reloads one after the other, on the event loop's thread."""
 
     def __init__(self, parts: ReloadParts) -> None:
         self._parts = parts
-        self._turn = asyncio.Lock()
-        #: Of the last one; None when there was none.
+        self._lock = asyncio.Lock()
+        #: The outcome of the last reload; None before the first.
         self.outcome: ReloadOutcome | None = None
-        #: What the last one that changed anything has changed, and when; empty when none did.
+        #: What the last reload that changed anything has changed, and when; empty before it.
         self.last_change = ""
 
     @property
     def settings(self) -> Settings:
-        """Those that are in force."""
+        """The settings in force."""
         return self._parts.settings
 
     def files(self) -> set[Path]:
-        """Everything that a reload reads."""
+        """All files that a reload reads."""
         parts = self._parts
         found = set(parts.access.in_force.files)
         if parts.settings.file is not None:
@@ -116,18 +116,18 @@ class Reload:
         return found
 
     async def run(self) -> list[str]:
-        """Take over what the files say now; returns what has changed, in words.
+        """Apply the files as they are now; returns a list of what has changed.
 
         Raises:
-            ReloadError: something is wrong; what was in force stays so.
+            ReloadError: a file is wrong; the settings in force stay as they are.
         """
-        async with self._turn:
+        async with self._lock:
             try:
                 changed = await self._run()
             except ReloadError as error:
                 self._ended(False, str(error))
-                told = str(error).replace("\n", "; ")
-                log.error("not reloaded, what was in force stays so: %s", told)
+                reason = str(error).replace("\n", "; ")
+                log.error("not reloaded, what was in force stays so: %s", reason)
                 if self._parts.audit is not None:
                     self._parts.audit.changed("nothing: the files cannot be used", error=str(error))
                 raise
@@ -142,12 +142,12 @@ class Reload:
         self.outcome = ReloadOutcome(asyncio.get_running_loop().time(), done, text)
 
     async def renewed(self) -> None:
-        """Take over the server's certificate, which is a new one.
+        """Apply the server's renewed certificate.
 
         Raises:
-            CertificateError: it, or another file of certificates, cannot be used.
+            CertificateError: this or another certificate file cannot be used.
         """
-        async with self._turn:
+        async with self._lock:
             tls = self._parts.tls
             if tls is not None:
                 self._take_certificates(tls, await asyncio.to_thread(tls.prepare))
@@ -155,7 +155,7 @@ class Reload:
     async def _run(self) -> list[str]:
         parts = self._parts
         try:
-            # In a thread: long files take their time, and a password in one does not wait for that.
+            # In a thread: long files take time, and logins must not wait for that.
             read = await asyncio.to_thread(_read, parts)
         except (ConfigError, AccessFileError, CertificateError) as error:
             raise ReloadError(str(error)) from None
@@ -165,7 +165,7 @@ class Reload:
             doors = parts.listeners.prepare(wanted)
         except OSError as error:
             raise ReloadError(str(error)) from None
-        # From here on nothing fails.
+        # Nothing below can fail.
         parts.settings = settings
         changed = [*_differences(before, settings)]
         limits = settings.broker.limits
@@ -188,7 +188,7 @@ class Reload:
         return changed
 
     def _take_certificates(self, tls: TlsContexts, loaded: LoadedTls) -> list[str]:
-        """Let them hold for the connections that are open, too."""
+        """Use them for new connections, and check those of connected clients against them."""
         if not tls.take(loaded):
             return []
         listeners = self._parts.listeners
@@ -196,8 +196,8 @@ class Reload:
         return ["certificates"]
 
     def _take_access(self, changes: Changes) -> list[str]:
-        """Let connected clients have the rights that they have now, and no others."""
-        removed = set(changes.users_removed)  # others are known to plugins
+        """Disconnect removed users; returns what has changed. `rules_changed` follows up on rights."""
+        removed = set(changes.users_removed)  # plugins may know users that the file has not
         for session in list(self._parts.broker.sessions.values()):
             if session.identity and session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
@@ -206,16 +206,16 @@ class Reload:
             "users_removed": "users removed: ",
             "passwords_changed": "new passwords of: ",
         }
-        told = [
+        changed = [
             text + ", ".join(names)
             for field, text in words.items()
             if (names := getattr(changes, field))
         ]
-        return told + (["access rules"] if changes.rules_changed else [])
+        return changed + (["access rules"] if changes.rules_changed else [])
 
 
-def _read(parts: ReloadParts) -> _Read:
-    """Everything that a reload needs from files; raises what is wrong with them."""
+def _read(parts: ReloadParts) -> _LoadedFiles:
+    """Load and check all files; raises the error of the first that is wrong."""
     before = parts.settings
     settings = before if before.file is None else config.load(before.file)
     fixed = [
@@ -233,11 +233,11 @@ def _read(parts: ReloadParts) -> _Read:
     if parts.tls is not None:
         broker = settings.broker
         tls = parts.tls.prepare(tls_files(broker), policies, broker.tls.username_from)
-    return _Read(settings, rules, tls)
+    return _LoadedFiles(settings, rules, tls)
 
 
 def _differences(before: BaseModel, after: BaseModel, path: str = "") -> Iterator[str]:
-    """The keys whose values are not the same."""
+    """The keys whose values differ."""
     for name in type(before).model_fields:
         old, new = getattr(before, name), getattr(after, name)
         if isinstance(old, BaseModel):

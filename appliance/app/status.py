@@ -1,4 +1,4 @@
-"""What the running appliance says of itself: to `appliance status`, and to `appliance doctor`."""
+"""The state of the running appliance, for `appliance status`, `appliance doctor` and systemd."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from appliance.ros.metrics import Meter
 from appliance.ros.status import RouteStatus
 from appliance.store import SessionStore
 
-#: The part of a limit from which on it is told that little is left, and who has most.
+#: The part of a limit from which on its use is reported, with the users that hold most of it.
 NEARLY_FULL = 0.8
 
-#: How many of those who have most of something are told.
+#: How many of these users are reported.
 HOLDERS = 3
 
 
 @dataclass(slots=True)
 class StatusParts:
-    """What is asked how it is."""
+    """The parts whose state is reported."""
 
     version: str
     broker: Broker
@@ -45,12 +45,12 @@ class StatusParts:
     bridge: Bridge | None
     reload: Reload
     warnings: Callable[[], list[str]]
-    #: The report of the last run, when that crashed.
+    #: The crash report of the last run, if it crashed.
     crash: Path | None = None
 
 
 class Status:
-    """Counts what comes and goes a second, and tells how everything is; the event loop's."""
+    """Measures message rates and reports the state of all parts; runs on the event loop."""
 
     def __init__(self, parts: StatusParts) -> None:
         self._parts = parts
@@ -60,13 +60,13 @@ class Status:
         self._received, self._sent = Meter(), Meter()
 
     def tick(self, now: float) -> None:
-        """Look at the counters, once a second or so."""
+        """Update the rates; called about once a second."""
         counters = self._parts.broker.counters
         self._received.tick(now, counters.publish_received, counters.publish_bytes_received)
         self._sent.tick(now, counters.publish_sent, counters.publish_bytes_sent)
 
     def line(self) -> str:
-        """How it is, in a line for `systemctl status`."""
+        """A one-line summary for `systemctl status`."""
         bridge = self._parts.bridge
         if bridge is None:
             ros = "without ROS"
@@ -81,12 +81,12 @@ class Status:
             text += f"; began after a crash, see {self._parts.crash}"
         return text
 
-    async def tell(self) -> dict[str, Any]:
-        """Everything, as JSON knows values; sizes are in bytes, times in seconds."""
+    async def report(self) -> dict[str, Any]:
+        """The full state as JSON values; sizes in bytes, times in seconds."""
         parts = self._parts
         settings = parts.reload.settings
         ros, routes = self._ros(settings), self._routes()
-        told: dict[str, Any] = {
+        report: dict[str, Any] = {
             "version": parts.version,
             "pid": os.getpid(),
             "robot": settings.robot,
@@ -105,21 +105,21 @@ class Status:
             "errors": self._errors(),
         }
         # In a thread: a revocation list may be long.
-        found = await asyncio.to_thread(_endings, settings)
-        told["certificates"] = [
+        endings = await asyncio.to_thread(_endings, settings)
+        report["certificates"] = [
             {
                 "what": each.what,
                 "file": str(each.file),
                 "ends": each.ends.isoformat(),
                 "days": each.days,
             }
-            for each in found
+            for each in endings
         ]
-        told["warnings"] = list(self._warnings(told))
-        return told
+        report["warnings"] = list(self._warnings(report))
+        return report
 
     def _date(self, moment: float) -> str:
-        """The date of a moment of the loop's clock, as the computer's clock is set now."""
+        """The date of a time of the loop's clock, by the wall clock as it is set now."""
         date = datetime.fromtimestamp(time.time() - self._loop.time() + moment, timezone.utc)
         return date.isoformat(timespec="seconds")
 
@@ -157,7 +157,7 @@ class Status:
         }
 
     def _ros_rates(self) -> dict[str, float]:
-        """What the bridge carries; the other figures are of the network's clients."""
+        """Rates of the bridge; the other metrics are those of network clients."""
         topics = self._parts.bridge.topics() if self._parts.bridge is not None else []
         rates = {"to_mqtt": 0.0, "to_ros": 0.0}
         for topic in topics:
@@ -187,11 +187,11 @@ class Status:
         }
 
     def _short(self) -> Iterator[dict[str, Any]]:
-        """What is nearly used up, by all together or by the user who has most, and who has it."""
+        """The limits that are nearly reached, by all or by one user, and the users with most of it."""
         broker = self._parts.broker
         accounting, limits, own = broker.accounting, broker.limits, broker.limits.user
         accounts, quotas, store = accounting.accounts, accounting.quotas, broker.store
-        figures: list[tuple[str, int, int, int | None, Callable[[Account], int]]] = [
+        usages: list[tuple[str, int, int, int | None, Callable[[Account], int]]] = [
             (
                 "connections",
                 accounts.connections,
@@ -217,7 +217,7 @@ class Status:
             ),
             ("stored", store.bytes, store.size, quotas.stored.own, _STORED),
         ]
-        for what, used, limit, most, held in figures:
+        for what, used, limit, most, held in usages:
             holders = accounts.holders(held, HOLDERS)
             is_short = limit and used >= NEARLY_FULL * limit
             if holders and most:
@@ -280,34 +280,34 @@ class Status:
             return None
         return {"at": self._date(last.at), "done": last.done, "text": last.text}
 
-    def _warnings(self, told: dict[str, Any]) -> Iterator[str]:
+    def _warnings(self, report: dict[str, Any]) -> Iterator[str]:
         if is_unset():
             yield (
                 f"the computer's clock says {datetime.now(timezone.utc):%Y-%m-%d}, which is before "
                 f"{RELEASED:%Y-%m-%d}: it is not set"
             )
         yield from self._parts.warnings()
-        if told["store"] is not None and told["store"]["failing"]:
-            yield f"{told['store']['path']} cannot be written; see the log"
-        for short in told["short"]:
+        if report["store"] is not None and report["store"]["failing"]:
+            yield f"{report['store']['path']} cannot be written; see the log"
+        for short in report["short"]:
             yield _shortage(short)
-        problem = told["ros"].get("problem")
-        if problem and told["ros"]["state"] == "joined":
+        problem = report["ros"].get("problem")
+        if problem and report["ros"]["state"] == "joined":
             yield f"ROS: {problem}"
         elif problem:
             yield f"there is no bridge to ROS: {problem}"
         if self._parts.crash is not None:
             yield f"the last run crashed, see {self._parts.crash}"
-        errors = told["errors"]
+        errors = report["errors"]
         if errors["count"]:
-            report = errors["report"]
+            crash_report = errors["report"]
             yield (
                 f"faults of the appliance since its start: {errors['count']}, each ended what it "
                 f"arose with and nothing else; the last: {errors['last']}"
-                + (f"; please send us the report {report}" if report else "")
+                + (f"; please send us the report {crash_report}" if crash_report else "")
             )
-        if told["reload"] is not None and not told["reload"]["done"]:
-            yield f"the last reload took nothing over: {told['reload']['text']}"
+        if report["reload"] is not None and not report["reload"]["done"]:
+            yield f"the last reload took nothing over: {report['reload']['text']}"
 
 
 def _endings(settings: Settings) -> list[certs.Ending]:
@@ -315,11 +315,11 @@ def _endings(settings: Settings) -> list[certs.Ending]:
         return []
     try:
         return certs.endings(tls_files(settings.broker))
-    except certs.CertificateError:  # what is in force goes on; the next reload says why
+    except certs.CertificateError:  # the loaded ones stay in use; the next reload reports it
         return []
 
 
-#: What an account holds of each of what is shared.
+#: An account's share of each limited resource.
 _CONNECTIONS: Callable[[Account], int] = attrgetter("connections")
 _SESSIONS: Callable[[Account], int] = attrgetter("sessions")
 _MEMORY: Callable[[Account], int] = attrgetter("bytes")
@@ -327,12 +327,12 @@ _RETAINED: Callable[[Account], int] = attrgetter("retained")
 _RETAINED_BYTES: Callable[[Account], int] = attrgetter("retained_bytes")
 _STORED: Callable[[Account], int] = attrgetter("stored")
 
-#: Those that are counted in bytes.
+#: The resources that are measured in bytes.
 _SIZES = ("memory", "retained_bytes", "stored")
 
 
 def _shortage(short: dict[str, Any]) -> str:
-    """In words what is nearly used up, and who has most of it."""
+    """A warning about a limit that is nearly reached, and who holds most of it."""
     what = short["what"]
 
     def amount(number: int) -> str:
@@ -347,7 +347,7 @@ def _shortage(short: dict[str, Any]) -> str:
 
 
 def name_of(route: RouteStatus) -> str:
-    """A route in the words of `appliance routes`."""
+    """A route as `appliance routes` shows it."""
     arrow = "→" if route.direction == "to_mqtt" else "←"
     settings = route.settings
     names = ", ".join(settings.names)
@@ -355,7 +355,7 @@ def name_of(route: RouteStatus) -> str:
 
 
 def topic_shown(names: Iterable[str], template: str) -> str:
-    """The MQTT topics of a route of these names, patterns as they are written."""
+    """The MQTT topics of a route with these names; patterns stay patterns."""
     wanted = [name for name in names if not name.startswith("!")]
     topics = [
         template.replace("{ros}", name).replace("{node}", name.rpartition("/")[0])
@@ -365,7 +365,7 @@ def topic_shown(names: Iterable[str], template: str) -> str:
 
 
 def problem_of(route: RouteStatus) -> str | None:
-    """What is wrong with a route; None when nothing is."""
+    """A route's problem; None when it has none."""
     if not route.topics and route.last_error is not None:
         return f"not bridged: {route.last_error}"
     found = []

@@ -31,7 +31,7 @@ from appliance.app import main as app
 from appliance.cli.main import main
 def fail(self):
     raise ValueError("a part\\nfailed")
-app.App._open_to_commands = fail
+app.App._open_control_socket = fail
 main(["run", "-c", sys.argv[1]])
 """
 
