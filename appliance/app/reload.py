@@ -196,7 +196,7 @@ class Reload:
         return ["certificates"]
 
     def _take_access(self, changes: Changes) -> list[str]:
-        """Disconnect removed users; returns what has changed. `rules_changed` follows up on rights."""
+        """Disconnect removed users; returns what has changed. Rights: `rules_changed`."""
         removed = set(changes.users_removed)  # plugins may know users that the file has not
         for session in list(self._parts.broker.sessions.values()):
             if session.identity and session.identity.username in removed:

@@ -187,7 +187,7 @@ class Status:
         }
 
     def _short(self) -> Iterator[dict[str, Any]]:
-        """The limits that are nearly reached, by all or by one user, and the users with most of it."""
+        """The limits that are nearly reached, by all or by one user, and by whom."""
         broker = self._parts.broker
         accounting, limits, own = broker.accounting, broker.limits, broker.limits.user
         accounts, quotas, store = accounting.accounts, accounting.quotas, broker.store
