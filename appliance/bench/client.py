@@ -26,7 +26,7 @@ class LoadError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class LoadTarget:
     """The broker to be driven."""
 
     host: str = "127.0.0.1"
@@ -50,7 +50,7 @@ class Target:
         )
 
     @classmethod
-    def of(cls, options: argparse.Namespace) -> Target:
+    def of(cls, options: argparse.Namespace) -> LoadTarget:
         """What the options say. Raises LoadError, OSError."""
         password = os.environ.get(options.password_env) if options.password_env else None
         if options.password_env and password is None:
@@ -115,11 +115,11 @@ def subscribe_packet(filters: Sequence[str], qos: int) -> bytes:
     return packet(0x82, b"\0\1" + b"".join(field(each.encode()) + bytes([qos]) for each in filters))
 
 
-class Plain:
+class TcpStream:
     """A TCP connection."""
 
-    backlog = False  # bytes were taken that the socket has not sent yet
-    more = False  # bytes have arrived that were not handed out yet
+    has_unsent = False  # bytes were taken that the socket has not sent yet
+    has_more = False  # bytes have arrived that were not handed out yet
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
@@ -142,7 +142,7 @@ class Plain:
         return size
 
 
-class Tls:
+class TlsStream:
     """A TLS connection: one system call for many records, where SSLSocket takes two for each."""
 
     def __init__(self, connection: socket.socket, context: ssl.SSLContext, host: str) -> None:
@@ -152,7 +152,7 @@ class Tls:
         # Into a buffer, it returns the number of bytes; its declared type knows only the other way.
         self._read = cast("Callable[[int, memoryview], int]", cast(Any, self._tls.read))
         self._sealed = memoryview(b"")
-        self.more = False
+        self.has_more = False
         while True:
             try:
                 self._tls.do_handshake()
@@ -164,7 +164,7 @@ class Tls:
         connection.sendall(self._outgoing.read())
 
     @property
-    def backlog(self) -> bool:
+    def has_unsent(self) -> bool:
         """Whether bytes were taken that the socket has not sent yet."""
         return bool(self._sealed)
 
@@ -181,7 +181,7 @@ class Tls:
 
     def recv_into(self, buffer: memoryview) -> int:
         """Receive; returns the number of bytes, 0 when there is nothing yet."""
-        if not self.more:
+        if not self.has_more:
             try:
                 received = self._socket.recv_into(RECORDS)
             except BlockingIOError:
@@ -194,21 +194,23 @@ class Tls:
             while size < room:
                 size += self._read(room - size, buffer[size:])
         except ssl.SSLWantReadError:
-            self.more = False
+            self.has_more = False
         else:
-            self.more = True
+            self.has_more = True
         return size
 
 
-class Client:
+class LoadClient:
     """One MQTT connection: opened step by step while blocking, then without ever blocking."""
 
-    def __init__(self, target: Target, client_id: str, *, clean: bool = True) -> None:
+    def __init__(self, target: LoadTarget, client_id: str, *, clean: bool = True) -> None:
         self.client_id = client_id
         self.socket = socket.create_connection((target.host, target.port), CONNECT_SECONDS)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.transport: Plain | Tls = (
-            Plain(self.socket) if target.tls is None else Tls(self.socket, target.tls, target.host)
+        self.transport: TcpStream | TlsStream = (
+            TcpStream(self.socket)
+            if target.tls is None
+            else TlsStream(self.socket, target.tls, target.host)
         )
         self._watch: Callable[[bool], None] = lambda wanted: None
         self._waiting = False
@@ -251,7 +253,7 @@ class Client:
             self.flush()
         if event & ~select.EPOLLOUT:
             self.receive()
-            while self.transport.more:
+            while self.transport.has_more:
                 self.receive()
 
     def receive(self) -> None:
@@ -265,7 +267,7 @@ class Client:
     def write(self, data: bytes | memoryview) -> int:
         """Send what the connection takes; returns how much that was."""
         taken = self.transport.send(memoryview(data))
-        if (full := taken < len(data) or self.transport.backlog) != self._waiting:
+        if (full := taken < len(data) or self.transport.has_unsent) != self._waiting:
             self._waiting = full
             self._watch(full)
         return taken

@@ -47,7 +47,7 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
     rows: list[Row] = []
     grown: list[GrowthRow] = []
     status = 0
-    with _Terminated(), console.status("") as shown:
+    with _InterruptOnSigterm(), console.status("") as shown:
         try:
             for number, cell in enumerate(chosen, 1):
                 where = f"{number} of {len(chosen)}: {cell.title}"
@@ -72,7 +72,7 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
     return status or int(any(row.problem for row in rows) or any(row.problem for row in grown))
 
 
-class _Terminated:
+class _InterruptOnSigterm:
     """Inside, SIGTERM ends the way Ctrl-C does: everything that was started is stopped."""
 
     def __enter__(self) -> None:

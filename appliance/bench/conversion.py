@@ -20,7 +20,7 @@ from typing import Any
 from appliance.bench.load import Result
 
 TYPE = "sensor_msgs/msg/Imu"
-BATCH = 100  # conversions between two looks at the clock
+CONVERSIONS_PER_CLOCK_READ = 100  # conversions between two looks at the clock
 
 Convert = Callable[[bytes], str | bytes]
 
@@ -69,19 +69,19 @@ def rclpy() -> Convert:
     return lambda cdr: json.dumps(walk(deserialize_message(cdr, imu)))
 
 
-HOW = {"ours": ours, "rclpy": rclpy}
+CONVERTERS = {"ours": ours, "rclpy": rclpy}
 
 
 def measure(how: str, seconds: float) -> Result:
     """Convert for so long."""
-    cdr, convert = sample(), HOW[how]()
+    cdr, convert = sample(), CONVERTERS[how]()
     count = 0
     convert(cdr)
     began, cpu = time.monotonic(), time.process_time()
     while time.monotonic() < began + seconds:
-        for _ in range(BATCH):
+        for _ in range(CONVERSIONS_PER_CLOCK_READ):
             convert(cdr)
-        count += BATCH
+        count += CONVERSIONS_PER_CLOCK_READ
     elapsed, cpu = time.monotonic() - began, time.process_time() - cpu
     return Result(
         cell=f"conversion-{how}",
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m appliance.bench.conversion", description="Serialized messages to JSON."
     )
-    parser.add_argument("how", choices=HOW)
+    parser.add_argument("how", choices=CONVERTERS)
     parser.add_argument("--seconds", type=float, default=3.0)
     options = parser.parse_args(arguments)
     sys.stdout.write(json.dumps(asdict(measure(options.how, options.seconds))) + "\n")

@@ -20,9 +20,9 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 
-from appliance.bench.client import LoadError, Target, allow_files, connect_packet
+from appliance.bench.client import LoadError, LoadTarget, allow_files, connect_packet
 from appliance.bench.load import percentile, pin
-from appliance.bench.probe import tell
+from appliance.bench.probe import print_answer
 
 CONNECT_SECONDS = 30.0  # from the TCP connection to the CONNACK, as MQTT.js has it
 OTHER_FILES = 64
@@ -30,10 +30,10 @@ NICENESS = 5  # clients are elsewhere, and a bystander is not to wait for them
 _READ, _WRITE = select.EPOLLIN | select.EPOLLRDHUP, select.EPOLLOUT
 
 
-class Newcomer:
+class ConnectingClient:
     """One client on its way: TCP connection, TLS handshake, CONNECT, CONNACK."""
 
-    def __init__(self, target: Target, client_id: str) -> None:
+    def __init__(self, target: LoadTarget, client_id: str) -> None:
         self._target = target
         self._connect = connect_packet(client_id, target.username, target.password)
         self._answer = b""
@@ -105,11 +105,11 @@ class Newcomer:
 class Crowd:
     """All of them, and the loop that serves them."""
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: LoadTarget) -> None:
         self._target = target
         self._poll = select.epoll()
-        self._waiting: dict[int, Newcomer] = {}
-        self._inside: dict[int, Newcomer] = {}
+        self._waiting: dict[int, ConnectingClient] = {}
+        self._inside: dict[int, ConnectingClient] = {}
         self._took: list[float] = []  # seconds, of each that connected, whether it stayed or not
         self._problems: Counter[str] = Counter()
 
@@ -117,7 +117,7 @@ class Crowd:
         """Let so many connect at once; returns how that went when all have, or their time is up."""
         began = time.perf_counter()
         for number in range(count):
-            newcomer = Newcomer(self._target, f"bench-crowd-{os.getpid()}-{number}")
+            newcomer = ConnectingClient(self._target, f"bench-crowd-{os.getpid()}-{number}")
             self._waiting[newcomer.socket.fileno()] = newcomer
             self._poll.register(newcomer.socket.fileno(), _WRITE)
         until = time.perf_counter() + CONNECT_SECONDS
@@ -176,22 +176,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m appliance.bench.crowd", description="Connect many MQTT clients at once."
     )
-    Target.add_options(parser)
+    LoadTarget.add_options(parser)
     parser.add_argument("--clients", type=int, default=5000)
     options = parser.parse_args(arguments)
     gc.disable()
     allow_files(options.clients + OTHER_FILES)
     try:
-        target = Target.of(options)
+        target = LoadTarget.of(options)
         crowd = Crowd(target)
         pin(target.pids)
         os.nice(NICENESS)
-        tell({"ready": True})
+        print_answer({"ready": True})
         if sys.stdin.readline():
-            tell(crowd.connect(options.clients))
+            print_answer(crowd.connect(options.clients))
             crowd.stay()
             if sys.stdin.readline():
-                tell(crowd.leave())
+                print_answer(crowd.leave())
                 sys.stdin.readline()
     except (LoadError, OSError) as error:
         sys.stderr.write(f"crowd: {error}\n")

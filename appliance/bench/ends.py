@@ -23,7 +23,7 @@ from dataclasses import asdict
 from importlib import import_module
 from typing import Any
 
-from appliance.bench.client import Client, LoadError, Target, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
 from appliance.bench.load import Result, cpu_seconds, percentile, pin
 
 TEXT_BYTES = 64
@@ -40,7 +40,7 @@ def text(number: int) -> str:
     return f"{time.monotonic_ns():020d} {number:010d}".ljust(TEXT_BYTES)
 
 
-class Meter:
+class LatencyMeter:
     """Latency, loss, and the CPU time of everything between the two ends."""
 
     def __init__(self, cell: str, pids: Sequence[int], seconds: float) -> None:
@@ -107,17 +107,17 @@ def paced(rate: float, seconds: float, send: Callable[[str], object]) -> None:
 # --- MQTT ---
 
 
-def mqtt_send(target: Target, topic: str, rate: float, seconds: float) -> None:
+def mqtt_send(target: LoadTarget, topic: str, rate: float, seconds: float) -> None:
     """Publish with QoS 0."""
-    with closing(Client(target, f"bench-send-{os.getpid()}")) as client:
+    with closing(LoadClient(target, f"bench-send-{os.getpid()}")) as client:
         client.connected()
         paced(rate, seconds, lambda data: client.write(publish_packet(topic, data.encode())))
 
 
-def mqtt_receive(target: Target, topic: str, meter: Meter, seconds: float) -> None:
+def mqtt_receive(target: LoadTarget, topic: str, meter: LatencyMeter, seconds: float) -> None:
     """Subscribe with QoS 0 and measure."""
     buffer, filled, size = memoryview(bytearray(RECEIVE_BYTES)), 0, 0
-    with closing(Client(target, f"bench-receive-{os.getpid()}")) as client:
+    with closing(LoadClient(target, f"bench-receive-{os.getpid()}")) as client:
         client.connected()
         client.subscribe(topic, 0)
         client.socket.settimeout(FIRST_SECONDS)
@@ -190,7 +190,7 @@ def ros_send(topic: str, rate: float, seconds: float, is_image: bool) -> None:
         rclpy.try_shutdown()
 
 
-def ros_receive(topic: str, meter: Meter, seconds: float, is_image: bool) -> None:
+def ros_receive(topic: str, meter: LatencyMeter, seconds: float, is_image: bool) -> None:
     """Subscribe to std_msgs/String, or to serialized sensor_msgs/Image, and measure."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -245,9 +245,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     password = os.environ[options.password_env].encode() if options.password_env else None
-    target = Target(options.host, options.port, None, options.user, password)
+    target = LoadTarget(options.host, options.port, None, options.user, password)
     pids = [os.getpid()] if options.role == "ros-listen" else options.pid
-    meter = Meter(options.role, pids, options.seconds)
+    meter = LatencyMeter(options.role, pids, options.seconds)
     pin(pids)  # both ends on one core, what is between on another
     try:
         if options.role == "mqtt-send":

@@ -25,29 +25,33 @@ from typing import Any, TypeAlias
 from appliance.bench import peers
 from appliance.bench.cells import run_measuring
 from appliance.bench.client import (
-    Client,
+    LoadClient,
     LoadError,
     allow_files,
     publish_packet,
     subscribe_packet,
 )
 from appliance.bench.crowd import CONNECT_SECONDS
-from appliance.bench.load import Flow, Load, Subscriber, cpu_seconds, resident_kib
+from appliance.bench.load import Load, LoadSubscriber, MessageFlow, cpu_seconds, resident_kib
 from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site, last_lines
 
-Start: TypeAlias = "Callable[[], AbstractContextManager[Server]]"  # of a broker, a new one each
+StartBroker: TypeAlias = (
+    "Callable[[], AbstractContextManager[Server]]"  # of a broker, a new one each
+)
 Progress: TypeAlias = "Callable[[str], object]"
 Figures: TypeAlias = "dict[str, float]"
 
 RUN_SECONDS = 0.5  # the longest that one run measures: there are many, in turn
 RUNS = 3
-SAME = 1.15  # a ratio up to which two figures of a computer that does other things are the same
-STOP_MS = 50.0
-CROWDED_MS = 500.0  # while thousands come or go at once, each with a TLS connection
+MAX_RATIO = (
+    1.15  # a ratio up to which two figures of a computer that does other things are the same
+)
+MAX_STALL_MS = 50.0
+MAX_CROWD_STALL_MS = 500.0  # while thousands come or go at once, each with a TLS connection
 FILTERS_A_PACKET = 100
 FILTERS_A_CLIENT = 800
 PACKETS_A_WINDOW = 1000
-KEPT_BYTES = 64
+RETAINED_BYTES = 64
 ANSWER_SECONDS = 20.0
 LEAVE_SECONDS = 10.0
 SETTLE_SECONDS = 1.0
@@ -86,7 +90,7 @@ class GrowthCell:
         """What this computer lacks to run the cell."""
         return None
 
-    def measure(self, start: Start, seconds: float, progress: Progress) -> Figures:
+    def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         """The figures of one broker. Raises PeerError, LoadError, OSError."""
         raise NotImplementedError
 
@@ -136,7 +140,7 @@ def publish_costs(
 def same_cost(load: str, title: str, little: str) -> Statement:
     """That a publish costs the same as with little."""
     note = f"{{{load}-little-us:.1f}} → {{{load}-much-us:.1f}} µs"
-    return Statement(load, f"CPU of a publish ÷ with {little}: {title}", "×", SAME, note)
+    return Statement(load, f"CPU of a publish ÷ with {little}: {title}", "×", MAX_RATIO, note)
 
 
 PUBLISHES = (
@@ -147,10 +151,10 @@ TOPICS = ("qos0-topics", "QoS 0, 10,000 topics in turn")
 
 
 @dataclass(frozen=True, slots=True)
-class Subscriptions(GrowthCell):
+class SubscriptionCell(GrowthCell):
     """A publish with 10, and with many subscriptions to other topics."""
 
-    def measure(self, start: Start, seconds: float, progress: Progress) -> Figures:
+    def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         with start() as little, start() as much, contextlib.ExitStack() as stack:
             progress(f"{self.size:,} subscriptions")
             subscribe(stack, little, 10)
@@ -176,7 +180,7 @@ def subscribe(stack: contextlib.ExitStack, server: Server, count: int) -> None:
         filters = [
             other_filter(each) for each in range(first, min(first + FILTERS_A_CLIENT, count))
         ]
-        client = Client(server.target(tls=False), f"bench-other-{first}")
+        client = LoadClient(server.target(tls=False), f"bench-other-{first}")
         stack.callback(client.close)
         client.connected()
         for start in range(0, len(filters), FILTERS_A_PACKET):
@@ -205,10 +209,10 @@ def other_filter(number: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Retained(GrowthCell):
+class RetainedCell(GrowthCell):
     """A publish with none, and with many messages retained; and one who wants to have them all."""
 
-    def measure(self, start: Start, seconds: float, progress: Progress) -> Figures:
+    def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         with start() as little, start() as much:
             progress(f"{self.size:,} retained messages")
             retain(much, self.size)
@@ -229,26 +233,28 @@ class Retained(GrowthCell):
             return figures
 
 
-def kept_topic(number: int) -> str:
+def retained_topic(number: int) -> str:
     """One of many topics with a retained message, all of the same length."""
     return f"bench/kept/robot{number // 100:05d}/{number % 100:02d}"
 
 
 def retain(server: Server, count: int) -> None:
     """Have the broker retain so many messages."""
-    with contextlib.closing(Client(server.target(tls=False), "bench-retain")) as client:
+    with contextlib.closing(LoadClient(server.target(tls=False), "bench-retain")) as client:
         client.connected()
         for first in range(0, count, PACKETS_A_WINDOW):
             numbers = range(first, min(first + PACKETS_A_WINDOW, count))
             packets = [
-                publish_packet(kept_topic(each), bytes(KEPT_BYTES), 1 + each - first, retain=True)
+                publish_packet(
+                    retained_topic(each), bytes(RETAINED_BYTES), 1 + each - first, retain=True
+                )
                 for each in numbers
             ]
             client.socket.sendall(b"".join(packets))
             client.expect(0x40, 4 * len(packets))
 
 
-class _Tally(Flow):
+class _DeliveryCounter(MessageFlow):
     """Counts what nobody has sent just now."""
 
     def deliver(self, count: int) -> None:
@@ -257,9 +263,9 @@ class _Tally(Flow):
 
 def receive_retained(server: Server, qos: int, count: int) -> int:
     """Subscribe to the retained messages; returns how many came, so many if all is well."""
-    tally = _Tally(Load(qos=qos, payload=KEPT_BYTES))
+    tally = _DeliveryCounter(Load(qos=qos, payload=RETAINED_BYTES))
     poll, events = select.epoll(), dict[int, Callable[[int], None]]()
-    client = Subscriber(server.target(tls=False), f"bench-all-{qos}", tally, kept_topic(0))
+    client = LoadSubscriber(server.target(tls=False), f"bench-all-{qos}", tally, retained_topic(0))
     with poll, contextlib.closing(client):
         client.connected()
         client.subscribe("bench/kept/#", qos)
@@ -277,14 +283,14 @@ def receive_retained(server: Server, qos: int, count: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Clients(GrowthCell):
+class ClientCell(GrowthCell):
     """Many clients that connect over TLS at once, stay, and leave at once."""
 
     def missing(self) -> str | None:
         files = 2 * self.size
         return None if allow_files(files) else f"needs {files} open files (ulimit -Hn)"
 
-    def measure(self, start: Start, seconds: float, progress: Progress) -> Figures:
+    def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         with start() as server, probing(server) as probe, crowd(server, self.size) as clients:
             time.sleep(SETTLE_SECONDS)
             files, memory = open_files(server.pids), resident_kib(server.pids)
@@ -329,7 +335,7 @@ def open_files(pids: Sequence[int]) -> int:
 # --- Programs that are asked ---
 
 
-class Program:
+class Subprocess:
     """A program of this package in a process of its own, which answers lines with lines of JSON."""
 
     def __init__(self, name: str, process: subprocess.Popen[bytes], log: Path) -> None:
@@ -364,54 +370,56 @@ class Program:
 
 
 @contextlib.contextmanager
-def program(name: str, server: Server, tls: bool, options: Sequence[str] = ()) -> Iterator[Program]:
+def program(
+    name: str, server: Server, tls: bool, options: Sequence[str] = ()
+) -> Iterator[Subprocess]:
     """Run one of this package's programs against a broker."""
     site = server.site
     command = [sys.executable, "-m", f"appliance.bench.{name}", *server.arguments(tls), *options]
     environment = {**os.environ, PASSWORD_VARIABLE: site.password}
     log = site.directory / f"{name}.log"
     with peers.running(f"the {name}", command, environment, log, talks=True) as process:
-        running = Program(f"the {name}", process, log)
+        running = Subprocess(f"the {name}", process, log)
         running.answer()
         yield running
 
 
-def probing(server: Server) -> AbstractContextManager[Program]:
+def probing(server: Server) -> AbstractContextManager[Subprocess]:
     """A bystander's round trips: asked for, since it was asked before."""
     return program("probe", server, tls=False)
 
 
-def crowd(server: Server, count: int) -> AbstractContextManager[Program]:
+def crowd(server: Server, count: int) -> AbstractContextManager[Subprocess]:
     """Clients that connect when asked, and leave when asked again."""
     return program("crowd", server, tls=True, options=["--clients", str(count)])
 
 
 # --- All of them ---
 
-MANY = 100_000
-CROWD = 5000
-QUIET = "before: {quiet-ms:.1f}"
+MANY_ENTRIES = 100_000
+CROWD_SIZE = 5000
+QUIET_NOTE = "before: {quiet-ms:.1f}"
 GROWTH: tuple[GrowthCell, ...] = (
-    Subscriptions(
+    SubscriptionCell(
         "growth-subscriptions",
-        f"{MANY:,} subscriptions to other topics",
-        MANY,
+        f"{MANY_ENTRIES:,} subscriptions to other topics",
+        MANY_ENTRIES,
         (
             *(same_cost(*each, "10") for each in (*PUBLISHES, TOPICS)),
             Statement(
                 "subscribing-ms",
                 "another's longest round trip while they are made",
                 "ms",
-                STOP_MS,
-                QUIET,
+                MAX_STALL_MS,
+                QUIET_NOTE,
             ),
             Statement("subscribe-us", "CPU of a subscription", "µs"),
         ),
     ),
-    Retained(
+    RetainedCell(
         "growth-retained",
-        f"{MANY:,} retained messages",
-        MANY,
+        f"{MANY_ENTRIES:,} retained messages",
+        MANY_ENTRIES,
         (
             *(same_cost(*each, "none") for each in PUBLISHES),
             *(
@@ -422,7 +430,7 @@ GROWTH: tuple[GrowthCell, ...] = (
                         f"stop-qos{qos}-ms",
                         f"another's longest round trip while QoS {qos} gets them all",
                         "ms",
-                        STOP_MS,
+                        MAX_STALL_MS,
                         f"before: {{quiet-qos{qos}-ms:.1f}}",
                     ),
                     Statement(
@@ -437,10 +445,10 @@ GROWTH: tuple[GrowthCell, ...] = (
             ),
         ),
     ),
-    Clients(
+    ClientCell(
         "growth-clients",
-        f"{CROWD:,} clients connect over TLS at once, stay, and leave at once",
-        CROWD,
+        f"{CROWD_SIZE:,} clients connect over TLS at once, stay, and leave at once",
+        CROWD_SIZE,
         (
             Statement(
                 "failed",
@@ -459,12 +467,15 @@ GROWTH: tuple[GrowthCell, ...] = (
                 "connecting-ms",
                 "another's longest round trip meanwhile",
                 "ms",
-                CROWDED_MS,
-                QUIET,
+                MAX_CROWD_STALL_MS,
+                QUIET_NOTE,
             ),
             Statement("memory-kib", "memory of a connection", "KiB"),
             Statement(
-                "leaving-ms", "another's longest round trip while they leave", "ms", CROWDED_MS
+                "leaving-ms",
+                "another's longest round trip while they leave",
+                "ms",
+                MAX_CROWD_STALL_MS,
             ),
         ),
     ),
@@ -485,7 +496,9 @@ def grow(
     with tempfile.TemporaryDirectory(prefix="appliance-bench-") as directory:
         site = Site(Path(directory))
         site.prepare()
-        starts: dict[str, Start] = {"appliance": lambda: peers.appliance(site, [], os.environ)}
+        starts: dict[str, StartBroker] = {
+            "appliance": lambda: peers.appliance(site, [], os.environ)
+        }
         if command is not None:
             starts["mosquitto"] = lambda: peers.mosquitto(command, site)
         for name, start in starts.items():

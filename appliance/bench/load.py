@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from appliance.bench.client import Client, LoadError, Target, allow_files, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, allow_files, publish_packet
 
 STALL_SECONDS = 3.0  # nothing arrives for so long: the broker has lost messages, or stands still
 RUN_SECONDS = 3.0  # of a run, unless said otherwise
@@ -90,7 +90,7 @@ def topic_of(topic: str, load: Load, number: int) -> str:
     return topic if load.topics == 1 else f"{topic}/{number:06d}"
 
 
-class Flow:
+class MessageFlow:
     """One publisher's messages: how many may be sent, and how long they took."""
 
     def __init__(self, load: Load) -> None:
@@ -100,9 +100,9 @@ class Flow:
         self.deliveries = 0  # over all subscribers
         self.latencies: list[tuple[float, int]] = []  # seconds, and of how many deliveries
         self._marks: deque[tuple[int, float]] = deque()  # deliveries due, since when
-        self._publisher: Publisher
+        self._publisher: LoadPublisher
 
-    def start(self, publisher: Publisher) -> None:
+    def start(self, publisher: LoadPublisher) -> None:
         """Send the first messages."""
         self._publisher = publisher
         self._send()
@@ -133,7 +133,7 @@ class Flow:
         return self.sent * self.load.subscribers - self.deliveries
 
     @property
-    def on_the_way(self) -> int:
+    def in_flight(self) -> int:
         """Messages neither delivered to all subscribers nor, with QoS 1, acknowledged."""
         done = self.deliveries // self.load.subscribers
         if self.load.qos:
@@ -145,18 +145,18 @@ class Flow:
         self.load = replace(self.load, window=0)
 
     def _send(self) -> None:
-        room = self.load.window - self.on_the_way
+        room = self.load.window - self.in_flight
         if room >= self.load.batch:
             self.sent += room
             self._marks.append((self.sent * self.load.subscribers, time.perf_counter()))
             self._publisher.send(room)
 
 
-class Flood(Flow):
+class FloodFlow(MessageFlow):
     """A publisher that waits for its acknowledgements only, and not for the subscriber."""
 
     @property
-    def on_the_way(self) -> int:
+    def in_flight(self) -> int:
         return self.sent - self.acknowledged
 
     @property
@@ -164,17 +164,17 @@ class Flood(Flow):
         return self.load.flood - self.deliveries
 
     def _send(self) -> None:
-        room = min(self.load.window - self.on_the_way, self.load.flood - self.sent)
+        room = min(self.load.window - self.in_flight, self.load.flood - self.sent)
         if room > 0:
             self.sent += room
             self._marks.append((self.sent, time.perf_counter()))
             self._publisher.send(room)
 
 
-class Publisher(Client):
+class LoadPublisher(LoadClient):
     """Sends packets out of a ring in which they lie ready, one after the other."""
 
-    def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
+    def __init__(self, target: LoadTarget, client_id: str, flow: MessageFlow, topic: str) -> None:
         super().__init__(target, client_id)
         load = flow.load
         payload = bytes(index & 0x7F for index in range(load.payload))
@@ -192,24 +192,24 @@ class Publisher(Client):
             )
         )
         self._position = 0
-        self._owed = 0
+        self._unsent = 0
         self._answer = memoryview(bytearray(4 * 65536))
         self._answered = 0
 
     def send(self, count: int) -> None:
         """Send `count` messages, now or as soon as the socket takes them."""
-        if self._owed:
-            self._owed += count * self._size
+        if self._unsent:
+            self._unsent += count * self._size
         else:
-            self._owed = count * self._size
+            self._unsent = count * self._size
             self.flush()
 
     def flush(self) -> None:
-        while self._owed:
-            sent = self.write(self._ring[self._position : self._position + self._owed])
+        while self._unsent:
+            sent = self.write(self._ring[self._position : self._position + self._unsent])
             if not sent:
                 return
-            self._owed -= sent
+            self._unsent -= sent
             self._position = (self._position + sent) % len(self._ring)
 
     def receive(self) -> None:
@@ -222,10 +222,10 @@ class Publisher(Client):
             self._flow.acknowledge(count)
 
 
-class Subscriber(Client):
+class LoadSubscriber(LoadClient):
     """Counts messages by their length, and acknowledges them where QoS 1 asks for it."""
 
-    def __init__(self, target: Target, client_id: str, flow: Flow, topic: str) -> None:
+    def __init__(self, target: LoadTarget, client_id: str, flow: MessageFlow, topic: str) -> None:
         load = flow.load
         super().__init__(target, client_id, clean=not load.stored)
         example = publish_packet(
@@ -265,10 +265,10 @@ class Subscriber(Client):
         self._acknowledgements = self._acknowledgements[self.write(self._acknowledgements) :]
 
 
-class Bystander(Client):
+class ProbeClient(LoadClient):
     """Publishes to itself, one message after the other with a pause between."""
 
-    def __init__(self, target: Target, client_id: str) -> None:
+    def __init__(self, target: LoadTarget, client_id: str) -> None:
         super().__init__(target, client_id)
         self.latencies: list[tuple[float, int]] = []
         self._topic = f"bench/beside/{os.getpid()}"
@@ -343,18 +343,18 @@ def percentile(weighted: Iterable[tuple[float, int]], part: float) -> float:
     raise LoadError("nothing was delivered while measuring")
 
 
-class Run:
+class LoadRun:
     """All clients of one cell, and the loop that serves them."""
 
-    def __init__(self, target: Target, load: Load, spin: bool) -> None:
+    def __init__(self, target: LoadTarget, load: Load, spin: bool) -> None:
         self._target = target
-        self._patience = 0.0 if spin else 0.1
+        self._poll_timeout = 0.0 if spin else 0.1
         self._poll = select.epoll()
         self._events: dict[int, Callable[[int], None]] = {}
-        self._clients: list[Client] = []
-        self._publishers: list[Publisher] = []
-        self._subscribers: list[tuple[Subscriber, str]] = []
-        self.flows: list[Flow] = []
+        self._clients: list[LoadClient] = []
+        self._publishers: list[LoadPublisher] = []
+        self._subscribers: list[tuple[LoadSubscriber, str]] = []
+        self.flows: list[MessageFlow] = []
         self._load = load
         self.arrived_at = 0.0  # when the last message of a flood did
 
@@ -363,13 +363,13 @@ class Run:
         run = f"bench-{os.getpid()}"
         for pair in range(self._load.pairs):
             topic = f"bench/load/{pair:02d}"
-            flow = Flood(self._load) if self._load.flood else Flow(self._load)
+            flow = FloodFlow(self._load) if self._load.flood else MessageFlow(self._load)
             self.flows.append(flow)
             for number in range(self._load.subscribers):
-                subscriber = Subscriber(self._target, f"{run}-s{pair}-{number}", flow, topic)
+                subscriber = LoadSubscriber(self._target, f"{run}-s{pair}-{number}", flow, topic)
                 self._subscribers.append((subscriber, topic))
                 self._clients.append(subscriber)
-            publisher = Publisher(self._target, f"{run}-p{pair}", flow, topic)
+            publisher = LoadPublisher(self._target, f"{run}-p{pair}", flow, topic)
             self._publishers.append(publisher)
             self._clients.append(publisher)
         # Only now: a broker may take its time for a password, and checks several at once.
@@ -389,16 +389,16 @@ class Run:
     def serve(self, until: float, drained: bool = False) -> None:
         """Serve the connections up to a time of `perf_counter`, or until all has arrived."""
         poll, events, clock = self._poll.poll, self._events, time.perf_counter
-        patience = self._patience
+        timeout = self._poll_timeout
         progress, seen = clock(), self.deliveries
         while (now := clock()) < until:
-            if drained and not any(flow.on_the_way for flow in self.flows):
+            if drained and not any(flow.in_flight for flow in self.flows):
                 return
-            for descriptor, event in poll(patience):
+            for descriptor, event in poll(timeout):
                 events[descriptor](event)
             if now - progress > STALL_SECONDS / 2:
                 if self.deliveries == seen and now - progress > STALL_SECONDS:
-                    missing = sum(flow.on_the_way for flow in self.flows)
+                    missing = sum(flow.in_flight for flow in self.flows)
                     raise LoadError(
                         f"nothing arrives: {missing} messages are on the way"
                         f" after {seen} deliveries (lost, or the broker stands still)"
@@ -411,30 +411,30 @@ class Run:
         """Messages delivered so far, over all subscribers."""
         return sum(flow.deliveries for flow in self.flows)
 
-    def add(self, client: Client) -> None:
+    def add(self, client: LoadClient) -> None:
         """Serve one connection more."""
         client.attach(self._poll, self._events)
 
-    def serve_flood(self, bystander: Bystander) -> None:
+    def serve_until_delivered(self, probe: ProbeClient) -> None:
         """Serve the connections until all has been acknowledged and has arrived, or nothing does.
 
         What was lost does not arrive, so that the end is known only when the time is up.
         """
         poll, events, clock = self._poll.poll, self._events, time.perf_counter
-        patience = min(self._patience, BESIDE_SECONDS)
+        timeout = min(self._poll_timeout, BESIDE_SECONDS)
         seen = 0
         self.arrived_at = clock()
-        while any(flow.on_the_way or flow.missing for flow in self.flows):
-            for descriptor, event in poll(patience):
+        while any(flow.in_flight or flow.missing for flow in self.flows):
+            for descriptor, event in poll(timeout):
                 events[descriptor](event)
             now = clock()
-            bystander.tick(now)
+            probe.tick(now)
             if (progress := sum(flow.acknowledged + flow.deliveries for flow in self.flows)) > seen:
                 seen, self.arrived_at = progress, now
             elif now - self.arrived_at > STALL_SECONDS:
                 return
 
-    def forget_latencies(self) -> None:
+    def reset_latencies(self) -> None:
         """Leave the warm-up out of the figures."""
         for flow in self.flows:
             flow.latencies = []
@@ -457,18 +457,18 @@ class Run:
         self._poll.close()
 
 
-def run_messages(cell: str, target: Target, load: Load, seconds: float, spin: bool) -> Result:
+def run_messages(cell: str, target: LoadTarget, load: Load, seconds: float, spin: bool) -> Result:
     """Drive a broker with messages for `seconds`, after a short warm-up.
 
     With `spin` the loop never sleeps, which takes a core of its own: waking up a sleeping process
     costs whoever writes to it, here the broker, more than a message does.
     """
-    run = Run(target, load, spin)
+    run = LoadRun(target, load, spin)
     try:
         run.open()
         run.start()
         run.serve(time.perf_counter() + WARM_UP_SECONDS)
-        run.forget_latencies()
+        run.reset_latencies()
         before, generator, cpu = run.deliveries, time.process_time(), cpu_seconds(target.pids)
         began = time.perf_counter()
         run.serve(began + seconds)
@@ -493,29 +493,29 @@ def run_messages(cell: str, target: Target, load: Load, seconds: float, spin: bo
     )
 
 
-def run_flood(cell: str, target: Target, load: Load, seconds: float, spin: bool) -> Result:
+def run_flood(cell: str, target: LoadTarget, load: Load, seconds: float, spin: bool) -> Result:
     """Send a number of messages as fast as they are acknowledged, and count what arrives.
 
     All that the cell says are meant for a run of RUN_SECONDS.
     """
     load = replace(load, flood=max(round(load.flood * seconds / RUN_SECONDS), load.window))
-    run = Run(target, load, spin)
-    bystander: Bystander | None = None
+    run = LoadRun(target, load, spin)
+    probe: ProbeClient | None = None
     try:
-        bystander = Bystander(target, f"bench-{os.getpid()}-beside")
-        bystander.subscribed()
+        probe = ProbeClient(target, f"bench-{os.getpid()}-beside")
+        probe.subscribed()
         run.open()
-        run.add(bystander)
+        run.add(probe)
         generator, cpu = time.process_time(), cpu_seconds(target.pids)
         began = time.perf_counter()
         run.start()
-        run.serve_flood(bystander)
+        run.serve_until_delivered(probe)
         elapsed = run.arrived_at - began
         cpu, generator = cpu_seconds(target.pids) - cpu, time.process_time() - generator
     finally:
         run.close()
-        if bystander is not None:
-            bystander.close()
+        if probe is not None:
+            probe.close()
     messages = run.deliveries
     return Result(
         cell=cell,
@@ -527,18 +527,18 @@ def run_flood(cell: str, target: Target, load: Load, seconds: float, spin: bool)
         cpu_us=1e6 * cpu / messages if target.pids and messages else None,
         p50_us=1e6 * percentile(run.latencies(), 0.50),
         p99_us=1e6 * percentile(run.latencies(), 0.99),
-        beside_us=1e6 * percentile(bystander.latencies, 0.99),
+        beside_us=1e6 * percentile(probe.latencies, 0.99),
         broker_busy=cpu / elapsed if target.pids else None,
         generator_busy=generator / elapsed,
     )
 
 
-def run_idle(cell: str, target: Target, load: Load, seconds: float) -> Result:
+def run_idle(cell: str, target: LoadTarget, load: Load, seconds: float) -> Result:
     """Open connections that stay idle, and see what memory each costs a freshly started broker."""
     if not target.pids:
         raise LoadError("the idle cell measures memory: tell the broker's process with --pid")
     allow_files(2 * load.idle + 100)
-    clients: list[Client] = []
+    clients: list[LoadClient] = []
     try:
         # The first connections also pay for what is made once.
         _open_idle(target, "warm", max(load.idle // 10, 10), clients)
@@ -552,10 +552,10 @@ def run_idle(cell: str, target: Target, load: Load, seconds: float) -> Result:
     return Result(cell, target.tls is not None, seconds, memory_kib=memory)
 
 
-def _open_idle(target: Target, name: str, count: int, clients: list[Client]) -> None:
+def _open_idle(target: LoadTarget, name: str, count: int, clients: list[LoadClient]) -> None:
     opened = []
     for number in range(count):
-        client = Client(target, f"bench-{os.getpid()}-{name}{number}")
+        client = LoadClient(target, f"bench-{os.getpid()}-{name}{number}")
         clients.append(client)
         opened.append(client)
     for client in opened:
@@ -578,7 +578,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Drive an MQTT broker with one cell's load and measure it.",
     )
     parser.add_argument("cell", choices=CELLS, metavar="CELL", help=", ".join(CELLS))
-    Target.add_options(parser)
+    LoadTarget.add_options(parser)
     parser.add_argument("--seconds", type=float, default=RUN_SECONDS, help="time to measure")
     parser.add_argument("--no-pin", action="store_true", help="leave both to the scheduler")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -602,7 +602,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if load.batch > load.window:
         parser.error("a batch larger than the window would never be sent")
     try:
-        target = Target.of(options)
+        target = LoadTarget.of(options)
         spin = not options.no_pin and pin(target.pids)
         if load.idle:
             result = run_idle(options.cell, target, load, options.seconds)

@@ -29,7 +29,7 @@ import yaml
 
 from appliance import certs
 from appliance.access import Passwords
-from appliance.bench.client import Client, LoadError, Target
+from appliance.bench.client import LoadClient, LoadError, LoadTarget
 from appliance.host.environment import for_other_programs
 
 USER = "bench"
@@ -53,7 +53,7 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
     "memory": "1 GiB",
 }
 QUEUES = f"max_inflight_messages {INFLIGHT}\nmax_queued_messages 0"  # of mosquitto
-PLACES = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
+EXTRA_PATHS = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
 START_SECONDS = 60.0
 STOP_SECONDS = 10.0
 
@@ -90,9 +90,9 @@ class Server:
     tls_port: int
     pids: tuple[int, ...]
 
-    def target(self, tls: bool) -> Target:
+    def target(self, tls: bool) -> LoadTarget:
         """Where and how a client connects."""
-        return Target(
+        return LoadTarget(
             port=self.tls_port if tls else self.port,
             tls=ssl.create_default_context(cafile=self.site.ca) if tls else None,
             username=USER,
@@ -110,7 +110,7 @@ class Server:
 
 def find_mosquitto(command: str | None) -> str | None:
     """The path of the mosquitto to compare with, None when there is none."""
-    path = os.pathsep.join((os.environ.get("PATH", os.defpath), *PLACES))
+    path = os.pathsep.join((os.environ.get("PATH", os.defpath), *EXTRA_PATHS))
     return shutil.which(command or "mosquitto", path=path)
 
 
@@ -128,7 +128,7 @@ def mosquitto_version(command: str) -> str:
 
 
 @contextlib.contextmanager
-def mosquitto(command: str, site: Site, *, usual: bool = False) -> Iterator[Server]:
+def mosquitto(command: str, site: Site, *, default_limits: bool = False) -> Iterator[Server]:
     """Run mosquitto, with its usual queue and window or larger ones; it is stopped in the end.
 
     Raises PeerError.
@@ -153,7 +153,7 @@ persistence false
 log_dest stderr
 log_type error
 log_type warning
-{"" if usual else QUEUES}
+{"" if default_limits else QUEUES}
 listener {port} 127.0.0.1
 listener {tls_port} 127.0.0.1
 certfile {site.directory / "server.crt"}
@@ -174,7 +174,7 @@ def appliance(
     environment: Mapping[str, str],
     durability: str = "off",
     *,
-    usual: bool = False,
+    default_limits: bool = False,
 ) -> Iterator[Server]:
     """Run this appliance, with a bridge when there are routes; it is stopped in the end.
 
@@ -201,7 +201,7 @@ def appliance(
                 "ca": str(site.ca),
                 "client_certificates": "off",
             },
-            "limits": {} if usual else {"inflight": INFLIGHT, **LIMITS},
+            "limits": {} if default_limits else {"inflight": INFLIGHT, **LIMITS},
             "store": {"durability": durability},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
@@ -277,7 +277,7 @@ def wait_for(server: Server, process: subprocess.Popen[bytes], log: Path) -> Non
     missing = [False, True]
     while missing:
         try:
-            with contextlib.closing(Client(server.target(missing[0]), "bench-ready")) as client:
+            with contextlib.closing(LoadClient(server.target(missing[0]), "bench-ready")) as client:
                 client.connected()
             missing.pop(0)
         except (OSError, LoadError) as error:

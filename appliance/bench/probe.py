@@ -18,14 +18,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 
-from appliance.bench.client import Client, LoadError, Target, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
 from appliance.bench.load import percentile
 
 PAUSE_SECONDS = 0.002  # between two round trips: the broker is watched, and not kept busy
 PATIENCE_SECONDS = 60.0  # for one round trip
 
 
-def round_trips(client: Client) -> Iterator[float]:
+def round_trips(client: LoadClient) -> Iterator[float]:
     """Seconds of one round trip after the other. Raises LoadError when one never ends."""
     topic = f"bench/probe/{os.getpid()}"
     packet = publish_packet(topic, bytes(64))
@@ -41,23 +41,23 @@ def round_trips(client: Client) -> Iterator[float]:
         yield time.perf_counter() - began
 
 
-def watch(client: Client) -> None:
+def watch(client: LoadClient) -> None:
     """Make round trips, and tell of them when asked, until the input ends."""
     samples: list[tuple[float, int]] = []
     trips = round_trips(client)
     next(trips)  # the first is not like the others
-    tell({"ready": True})
+    print_answer({"ready": True})
     while True:
         samples.append((next(trips), 1))
         if not select.select([sys.stdin], [], [], PAUSE_SECONDS)[0]:
             continue
         if not sys.stdin.readline():
             return
-        tell({"longest": percentile(samples, 1.0), "median": percentile(samples, 0.5)})
+        print_answer({"longest": percentile(samples, 1.0), "median": percentile(samples, 0.5)})
         samples.clear()
 
 
-def tell(answer: dict[str, object]) -> None:
+def print_answer(answer: dict[str, object]) -> None:
     """Print a line for the process that asks."""
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
@@ -68,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m appliance.bench.probe", description="Time an MQTT client's round trips."
     )
-    Target.add_options(parser)
+    LoadTarget.add_options(parser)
     gc.disable()  # its pauses would be taken for the broker's
     try:
-        target = Target.of(parser.parse_args(arguments))
-        with closing(Client(target, f"bench-probe-{os.getpid()}")) as client:
+        target = LoadTarget.of(parser.parse_args(arguments))
+        with closing(LoadClient(target, f"bench-probe-{os.getpid()}")) as client:
             client.connected()
             watch(client)
     except (LoadError, OSError) as error:

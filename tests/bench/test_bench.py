@@ -32,10 +32,10 @@ from appliance.bench.cells import (
     compare,
     median,
 )
-from appliance.bench.client import LoadError, Target
+from appliance.bench.client import LoadError, LoadTarget
 from appliance.bench.crowd import Crowd
 from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, Statement, grow
-from appliance.bench.load import Flow, Load, Publisher, Result, Subscriber
+from appliance.bench.load import Load, LoadPublisher, LoadSubscriber, MessageFlow, Result
 from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
 from appliance.mqtt.topics import check_filter, matches
 
@@ -299,12 +299,12 @@ def test_packets() -> None:
     assert client.publish_packet("a", bytes(200))[:3] == bytes.fromhex("30 cb 01")
 
 
-class Wire:
+class BrokerEnd:
     """The broker's end of one connection."""
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.target = Target(port=self.listener.getsockname()[1])
+        self.target = LoadTarget(port=self.listener.getsockname()[1])
 
     def accept(self) -> socket.socket:
         connection, _ = self.listener.accept()
@@ -315,12 +315,12 @@ class Wire:
 
 @pytest.mark.parametrize("step", [1, 7, 79, 80, 81, 1000])
 def test_a_subscriber_acknowledges_every_identifier_however_the_bytes_are_cut(step: int) -> None:
-    wire, flow = Wire(), Flow(Load(qos=1, window=50))
+    broker, flow = BrokerEnd(), MessageFlow(Load(qos=1, window=50))
     identifiers = [1, 2, 300, 65535, 1, 77, 256, 255, 9]
     packets = b"".join(client.publish_packet("t", bytes(64), each) for each in identifiers)
-    subscriber = Subscriber(wire.target, "s", flow, "t")
-    with wire.listener, wire.accept() as peer:
-        publisher = Publisher(wire.target, "p", flow, "t")
+    subscriber = LoadSubscriber(broker.target, "s", flow, "t")
+    with broker.listener, broker.accept() as peer:
+        publisher = LoadPublisher(broker.target, "p", flow, "t")
         flow.start(publisher)
         for start in range(0, len(packets), step):
             peer.sendall(packets[start : start + step])
@@ -349,7 +349,7 @@ class Recorder:
 
 
 def test_the_window_counts_what_is_neither_delivered_nor_acknowledged() -> None:
-    flow, publisher = Flow(Load(qos=1, window=3)), Recorder()
+    flow, publisher = MessageFlow(Load(qos=1, window=3)), Recorder()
     flow.start(publisher)  # type: ignore[arg-type]
     flow.deliver(2)
     assert publisher.sent == [3]
@@ -357,12 +357,12 @@ def test_the_window_counts_what_is_neither_delivered_nor_acknowledged() -> None:
     assert publisher.sent == [3, 1]
     flow.acknowledge(3)
     assert publisher.sent == [3, 1, 1]
-    assert flow.on_the_way == 3
+    assert flow.in_flight == 3
     assert sum(count for _, count in flow.latencies) == 2
 
 
 def test_one_at_a_time_waits_for_every_subscriber() -> None:
-    flow, publisher = Flow(Load(subscribers=3)), Recorder()
+    flow, publisher = MessageFlow(Load(subscribers=3)), Recorder()
     flow.start(publisher)  # type: ignore[arg-type]
     flow.deliver(2)
     assert publisher.sent == [1]
@@ -373,10 +373,10 @@ def test_one_at_a_time_waits_for_every_subscriber() -> None:
 
 
 def test_each_of_many_topics_has_its_turn_and_the_wildcard_has_all() -> None:
-    wire, flow = Wire(), Flow(Load(topics=5000))
-    publisher = Publisher(wire.target, "p", flow, "bench/t")
+    broker, flow = BrokerEnd(), MessageFlow(Load(topics=5000))
+    publisher = LoadPublisher(broker.target, "p", flow, "bench/t")
     publisher.close()
-    wire.listener.close()
+    broker.listener.close()
     size = len(client.publish_packet(load.topic_of("bench/t", flow.load, 0), bytes(64)))
     ring = bytes(publisher._ring)
     assert len(ring) % size == 0
@@ -418,7 +418,7 @@ def test_other_subscriptions_are_other_ones() -> None:
     for each in filters:
         check_filter(each)
         assert not any(matches(each, topic) for topic in published)
-    kept = [growth.kept_topic(number) for number in range(10_000)]
+    kept = [growth.retained_topic(number) for number in range(10_000)]
     assert len(set(kept)) == 10_000 and len(set(map(len, kept))) == 1
 
 
@@ -427,7 +427,7 @@ class Pretender:
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.target = Target(port=self.listener.getsockname()[1])
+        self.target = LoadTarget(port=self.listener.getsockname()[1])
         self.pauses: list[float] = []  # each before one PUBLISH is sent back
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
         self._threads[0].start()
@@ -515,7 +515,7 @@ def test_a_crowd_counts_who_could_not_connect_and_who_did_not_stay(pretender: Pr
 def test_who_gets_no_answer_has_timed_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("appliance.bench.crowd.CONNECT_SECONDS", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        crowd = Crowd(Target(port=listener.getsockname()[1]))
+        crowd = Crowd(LoadTarget(port=listener.getsockname()[1]))
         came = crowd.connect(3)
         assert (came["failed"], came["timed_out"]) == (3, 3)
         assert "p50" not in came
@@ -550,7 +550,7 @@ def test_what_is_no_packet_is_told() -> None:
 def test_the_meter_counts_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = 1_000_000_000
     monkeypatch.setattr("time.monotonic_ns", lambda: clock)
-    meter = ends.Meter("bridge", [], 1.0)
+    meter = ends.LatencyMeter("bridge", [], 1.0)
     with pytest.raises(LoadError, match="nothing comes through"):
         meter.result()
     for number in range(2500):
