@@ -1,7 +1,7 @@
 """The broker: connect · publish · subscribe · unsubscribe · disconnect · tick(now).
 
-Only one thread may call it. It does no I/O: what it sends goes to `Link`s, and `flush` tells the
-network clients among them to write what one received chunk has caused.
+Only one thread may call it. It does no I/O: messages go to `Link`s, and `flush` makes the network
+clients write what they were sent while one received chunk was processed.
 """
 
 from __future__ import annotations
@@ -50,64 +50,64 @@ from appliance.mqtt.topics import check_filter, parse_shared
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a QoS 2 exchange may take before its message counts as late.
+#: Seconds that a QoS 2 exchange may take before its message counts as delayed.
 LATE = 0.1
 
-#: Readers that are asked whether they are full for the cost to give a message to one of them.
+#: Receivers that are checked for room for one unit of cost.
 CHECKS_PER_COST_UNIT = 4
 
-#: Connections, wills and sessions that one tick ends, and the cost after which it ends no more:
-#: some ten milliseconds of work.
+#: Limits of one tick: connections, wills and sessions that it ends, and its cost, which is about
+#: ten milliseconds of work.
 ENDINGS_PER_TICK = 128
 COST_PER_TICK = 2600
 
 
-#: The cost to refuse a message, to keep one of QoS 2 until its PUBREL and to take it out again,
-#: and to give a client that has logged in its session.
+#: The cost of refusing a message, of holding a QoS 2 message until its PUBREL and releasing it, and
+#: of creating or resuming a session.
 REFUSAL_COST = 2
 HELD_COST = 3
 CONNECT_COST = 50
 
-#: The cost to end a connection or a session, and to take one of its subscriptions from the tree,
-#: of so many levels for one unit of cost.
+#: The cost of ending a connection or a session, and of removing one of its subscriptions from the
+#: tree; LEVELS_PER_COST_UNIT levels of the filter add one unit.
 ENDING_COST = 10
 LEAVING_COST = 3
 LEVELS_PER_COST_UNIT = 4
 
 
 class Ticking(Protocol):
-    """A network client, as the broker's clock and its store see it."""
+    """A network client as the broker's clock and its store call it."""
 
     def tick(self, now: float) -> bool:
         """Check its keep alive; True when that ended the connection."""
 
     def resume(self) -> None:
-        """The store keeps again what is to be kept."""
+        """The store works again: continue what waited for it."""
 
     def fault(self) -> None:
-        """End the connection, as a fault arose with it."""
+        """End the connection because an internal error occurred in it."""
 
     def cut_off(self) -> None:
-        """Cut it, as not even its end went well; never raises."""
+        """Abort the connection because even `fault` failed; never raises."""
 
 
 class Flushing(Protocol):
-    """What a network client is sent, as the flush and the commits see it."""
+    """The output of a network client as the flush and the commits call it."""
 
     def flush(self) -> None:
-        """Write what was sent to it."""
+        """Write the buffered packets."""
 
     def wait(self, committed: int) -> bool:
-        """Keep what was sent to it, if it depends on a later batch of the store than this."""
+        """Hold the buffered packets back if they depend on a later batch than `committed`."""
 
     def release(self, committed: int) -> bool:
-        """Write what does not depend on a later batch; True when some does."""
+        """Write the packets whose batch is committed; True when others still wait."""
 
     def abandon(self) -> None:
-        """Close it without writing what was sent to it."""
+        """Close the connection without writing the buffered packets."""
 
 
-#: Who a message may be owed to: a session, or one of a group.
+#: The receiver of a message: a session, or one member of a group.
 Receiver: TypeAlias = "Session | Share"
 
 
@@ -122,7 +122,7 @@ def _all_taken(account: Account, held: int, what: str, limit: int) -> ProtocolEr
 
 
 class Broker:
-    """All sessions, subscriptions and retained messages, and the rules that join them."""
+    """The sessions, subscriptions and retained messages of one broker."""
 
     def __init__(
         self,
@@ -135,12 +135,11 @@ class Broker:
         self.limits = limits or Limits()
         self.features = features or Features()
         self.rate_limited_log = RateLimitedLog()
-        #: When `tick` was last through.
+        #: When `tick` last finished.
         self.ticked_at = -math.inf
-        #: What escaped somewhere, and was caught where it entered.
+        #: Internal errors that were caught at an entry point.
         self.faults = Faults(self.rate_limited_log)
         self.accounting = Accounting(self.limits, store, faults=self.faults)
-        #: What the broker counts.
         self.counters = self.accounting.counters
         self.sessions: dict[str, Session] = {}
         self.router = Router(access, self.accounting, self.sessions)
@@ -150,8 +149,8 @@ class Broker:
         )
         self.header_cache = HeaderCache()
         self.observer: Observer | None = None
-        #: By topic, what parts of the appliance have to say about who publishes to it. What they
-        #: say holds until `guards_changed`.
+        #: By topic, the parts of the appliance that restrict who may publish to it. Their decisions
+        #: are cached until `guards_changed`.
         self.guards = self.router.guards
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
@@ -160,7 +159,7 @@ class Broker:
         self.clients: set[Ticking] = set()
         #: The outputs of network clients with bytes to write.
         self.unflushed: list[Flushing] = []
-        #: Those with bytes that wait for a commit, in the order in which they do.
+        #: The outputs whose packets wait for a commit, in the order in which they began to wait.
         self._waiting: dict[Flushing, None] = {}
         store.listen(self._committed)
         self._deadlines: list[tuple[float, int, Session]] = []
@@ -178,7 +177,7 @@ class Broker:
 
     @property
     def shared_subscription_count(self) -> int:
-        """Shared subscriptions, whatever the number of their members."""
+        """Shared subscriptions; the number of their members does not matter."""
         return len(self.router.shares)
 
     # --- sessions ------------------------------------------------------------------------------
@@ -192,12 +191,12 @@ class Broker:
         expiry: int,
         will: PendingWill | None,
     ) -> tuple[Session, bool]:
-        """Give an authenticated client its session; returns it and whether it was there before.
+        """Create or resume an authenticated client's session; returns it and whether it existed.
 
         Raises:
-            ProtocolError: 0x85, the client id belongs to another user's session, which is not
-                touched; 0x97, its user has as many connections or sessions as it may have, or its
-                will has no room.
+            ProtocolError: 0x85, the client id belongs to a session of another user, which is left
+                alone; 0x97, the user has reached its limit of connections or sessions, or there is
+                no memory for the will.
         """
         self.counters.cost += CONNECT_COST
         account = self.accounting.accounts.of(identity)
@@ -219,7 +218,7 @@ class Broker:
                 session.close_link(ReasonCode.SESSION_TAKEN_OVER, f"taken over by {identity}")
             if clean_start or not self._is_alive(session):  # [MQTT-3.1.2-4], 3.1.1 [MQTT-3.1.2-6]
                 self._end(session)
-        # The take-over may have ended it, when it was not to outlive its connection.
+        # A session that does not outlive its connection was ended by the take-over.
         session = self.sessions.get(identity.client_id)
         present = session is not None
         if session is None:
@@ -240,21 +239,21 @@ class Broker:
         return session, present
 
     def _make_room(self, account: Account, session: Session | None) -> None:
-        """Let there be room for a client of the account, and for its session if it has none.
+        """Make room for a client of the account, and for its session if it has none.
 
-        As long as there is any, everybody may have it, up to what the configuration allows a user.
-        When there is none, sessions without a client go first. A connection that is in use is ended
-        only for who has less than is sure for each user, where another one has more than that.
+        Free places go to any user, up to the user's configured limit. When there are none, sessions
+        without a client are evicted first. A connection in use is evicted only for a user who has
+        less than the share that each user is guaranteed, and from a user who has more than that.
 
         Raises:
-            ProtocolError: 0x97, nothing may be ended for it; nothing has changed then.
+            ProtocolError: 0x97, nothing may be evicted; nothing was changed.
         """
         needs_connection = session is None or session.link is None
         closing = self._connection_to_end(account) if needs_connection else None
         ending = self._session_to_end(account) if session is None else None
         if closing is not None:
             self._evict(closing, account, "connections")
-            # Its session may have ended with it, which may be room enough.
+            # Its session may have ended with it, so that no other one has to be evicted.
             ending = ending and self._session_to_end(account)
         if ending is not None:
             self._evict(ending, account, "sessions")
@@ -262,10 +261,10 @@ class Broker:
                 self._end(ending)
 
     def _connection_to_end(self, account: Account) -> Session | None:
-        """Whose connection makes room for one of the account; None when none has to.
+        """The session whose connection is evicted for one of the account; None if there is room.
 
         Raises:
-            ProtocolError: 0x97, none may be ended for it.
+            ProtocolError: 0x97, none may be evicted.
         """
         accounts, own = self.accounting.accounts, self.limits.user.connections
         if own is not None and account.connections >= own:
@@ -278,13 +277,14 @@ class Broker:
         raise _all_taken(account, account.connections, "connections", self.limits.connections)
 
     def _session_to_end(self, account: Account) -> Session | None:
-        """Which session makes room for one of the account; None when none has to.
+        """The session that is evicted for one of the account; None if there is room.
 
-        The one whose client has been away for longest, of the user who has most sessions; where
-        that one would not be left with as many as the account gets, of the account itself.
+        It is the session whose client has been away for longest, of the user with the most
+        sessions. If that user would be left with fewer than the account gets, it is one of the
+        account's own sessions.
 
         Raises:
-            ProtocolError: 0x97, none may be ended for it.
+            ProtocolError: 0x97, none may be evicted.
         """
         accounts, own = self.accounting.accounts, self.limits.user.sessions
         has_all_of_its_own = own is not None and account.sessions >= own
@@ -306,7 +306,7 @@ class Broker:
         raise _all_taken(account, account.sessions, "sessions", self.limits.sessions)
 
     def _evict(self, session: Session, account: Account, what: str) -> None:
-        """End the connection of a session, if it has one, as the account needs the place."""
+        """End the connection of a session, if it has one, to make room for the account."""
         self.counters.evicted += 1
         holder = session.account
         key = ("taken back", what, holder.username)
@@ -340,7 +340,7 @@ class Broker:
         )
 
     def claim(self, session: Session, identity: Identity) -> None:
-        """A session that was made for a client that had not logged in yet has found its user."""
+        """Give a session its user, who was not known when a plugin created it."""
         session.identity = identity
         self.accounting.accounts.move(session, self.accounting.accounts.of(identity))
         self.store.session_saved(session)
@@ -348,7 +348,7 @@ class Broker:
         self.router.changed()
 
     def connected(self, session: Session) -> None:
-        """The CONNACK was sent: observers may know, and what waits may go."""
+        """CONNACK was sent: notify the observer, and send what is queued."""
         if self.observer is not None:
             self.observer.connected(session)
         session.unchecked = True
@@ -360,7 +360,7 @@ class Broker:
         if before is not None:
             if before.identity is None:
                 raise ValueError(f"there is a session '{client_id}' already")
-            # It was stored by a version that let clients have such an id; nobody comes for it.
+            # An old version stored it, which allowed clients such an id; no client can resume it.
             log.warning("the session of %s is ended: its client id is the appliance's own", before)
             self._end(before)
         session = Session(client_id, None, self.accounting)
@@ -377,10 +377,10 @@ class Broker:
     def disconnect(
         self, session: Session, link: Link, *, publish_will: bool, expiry: int | None = None
     ) -> None:
-        """The connection behind `link` ended; nothing happens when another has taken over.
+        """The connection behind `link` ended; does nothing if another one has taken over.
 
-        Each part of the end happens, whatever goes wrong in another one: who is gone does not count
-        as connected, and who waits for its departure, as a robot's stop, is told.
+        An error in one step does not prevent the others: the client no longer counts as connected,
+        and callbacks that depend on it, such as the stop of a robot, are called.
         """
         if session.link is not link:
             return
@@ -428,17 +428,17 @@ class Broker:
         )
 
     def _notify_departure(self, session: Session) -> None:
-        for told in tuple(self.departures):
-            self.faults.run("broker.departure", told, session, otherwise=None)
+        for departed in tuple(self.departures):
+            self.faults.run("broker.departure", departed, session, otherwise=None)
 
     def _end(self, session: Session) -> None:
-        """Forget a session; its will, if still due, is published [MQTT-3.1.2-10]."""
+        """Delete a session; its will, if still due, is published [MQTT-3.1.2-10]."""
         if self.sessions.get(session.client_id) is session:
             del self.sessions[session.client_id]
         self.accounting.accounts.ended(session)
         self._publish_will(session)
         session.ends_at = None
-        # Each for itself: what is left of a session that has ended would be there for good.
+        # Each step runs even if another one fails: nothing removes remains of a session later.
         faults = self.faults
         cost = ENDING_COST
         for topic_filter in session.subscriptions:
@@ -446,15 +446,15 @@ class Broker:
             cost += LEAVING_COST + topic_filter.count("/") // LEVELS_PER_COST_UNIT
         self.counters.cost += cost
         faults.run("end.hand_over", self._hand_over_all, session, otherwise=None)
-        for _ in range(2):  # as `_leave`: nobody gives back later what it holds
+        for _ in range(2):  # as in `_leave`: nothing frees later what the session holds
             if faults.run("end.clear", _done, session.clear, otherwise=False):
                 break
         faults.run("end.store", self.store.session_removed, session, otherwise=None)
 
     def _leave(self, session: Session, topic_filter: str) -> None:
-        """Take a subscription out of the tree; when that fails, once more.
+        """Remove a subscription from the tree; retry once if that fails.
 
-        Nobody does it later, and what is left there would be given all that comes, for good.
+        Nothing removes it later, and a leftover would receive matching messages for ever.
         """
         for _ in range(2):
             leave = self.router.leave
@@ -462,18 +462,18 @@ class Broker:
                 return
 
     def _hand_over(self, session: Session) -> None:
-        """A client is gone: what its groups gave it goes to the members who are there."""
+        """A client disconnected: pass its groups' messages on to members that are connected."""
         known = self.router.shares
         shares = {known[name] for name in session.subscriptions if name in known}
         if shares:
             session.hand_over(shares, self._giver(absent_too=False), sent=True)
 
     def _hand_over_all(self, session: Session) -> None:
-        """A session is over: what groups gave it goes to the other members, absent ones too."""
+        """A session ended: pass its groups' messages on to other members, absent ones included."""
         session.hand_over(None, self._giver(absent_too=True), sent=True)
 
     def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
-        """A way to give other members what one of a group leaves; True when that is settled."""
+        """Return a function that delivers a message to another member; True if that succeeded."""
         known: dict[Share, list[Target]] = {}
 
         def give(delivery: Delivery) -> bool:
@@ -488,9 +488,9 @@ class Broker:
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
                 known[share] = members
-            # Who may receive it is asked of those alone that it may go to: there may be thousands.
+            # Only candidates are checked against the rules: a group may have thousands of members.
             target = share.choose(members, message, self.router.may_receive)
-            self.counters.cost += 1 + share.looked // CHECKS_PER_COST_UNIT
+            self.counters.cost += 1 + share.checked // CHECKS_PER_COST_UNIT
             return target is not None and self._deliver_shared(target, message, share)
 
         return give
@@ -510,7 +510,7 @@ class Broker:
             self.faults.caught("broker.will", error, session)
 
     def _publish_late(self, will: PendingWill, session: Session) -> None:
-        """Publish a will; its time to expire begins only now."""
+        """Publish a will; its expiry interval begins only now."""
         if will.expiry is not None:
             will.message.expires_at = self.now + will.expiry
         self.publish(will.message, session)
@@ -538,22 +538,22 @@ class Broker:
         return self.router.route(session, topic_wire)
 
     def use(self, limits: Limits, features: Features) -> None:
-        """Let other limits and features hold from now on.
+        """Apply other limits and features from now on.
 
-        Who holds more than they allow keeps it. What a client was told in its CONNACK stays true
+        A client that holds more than they allow keeps it. What its CONNACK announced stays valid
         while it is connected.
         """
         self.limits = limits
         self.features = features
         self.accounting.use(limits)
-        self.router.changed()  # topics that were too long may not be so any more
+        self.router.changed()  # topics may be too long now, or not any more
 
     def guards_changed(self) -> None:
-        """Guards were set, or would decide otherwise now."""
+        """Guards were added or removed, or their decisions changed."""
         self.router.changed()
 
     def rules_changed(self) -> None:
-        """The access rules changed: nothing cached holds, and what waits is checked again."""
+        """The access rules changed: clear cached decisions, and check queued messages again."""
         self.router.changed()
         for session in self.sessions.values():
             session.unchecked = True  # message by message, as they are sent
@@ -563,8 +563,8 @@ class Broker:
     def publish(self, message: Message, origin: Session) -> ReasonCode:
         """Deliver the message to every session that subscribed to its topic.
 
-        Returns 0x00, 0x10 when nobody did, 0x87 when `origin` may not publish it (told in the
-        log), 0x97 when nobody who subscribed, or not the retained messages, had room for it.
+        Returns 0x00; 0x10 when there is no subscription; 0x87 when `origin` may not publish it,
+        which is logged; 0x97 when no subscriber had room for it, or it could not be retained.
 
         Raises:
             ProtocolError: the topic is not valid.
@@ -592,7 +592,7 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
-        # Without room to keep it who is there still gets it.
+        # If there is no room to retain it, connected subscribers still get it.
         kept = not retain or self.retained.keep(message, origin.account, refusable)
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
@@ -606,19 +606,19 @@ class Broker:
                 delivered = session.deliver(
                     message, qos, retain and as_published, subscription_ids, None, refusable
                 )
-            except Exception as error:  # it is this receiver who misses it, and nobody else
+            except Exception as error:  # only this receiver misses the message
                 delivered = self._not_delivered(session, error)
             if delivered:
                 taken = True
             elif qos:
                 if store_fails and session.persistent:
-                    kept = False  # who publishes has to try again, whoever else has got it
+                    kept = False  # the publisher has to retry, whether or not others got it
                 else:
                     self._log_receiver_full(session, message)
                 full = True
         for share, members in route.shares:
             chosen = share.choose(members, message, None, refusable)
-            self.counters.cost += 1 + share.looked // CHECKS_PER_COST_UNIT
+            self.counters.cost += 1 + share.checked // CHECKS_PER_COST_UNIT
             if chosen is not None and self._deliver_shared(chosen, message, share, refusable):
                 taken = True
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
@@ -631,10 +631,10 @@ class Broker:
         message.publisher = None
         if not kept or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
-        # Who has no room misses it, which is logged: a publisher that was told would send it to
-        # all others again, for one tablet that was left switched off.
-        # 0x10 is for a topic without a subscription. That its client is absent, or may not read
-        # it, is nothing to tell the publisher.
+        # A receiver without room misses the message, which is logged but not reported: the
+        # publisher would send it again to all others, because of one tablet that is switched off.
+        # 0x10 means that the topic has no subscription. The publisher does not learn that a
+        # subscriber is absent or may not read the topic.
         return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
 
     def _deliver_shared(
@@ -656,12 +656,12 @@ class Broker:
         return False
 
     def announce(self, message: Message, session: Session) -> None:
-        """A QoS 2 message has come, and is kept until its PUBREL."""
+        """Notify the topic's guards of a QoS 2 message, which is held until its PUBREL."""
         for guard in self.guards.get(message.topic, ()):
             guard.announced(message, session)
 
     def inspect(self, message: Message, session: Session) -> PublishRejection | None:
-        """What a part of the appliance has against a QoS 2 message, before it is taken."""
+        """Why a part of the appliance rejects a QoS 2 message, if so, before it is accepted."""
         for guard in self.guards.get(message.topic, ()):
             rejection = guard.inspect(message, session)
             if rejection is not None:
@@ -669,7 +669,7 @@ class Broker:
         return None
 
     def shortage(self, route: Fanout, message: Message, origin: Session) -> str:
-        """Why a message was refused for want of room (0x97), in words for its publisher."""
+        """Why a message found no room (0x97), as a text for its publisher."""
         if message.retain and message.payload:
             shortage = self.retained.shortage(message, origin.account)
             if shortage:
@@ -681,19 +681,19 @@ class Broker:
         return f"nobody who subscribed to its topic has room for it{why}"
 
     def without_room(self, route: Fanout, message: Message) -> tuple[frozenset[Receiver], bool]:
-        """Who could not keep a QoS 2 message now, and whether that is everybody.
+        """The receivers that have no room for a QoS 2 message now, and whether all have none.
 
-        It can be refused only as a whole, at its PUBREC: so it is when nobody has room. When some
-        have, it is theirs, and those who have none miss it, counted and logged: one slow reader
-        does not keep it from the others.
+        The message can be refused only for all receivers, in its PUBREC; so it is refused when none
+        has room. When some have, it is delivered to these; the others miss it, which is counted and
+        logged, so that one slow receiver does not keep it from the others.
         """
-        self._count_looks(route)
+        self._count_checks(route)
         full: set[Receiver] = set()
         is_taken = False
         for session, qos, _, _ in route.targets:
             if qos and not session.has_room(message):
                 full.add(session)
-            else:  # as QoS 0 it goes to who is there: a client, or ROS
+            else:  # with QoS 0 a connected client, or ROS, takes it
                 is_taken |= bool(qos) or session.link is not None
         for share, members in route.shares:
             asked = [session for session, qos, _, _ in members if qos]
@@ -704,18 +704,18 @@ class Broker:
         return frozenset(full), bool(full) and not is_taken
 
     def congestions(self, route: Fanout, message: Message) -> list[Congestion]:
-        """Those readers of a QoS 1 or 2 message that have no room for it, but soon will.
+        """The congestions of receivers without room for a QoS 1 or 2 message that soon will have.
 
-        Of a group that is one of these if nobody in it has room.
+        The members of a group are among them only if no member has room.
         """
         size = message.size
-        if len(route.targets) == 1 and not route.shares:  # the most, in a flood
+        if len(route.targets) == 1 and not route.shares:  # the common case in a flood
             session, qos, _, _ = route.targets[0]
             congestion = session.congestion
             if congestion is None or not qos or session.link is None or not session.is_full(size):
                 return []
             return [congestion] if congestion.patience() else []
-        self._count_looks(route)
+        self._count_checks(route)
         full = [
             session
             for session, qos, _, _ in route.targets
@@ -728,14 +728,14 @@ class Broker:
         congestions = [session.congestion for session in full]
         return [each for each in congestions if each is not None and each.patience()]
 
-    def _count_looks(self, route: Fanout) -> None:
-        """All receivers of a route are asked, each on its own."""
-        looks = len(route.targets) + sum(len(members) for _, members in route.shares)
-        self.counters.cost += looks // CHECKS_PER_COST_UNIT
+    def _count_checks(self, route: Fanout) -> None:
+        """Add the cost of checking each receiver of a route."""
+        checks = len(route.targets) + sum(len(members) for _, members in route.shares)
+        self.counters.cost += checks // CHECKS_PER_COST_UNIT
 
     def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
-        """Whether the message, of QoS 1 or 2, would be kept in the store."""
-        self._count_looks(route)
+        """Whether the message, of QoS 1 or 2, would be stored."""
+        self._count_checks(route)
         return (
             message.retain
             or (message.qos == 2 and origin.persistent)
@@ -744,9 +744,9 @@ class Broker:
         )
 
     def release(self, held: UnreleasedPublish, origin: Session, age: float) -> None:
-        """Publish a QoS 2 message at its PUBREL, to all who had room at its PUBREC.
+        """Publish a QoS 2 message at its PUBREL, to all receivers that had room at its PUBREC.
 
-        `age` is in seconds from its coming.
+        `age` is in seconds since its arrival.
         """
         self.counters.cost += HELD_COST
         message, full, _ = held
@@ -760,7 +760,7 @@ class Broker:
             self.counters.publish_dropped += 1
             self.log_rate_limited(origin, "its message cannot be published: %s", error)
             return
-        self._count_looks(route)
+        self._count_checks(route)
         targets: list[Target] = []
         for target in route.targets:
             session, qos, as_published, ids = target
@@ -800,13 +800,13 @@ class Broker:
             self.audit_log.denied(session, action, topic, reason)
 
     def log_rate_limited(self, session: Session, message: str, *args: object) -> None:
-        """Log what a client does wrong, but not every time that it does it again."""
+        """Log a client's mistake; repetitions are rate limited."""
         key = session.client_id, message
         self.rate_limited_log.warning(self.now, key, f"%s {message}", session, *args)
 
     def _log_receiver_full(self, session: Session, message: Message) -> None:
         if session.link is None:
-            return  # that is told at the next tick, once: it is not slow, but away
+            return  # an absent client's full queue is logged once, at the next tick
         self.log_rate_limited(
             session,
             "takes its messages too slowly, its queue is full: %s (it has %d messages, %d bytes)",
@@ -823,7 +823,7 @@ class Broker:
     # --- subscribing ---------------------------------------------------------------------------
 
     def subscribe(self, session: Session, subscription: Subscription) -> tuple[ReasonCode, str]:
-        """Subscribe; returns the granted QoS or the refusal, as it stands in SUBACK, and why."""
+        """Subscribe; returns the code for SUBACK, the granted QoS or a failure, and its reason."""
         refusal = self._check_subscription(session, subscription)
         if refusal is not None:
             code, reason = refusal
@@ -837,7 +837,7 @@ class Broker:
                 session.subscribe(subscription)
                 self.router.join(session, subscription)
             except Exception:
-                # Half of it would be taken for the whole when the client subscribes again.
+                # Undo both: a partial subscription would look complete at the next SUBSCRIBE.
                 session.unsubscribe(topic_filter)
                 self._leave(session, topic_filter)
                 raise
@@ -879,22 +879,22 @@ class Broker:
     def replay_retained(self, session: Session, subscription: Subscription, is_new: bool) -> None:
         """Let the next `Session.pump` send the retained messages that a subscription asks for."""
         if parse_shared(subscription.filter) is not None:
-            return  # the group's members have not asked for them (5.0 section 4.8.2)
+            return  # there are none for shared subscriptions (5.0 section 4.8.2)
         handling = subscription.retain_handling
         if handling == 2 or (handling == 1 and not is_new):  # [MQTT-3.3.1-9..11]
             return
         self.begin_replay(session, subscription)
 
     def begin_replay(self, session: Session, subscription: Subscription) -> None:
-        """The same, of a subscription that has asked for them."""
+        """Let the next `Session.pump` send the retained messages that match the subscription."""
         session.replay(subscription.filter, self._find_retained(session, subscription.filter))
         if session.persistent and subscription.qos:
             self.store.subscribed(session, subscription)
 
     def _find_retained(self, session: Session, topic_filter: str) -> Iterator[Delivery | None]:
-        """What a subscription asks for, checked message by message as the client takes them.
+        """The retained messages for a subscription, each checked when the client can take it.
 
-        None stands for what it may not see, so that passing over many of these takes turns, too.
+        None stands for a message that is skipped, so that skipping many takes several turns, too.
         """
         for found in self.retained.find_in_steps(topic_filter):
             if found is None:
@@ -928,11 +928,11 @@ class Broker:
     # --- time ----------------------------------------------------------------------------------
 
     def schedule(self, session: Session) -> None:
-        """Let `tick` publish an absent client's will, and end its session, when these are due."""
+        """Schedule an absent client's will, and the end of its session, for `tick`."""
         for when in (session.ends_at, session.will_at):
             if when is not None:
                 heapq.heappush(self._deadlines, (when, next(self._order), session))
-        # Those of clients that came back in time hold no more: they are not kept for their days.
+        # Remove outdated entries, of clients that have reconnected, before they are due.
         if len(self._deadlines) > 4 * len(self.sessions) + 64:
             hold = {
                 (when, session.client_id): (when, order, session)
@@ -945,10 +945,10 @@ class Broker:
     def tick(self, now: float) -> float:
         """Let time pass: keep alive, wills, sessions. `now` is in seconds and never goes back.
 
-        Returns when a will or a session falls due next, infinity for never, and `now` when more is
-        due than one turn is for: thousands of clients that fall silent together do not stop the
-        others, nor a hundred wills that are long to deliver. Between two ticks `accounting.now` may
-        be moved on, so that what begins then is not cut short.
+        Returns when the next will or session is due, infinity for never, and `now` when more is due
+        than the cost limit of one tick allows: neither thousands of clients that time out together
+        nor a hundred wills with many receivers stop the other clients. Between two ticks
+        `accounting.now` may be advanced, so that timeouts which begin then are not too short.
         """
         faults = self.faults
         self.accounting.now = faults.now = now
@@ -974,7 +974,7 @@ class Broker:
                 break
             left -= 1
             _, _, session = heapq.heappop(self._deadlines)
-            # Entries are never removed early: one that no longer holds is passed over here.
+            # Entries are not removed early; an outdated one is skipped here.
             if session.link is not None or self.sessions.get(session.client_id) is not session:
                 continue
             try:
@@ -988,7 +988,7 @@ class Broker:
         return self._deadlines[0][0] if self._deadlines else math.inf
 
     def _fall_due(self, session: Session, now: float) -> None:
-        """Publish an absent client's will, or end its session, if it is time for that."""
+        """Publish an absent client's will, and end its session, if these are due."""
         if session.will_at is not None and session.will_at <= now:
             self._publish_will(session)
             self.store.session_saved(session)
@@ -1000,7 +1000,7 @@ class Broker:
     # --- faults --------------------------------------------------------------------------------
 
     def fault(self, entry: str, error: Exception, client: Ticking) -> None:
-        """Count what escaped at an entry, and end the connection that it arose with."""
+        """Count an exception that was caught at an entry, and end the connection it occurred in."""
         self.faults.caught(entry, error, client)
         try:
             client.fault()
@@ -1009,26 +1009,26 @@ class Broker:
             client.cut_off()
 
     def _abandon(self, entry: str, error: Exception, output: Flushing) -> None:
-        """The same, with a connection whose output cannot be relied on any more."""
+        """Count an exception in an output, and close its connection without further output."""
         self.faults.caught(entry, error, output)
         self.faults.run("broker.abandon", output.abandon, otherwise=None)
 
-    # --- bytes out, and the commits that they wait for -----------------------------------------
+    # --- output, and the commits that it waits for ---------------------------------------------
 
     def flush(self) -> None:
-        """Write to every network client what it was sent since the last flush.
+        """Write the packets that network clients were sent since the last flush.
 
-        What depends on changes that the store has not committed waits: acknowledged means kept.
+        Packets that depend on uncommitted changes wait: an acknowledged message is stored.
         """
         overflowed = self.accounting.overflowed
         while overflowed:
             self.faults.run("flush.overflow", self._close_full, overflowed.pop(), otherwise=None)
         if not self.unflushed:
-            # Such as a retained message of the bridge's that had to queue: what a client is sent
-            # later does not depend on it.
+            # Only a part of the appliance has caused changes, such as a retained message of the
+            # bridge that was queued: no later packet to a client depends on it.
             self.store.fresh = False
             return
-        while self.unflushed:  # what was written makes room for what waited
+        while self.unflushed:  # writing makes room for queued messages
             outputs = self.unflushed
             self.unflushed = []
             if self.store.staged:
@@ -1046,7 +1046,7 @@ class Broker:
         )
 
     def _hold_back(self, outputs: list[Flushing]) -> list[Flushing]:
-        """Let those wait whose bytes depend on what is not committed; returns the others."""
+        """Hold outputs back that depend on uncommitted changes; returns the others."""
         self.store.fresh = False
         committed = self.store.committed
         free: list[Flushing] = []
@@ -1062,10 +1062,10 @@ class Broker:
             self.faults.run("commit.hurry", self.store.hurry, otherwise=None)
         return free
 
-    def _committed(self, kept: bool) -> None:
+    def _committed(self, succeeded: bool) -> None:
         waiting, self._waiting = self._waiting, {}
         faults = self.faults
-        if kept:
+        if succeeded:
             committed = self.store.committed
             for output in waiting:
                 try:
@@ -1087,7 +1087,7 @@ class Broker:
         self.flush()
 
     def _recover(self) -> None:
-        """What had to wait for the store can go on."""
+        """The store works again: continue what waited for it."""
         self.accounting.failing = False
         for client in tuple(self.clients):
             try:
@@ -1098,7 +1098,7 @@ class Broker:
             self.faults.run("commit.go_on", session.go_on, otherwise=None)
 
     def close(self, close: Callable[[Session], None]) -> None:
-        """Stop: every connection is closed by `close`; wills are not sent, sessions are kept."""
+        """Stop: close each connection by `close`; publish no wills, and keep stored sessions."""
         for session in list(self.sessions.values()):
             if session.link is not None:
                 session.set_will(None)
@@ -1108,6 +1108,6 @@ class Broker:
 
 
 def _done(work: Callable[..., object], *args: object) -> bool:
-    """Do it: true, as it has not failed then, whatever it returns."""
+    """Call `work`; returns True if it does not raise."""
     work(*args)
     return True

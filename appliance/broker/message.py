@@ -1,4 +1,4 @@
-"""An application message, and its bytes on the wire, encoded once for all who get the same."""
+"""An application message, and its encoding, which receivers of the same packet share."""
 
 from __future__ import annotations
 
@@ -22,30 +22,31 @@ if TYPE_CHECKING:
     from appliance.broker.ports import PublishRejection
     from appliance.broker.session import Session
 
-#: What a queued message takes beside its bytes, roughly: the objects around it, in bytes.
+#: The approximate memory of a queued message beside its own bytes: the objects around it.
 OVERHEAD = 512
 
-#: The longest interval that a property can name, in seconds. More may be left of it than was asked
-#: for, as the clock of a restored message may have gone back.
+#: The longest interval that a property can encode, in seconds. The remaining time can exceed it
+#: because the clock of a restored message may have gone back.
 LONGEST_INTERVAL = 0xFFFF_FFFF
 
-#: Payloads from this size on, in bytes, are not kept a second time while a message waits.
+#: While a message is queued, its encoding is not cached if the payload has at least this size.
 LARGE = 1024
 
 
 def _passed_on(properties: Properties) -> bytes:
-    """What receivers get of them, as it stands in a packet."""
-    expiry = Property.MESSAGE_EXPIRY_INTERVAL  # which is counted down
+    """The properties for the receivers, encoded."""
+    expiry = Property.MESSAGE_EXPIRY_INTERVAL  # sent to each receiver with its remaining time
     return encode_properties({name: properties[name] for name in properties if name != expiry})
 
 
 class Message:
-    """An application message; immutable by convention, shared by all sessions that it is owed to.
+    """An application message, shared by all sessions that it is delivered to.
 
-    `topic_wire` is the topic as it stands in a PUBLISH, its two length bytes included. `expires_at`
-    is in seconds of the broker's clock (`Broker.now`), None when the message does not expire.
-    `properties_wire` are the properties that all receivers get, as they stand in an MQTT 5 packet
-    between packet id and payload: a message keeps no other form of them.
+    By convention nothing changes it but its delivery, see `publisher` and `rejection`.
+    `topic_wire` is the encoded topic, its two length bytes included. `expires_at` is in seconds of
+    the broker's clock (`Broker.now`), None when the message does not expire. `properties_wire` are
+    the properties for all receivers, encoded as in an MQTT 5 packet between packet id and payload;
+    no decoded form of them is stored.
 
     `publisher` is the session that publishes it, while it is delivered: links inside the appliance
     read it. It is None before and after, as a message may outlive the session by days.
@@ -93,23 +94,23 @@ class Message:
         #: `HeaderCache` has the others.
         self.wire_key = 0
         self.wire_head = b""
-        #: Bytes that a queue counts for this message: its topic is there as a string, and twice in
-        #: bytes.
+        #: Bytes that a queue counts for this message; the topic is in memory as a string, and twice
+        #: encoded.
         wire = len(self.topic_wire)
         text = wire if topic.isascii() else text_size(topic)
         self.size = len(payload) + 2 * wire + text + len(self.properties_wire) + OVERHEAD
 
     @property
     def properties(self) -> Properties | None:
-        """The properties that all receivers get, decoded anew each time; None when there are none.
+        """The properties for all receivers, decoded at each call; None when there are none.
 
-        Times to live are not among them, see `expires_at`.
+        The Message Expiry Interval is not among them, see `expires_at`.
         """
         wire = self.properties_wire
         return decode_properties(wire, 0, len(wire), PacketType.PUBLISH)[0]
 
     def encode_head(self, version: int, first: int) -> bytes:
-        """The packet's bytes up to the topic's end; for QoS 0 to the packet's end."""
+        """Encode the packet up to the end of its topic; for QoS 0 the whole packet."""
         packet_id = 2 if first & 0x06 else 0
         properties = self.properties_wire if version == 5 else b""
         size = len(self.topic_wire) + packet_id + len(properties) + len(self.payload)
@@ -118,18 +119,18 @@ class Message:
 
     @property
     def age(self) -> float:
-        """Seconds from its arrival until it was published, see `DelayedMessage`."""
+        """Seconds between its arrival and its publication, see `DelayedMessage`."""
         return 0.0
 
     def dropped(self) -> None:
-        """A session has given it up, whose client was too slow; see `CountedMessage`."""
+        """Note that a session dropped it because the client was too slow, see `CountedMessage`."""
 
     def is_like(self, other: Message) -> bool:
-        """Whether it may be the same message, sent again."""
+        """Whether the other may be the same message, sent again."""
         return self.topic_wire == other.topic_wire and self.payload == other.payload
 
     def settle(self) -> None:
-        """The message is going to wait: what can be encoded again is not kept, if it is large."""
+        """Prepare for being queued: drop a large cached encoding, which can be made again."""
         if len(self.payload) >= LARGE and self.wire_key & 0x06 == 0:  # QoS 0: the whole packet
             self.wire_key = 0
             self.wire_head = b""
@@ -144,10 +145,10 @@ class Message:
         *,
         named: bool = True,
     ) -> bytes:
-        """A whole MQTT 5 packet with what differs a receiver: the slow way.
+        """Encode a whole MQTT 5 packet for one receiver: the slow path.
 
-        Subscription identifiers of the receiver [MQTT-3.3.4-3], its alias for the topic, which
-        stands for the name when not `named`, and the time that is left of the expiry interval
+        It contains the receiver's subscription identifiers [MQTT-3.3.4-3], its topic alias, which
+        replaces the topic unless `named`, and the time that is left of the expiry interval
         [MQTT-3.3.2-6]. The properties are in mosquitto's order.
         """
         before: Properties = {}
@@ -168,10 +169,10 @@ class Message:
 
 
 class HeaderCache:
-    """The encoded beginnings of the message that is being given to its receivers.
+    """Caches the encoded headers of the message that is being delivered.
 
-    They are forgotten with the next one: kept with every message that waits, they would take more
-    than it does.
+    The next message replaces them: cached for each queued message, they would take more memory than
+    the message itself.
     """
 
     def __init__(self) -> None:
@@ -179,7 +180,7 @@ class HeaderCache:
         self._known: dict[int, bytes] = {}
 
     def get(self, message: Message, version: int, first: int) -> bytes:
-        """`Message.encode_head`, once for all who get the same."""
+        """`Message.encode_head`, encoded once for all receivers of the same packet."""
         if message is not self._message:
             self._known.clear()
             self._message = message
@@ -192,21 +193,21 @@ class HeaderCache:
         return head
 
     def clear(self) -> None:
-        """Let the message go."""
+        """Drop the reference to the message, and its headers."""
         self._known.clear()
         self._message = None
 
 
 class SkipCounter(Protocol):
-    """Counts what slow clients are not sent."""
+    """Counts messages that were dropped because a client was slow."""
 
     skipped: int
 
 
 class CountedMessage(Message):
-    """A message of a part of the appliance that counts what slow clients are not sent of it.
+    """A message that counts how often it is dropped because a client is slow.
 
-    Whoever makes one sets `skip_counter`.
+    Its creator must set `skip_counter`.
     """
 
     __slots__ = ("skip_counter",)
@@ -218,10 +219,11 @@ class CountedMessage(Message):
 
 
 class DelayedMessage(Message):
-    """A message that was published some time after its client had sent it for the first time.
+    """A message that is published some time after its client first sent it.
 
-    `age` is that time in seconds, infinity where it is not known: what is sent again after a lost
-    connection, a QoS 2 message that waited for its PUBREL. For most receivers it is as any other.
+    `age` is that time in seconds; it is infinity where it is unknown. Examples are a message that
+    is sent again after a lost connection, and a QoS 2 message that waited for its PUBREL. Only
+    receivers that reject old messages, such as command routes, look at the age.
     """
 
     __slots__ = ("_age",)

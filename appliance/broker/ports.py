@@ -1,4 +1,4 @@
-"""What the broker needs from outside, as Protocols, and the values that cross the border."""
+"""The broker's ports: Protocols that others implement, and the values passed through them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Action(Enum):
-    """What a client wants to do with a topic, or, for SUBSCRIBE, with a topic filter."""
+    """An operation on a topic that needs permission; for SUBSCRIBE it is on a topic filter."""
 
     PUBLISH = "publish"
     SUBSCRIBE = "subscribe"
@@ -28,7 +28,7 @@ class Action(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who an authenticated client is; `username` is None for an anonymous one."""
+    """The identity of an authenticated client; `username` is None for an anonymous one."""
 
     username: str | None
     client_id: str
@@ -40,9 +40,9 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Whether something is allowed; `reason` names the rule, for the log.
+    """Whether an operation is allowed; `reason` names the rule, for the log.
 
-    A refusal that is `pending` holds only until those who decide have answered.
+    A `pending` refusal is provisional: it holds until the answer of a plugin arrives.
     """
 
     allowed: bool
@@ -55,10 +55,10 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a client does not come in: `code` for the client, `reason` only for the log.
+    """Why a login is refused: `code` is sent to the client, `reason` is only logged.
 
-    The client is not told whether the user exists, so its code is NOT_AUTHORIZED for a wrong
-    password, an unknown user and none at all, as mosquitto does.
+    The code must not reveal whether the user exists: it is NOT_AUTHORIZED for a wrong password,
+    an unknown user and a missing user name alike, as in mosquitto.
     """
 
     code: ReasonCode
@@ -67,36 +67,36 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """An enhanced authentication succeeded; `data` is the last that the client is sent."""
+    """The success of an enhanced authentication; `data` goes into the last packet to the client."""
 
     username: str
     data: bytes
 
 
 class Exchange(Protocol):
-    """One enhanced authentication under way (5.0 section 4.12): AUTH packets to and fro."""
+    """One enhanced authentication in progress: an exchange of AUTH packets (5.0 section 4.12)."""
 
     def step(self, data: bytes) -> bytes | Accepted | Refusal:
-        """Take what the client sent; returns the next challenge, or how it ended. No I/O."""
+        """Process the client's data; returns the next challenge or the outcome. Does no I/O."""
 
 
 class Access(Protocol):
-    """The access rules in force. `epoch` grows by one whenever they change."""
+    """The access rules in force. `epoch` is incremented whenever they change."""
 
     epoch: int
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
-        """Decide at once, without I/O; `topic` is a filter when `action` is SUBSCRIBE."""
+        """Decide immediately, without I/O; `topic` is a filter when `action` is SUBSCRIBE."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeerStatus:
-    """How a client's computer answers, whatever the client says; times in seconds.
+    """The state of the connection to a client's computer, as TCP knows it; times in seconds.
 
-    `silence` is how long nothing has come from it, not even an acknowledgement of the network's;
-    infinity where that cannot be known. `has_unread`: bytes have come that were not looked at yet.
-    `flowing` is for how long it has sent without a pause, `held` for how long what it sends now may
-    have waited in here, as it was not read.
+    `silence` is the time since anything arrived from that computer, TCP acknowledgements included;
+    it is infinity where that is unknown. `has_unread` says that bytes have arrived and are not yet
+    processed. `flowing` is for how long the client has sent without a pause. `held` is for how long
+    what the client sends now may have waited here because its connection was not read.
     """
 
     round_trip: float = 0.0
@@ -106,28 +106,31 @@ class PeerStatus:
     held: float = 0.0
 
 
-#: What is on this computer is there as long as its connection is.
+#: The status of a peer on this computer: it is alive as long as its connection is open.
 LOCAL_PEER = PeerStatus()
 
-#: A client's identity, what it wants to do, and the topic or filter: what rules are asked.
+#: The arguments of `Access.decide`: a client's identity, the action, and the topic or filter.
 AccessQuery: TypeAlias = "tuple[Identity, Action, str]"
 
 
 class PendingDecisions(Protocol):
-    """Those who may have to ask somebody else before they decide."""
+    """Access rules that may have to wait for a plugin's answer before they decide."""
 
     @property
     def timeout(self) -> float:
-        """For how many seconds a packet waits for them."""
+        """Seconds that a packet waits for a decision."""
 
     def is_pending(self, question: AccessQuery, wake: Callable[[], None]) -> bool:
-        """Whether there is no answer yet; `wake` is then called when there may be one."""
+        """Whether the decision is outstanding; if so, `wake` is called when it may be known."""
 
 
 class Link(Protocol):
-    """The way to the client of a session: a network connection, or the bridge."""
+    """The outgoing side of a session: a network connection, or a part of the appliance.
 
-    #: False while the other side takes nothing more; `Session.pump` is called when it does again.
+    `Session.pump` is called when the link becomes writable again.
+    """
+
+    #: False while the receiver applies backpressure.
     writable: bool
 
     def publish(
@@ -142,39 +145,41 @@ class Link(Protocol):
         """Send a PUBLISH; `packet_id` is 0 for QoS 0."""
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """Send a QoS 0 PUBLISH as it came in; False, and nothing sent, when it cannot stay so.
+        """Forward a received QoS 0 PUBLISH unchanged; False if this receiver needs another packet.
 
-        The short cut of the data path; `publish` is the way that always works.
+        This is the fast path; `publish` always works.
         """
 
     def pubrel(self, packet_id: int) -> None:
         """Send a PUBREL."""
 
     def is_behind(self) -> bool:
-        """Whether a large message of QoS 0 has to wait in the session, as what was sent before has
-        not gone out; `Session.pump` is called when it has."""
+        """Whether a large QoS 0 message must wait in the session until earlier output is sent.
+
+        `Session.pump` is called when it is.
+        """
 
     def later(self) -> None:
-        """Call `Session.pump` once more when the other clients have had their turn."""
+        """Call `Session.pump` again after the other clients have had their turn."""
 
     def peer_status(self) -> PeerStatus:
-        """How the client's computer answers."""
+        """The state of the connection to the client's computer."""
 
     def probe(self) -> None:
-        """Have the client's computer answer, within two seconds, if it can: `peer_status` tells."""
+        """Make the client's computer answer within two seconds, if it is alive."""
 
     def withhold(self, seconds: float) -> None:
-        """Let nothing out for so long, acknowledgements included; with 0, no longer."""
+        """Send nothing for this time, not even acknowledgements; 0 ends it."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
-        """Tell the client why, where the protocol can, and end the connection."""
+        """Send the reason to the client, where the protocol can, and close the connection."""
 
 
 class InsideLink:
-    """The link of a session that a part of the appliance has: it takes everything at once.
+    """The link of a session inside the appliance; it never applies backpressure.
 
-    As it is it takes nothing, which is enough for who only publishes. Whoever subscribes overrides
-    `publish`, and does so with QoS 0 and without asking for retained messages.
+    This class drops all messages, which is enough for a session that only publishes. A session that
+    subscribes overrides `publish`, and subscribes with QoS 0 and without retained messages.
     """
 
     writable = True
@@ -188,106 +193,106 @@ class InsideLink:
         retain: bool,
         subscription_ids: list[int] | None,
     ) -> None:
-        """A message that was subscribed to."""
+        """Take a message that matches a subscription."""
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """It takes messages, not packets."""
+        """Ask for `publish`: inside, messages are taken, not packets."""
         return False
 
     def pubrel(self, packet_id: int) -> None:
-        """It has no QoS 2."""
+        """Do nothing: QoS 2 is not used inside."""
 
     def is_behind(self) -> bool:
-        """It takes everything at once."""
+        """Never: every message is taken immediately."""
         return False
 
     def later(self) -> None:
-        """It has no retained messages to go on with."""
+        """Do nothing: no retained messages are replayed inside."""
 
     def peer_status(self) -> PeerStatus:
-        """It is here."""
+        """Always alive."""
         return LOCAL_PEER
 
     def probe(self) -> None:
-        """It is here."""
+        """Do nothing: it is in this process."""
 
     def withhold(self, seconds: float) -> None:
-        """Nothing is acknowledged."""
+        """Do nothing: nothing is acknowledged."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
-        """There is no connection to close."""
+        """Do nothing: there is no connection."""
 
 
 class Store(Protocol):
-    """Keeps sessions and retained messages through a restart.
+    """Persistence of sessions and retained messages across restarts.
 
-    Each method stages a change. Changes are committed in batches, which are numbered from 1 on.
-    What depends on a change is sent only when its batch is committed.
+    Each method stages a change. Changes are committed in batches, which are numbered from 1. A
+    packet that acknowledges a change is sent only when the change's batch is committed.
     """
 
-    #: True while there are changes that something may depend on, and that are not committed, or
-    #: somebody waits for a batch, whatever is in it.
+    #: True while a change that a packet may depend on is not committed, or while a packet waits
+    #: for a batch, whatever that contains.
     staged: bool
 
     #: True when such a change was staged since this was last set to False.
     fresh: bool
 
-    #: The batch that changes go into now, and the last one that is committed.
+    #: The batch that changes are staged in now, and the last one that is committed.
     batch: int
     committed: int
 
-    #: Bytes of the messages that are kept, and the most that these may be.
+    #: Bytes of the stored messages, and their limit.
     bytes: int
     size: int
 
     def listen(self, callback: Callable[[bool], None]) -> None:
-        """Call back whenever a batch is done with: with True when it is kept.
+        """Call back after each batch: with True when it is committed, with False when that failed.
 
-        With False when it could not be: then it is tried again, with all that is staged meanwhile,
-        for as long as it takes, and `staged` is False until that succeeds, though nothing is kept.
+        A failed batch is retried, together with what is staged meanwhile, until it succeeds. Until
+        then `staged` is False although nothing is stored.
         """
 
     def hurry(self) -> None:
-        """Commit soon: somebody waits."""
+        """Commit soon: packets wait for it."""
 
     def session_saved(self, session: Session) -> None:
-        """The session was made, or its owner, its expiry or its will changed."""
+        """The session was created, or its owner, its expiry or its will changed."""
 
     def session_removed(self, session: Session) -> None:
-        """The session and all that belongs to it ended."""
+        """The session ended, with everything that belongs to it."""
 
     def subscribed(self, session: Session, subscription: Subscription) -> None:
-        """The session subscribed, or anew, or its `replays` of that filter begin or end."""
+        """A subscription was added or replaced, or its replay of retained messages changed."""
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
-        """The session unsubscribed."""
+        """A subscription was removed."""
 
     def retained(self, message: Message, owner: Account) -> None:
-        """The message is its topic's retained message now; an empty payload deletes it.
+        """The message was retained; one with an empty payload deleted its topic's message.
 
-        `owner` is whose client has published it.
+        `owner` is the account of the publisher.
         """
 
     def queued(self, session: Session, delivery: Delivery) -> None:
-        """A QoS 1 or 2 message is owed to the session, and waits."""
+        """A QoS 1 or 2 message was queued for the session."""
 
     def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
-        """A message is on its way under that packet id, whether it was queued before or not."""
+        """A message was sent under that packet id, whether it was queued before or not."""
 
     def settled(self, session: Session, delivery: Delivery) -> None:
-        """A message that was owed is acknowledged, expired or dropped."""
+        """A queued or sent message was acknowledged, expired or dropped."""
 
     def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
-        """PUBREC came for a QoS 2 message: PUBREL is all that is left of it."""
+        """PUBREC arrived for a QoS 2 message: only its PUBREL is left to be sent."""
 
     def completed(self, session: Session, packet_id: int) -> None:
-        """PUBCOMP came."""
+        """PUBCOMP arrived."""
 
     def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
-        """A QoS 2 message of the session's client waits for its PUBREL."""
+        """A QoS 2 message from the session's client waits for its PUBREL."""
 
     def unheld(self, session: Session, packet_id: int) -> None:
-        """It does not any more."""
+        """It does not wait any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,27 +304,27 @@ class PublishRejection:
 
 
 class PublishGuard(Protocol):
-    """A part of the appliance that has a say in who publishes to its topic."""
+    """A part of the appliance that restricts who may publish to its topic, beside the rules."""
 
     def decide(self, session: Session) -> Decision:
-        """Whether the session may; it holds until `Broker.guards_changed`."""
+        """Whether the session may publish; the decision holds until `Broker.guards_changed`."""
 
     def announced(self, message: Message, session: Session) -> None:
-        """A QoS 2 message has come, which will be published with its PUBREL."""
+        """A QoS 2 message has arrived; it will be published at its PUBREL."""
 
     def inspect(self, message: Message, session: Session) -> PublishRejection | None:
-        """What is wrong with a QoS 2 message, which can be refused before its PUBREL only, and in
-        MQTT 5 only."""
+        """Why a QoS 2 message cannot be used, if so: only MQTT 5 can refuse it, and only before
+        its PUBREL."""
 
     def refused(self, session: Session) -> None:
-        """A message of the session was refused, by this guard, another or the access rules."""
+        """A message of the session was refused, by this guard, another one or the access rules."""
 
 
 class Observer(Protocol):
-    """Told of what happens in the broker: amqtt's plugins listen here."""
+    """Notified of events in the broker: amqtt's plugins are called from here."""
 
     def connected(self, session: Session) -> None:
-        """A client was authenticated and its session is there."""
+        """A client was authenticated and has its session."""
 
     def disconnected(self, session: Session) -> None:
         """The client's connection ended."""
@@ -328,80 +333,80 @@ class Observer(Protocol):
         """A subscription was granted."""
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
-        """A subscription ended on the client's wish."""
+        """The client unsubscribed."""
 
     def published(self, session: Session, message: Message) -> None:
         """A client's message was accepted and is about to be delivered."""
 
     def refused(self, session: Session, message: Message) -> None:
-        """A client's message was not allowed and goes nowhere."""
+        """A client's message was not allowed and is not delivered."""
 
     def retained(self, message: Message) -> None:
-        """A retained message was kept, or, with an empty payload, deleted."""
+        """A message was retained, or, with an empty payload, deleted one."""
 
 
 @dataclass(frozen=True, slots=True)
 class TlsInfo:
-    """How a connection is secured: the version of TLS, and the name in the client's certificate.
-
-    Both are empty where there is none.
-    """
+    """The TLS version of a connection, and the name in the client's certificate; empty for none."""
 
     version: str = ""
     certificate: str = ""
 
 
 class Transport(Protocol):
-    """The connection under a client, as a listener implements it."""
+    """The network connection of a `ClientHandler`, as the listeners implement it."""
 
-    #: Where the client is, for the log: "127.0.0.1:54321".
+    #: The client's address, for the log: "127.0.0.1:54321".
     address: str
 
     def authenticate(self, connect: Connect) -> None:
-        """Find out who it is, in the background; `Client.accept` or `Client.refuse` ends it."""
+        """Check the login in the background, then call `ClientHandler.accept` or `.refuse`."""
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
 
     def now(self) -> float:
-        """Seconds of a clock that never goes back, finer than the broker's."""
+        """Seconds of a monotonic clock that is finer than the broker's."""
 
     def admit(self, account: Account) -> str:
-        """The client logs in as that user: why it may not from where it is, or nothing.
+        """Why that user may not log in from this address; empty if it may.
 
-        With that the time limit for the login is over.
+        This ends the time limit for the login.
         """
 
     def holds(self, size: int) -> None:
-        """So many bytes came and wait for more: the next chunk, however small, may be costly."""
+        """Note that `size` bytes of partial packets are buffered: even a small chunk may complete
+        them, and be costly."""
 
     def tls_info(self) -> TlsInfo:
-        """What protects the connection, and who its certificate says that the client is."""
+        """The TLS version, and the name in the client's certificate."""
 
     def later(self) -> None:
-        """Call `Client.send_on` in a later turn of the loop, when others had theirs."""
+        """Call `ClientHandler.send_on` in a later turn, after the other clients."""
 
     def stop_reading(self) -> None:
-        """Read nothing more until the next `Client.send_on`."""
+        """Stop reading until the next `ClientHandler.send_on`."""
 
     def wait(self, seconds: float) -> None:
-        """Call `Client.send_on` after so many seconds, if not before; read on until then."""
+        """Call `ClientHandler.send_on` after this time at the latest; keep reading until then."""
 
     def proceed(self) -> None:
-        """What it waits for is there: call `Client.send_on` when others had their turn."""
+        """The client need not wait any longer: call `ClientHandler.send_on` in a later turn."""
 
     def write(self, chunks: list[bytes]) -> None:
-        """Write the chunks, one behind the other."""
+        """Write the chunks in this order."""
 
     def is_behind(self) -> bool:
-        """Whether some of it waits here, as the network takes no more; when it does,
-        `Output.caught_up` is called, or `Output.resume_writing`."""
+        """Whether written bytes are still buffered here because the network is slow.
+
+        When they have been sent, `Output.caught_up` or `Output.resume_writing` is called.
+        """
 
     def peer_status(self) -> PeerStatus:
-        """How the computer at the other end answers."""
+        """The state of the connection to the client's computer."""
 
     def probe(self) -> None:
-        """Have it answer within two seconds, if it can."""
+        """Make that computer answer within two seconds if it is alive."""
 
     def withhold(self, seconds: float) -> None:
         """Write nothing for so long; with 0, no longer."""
@@ -414,10 +419,10 @@ class Transport(Protocol):
 
 
 class AuditLog(Protocol):
-    """Told of who comes, who is refused, and who leaves: an audit log. Not of messages."""
+    """Notified of logins, refusals and ends of connections, for the audit log; not of messages."""
 
     def connected(self, session: Session, address: str, version: int, tls_info: TlsInfo) -> None:
-        """A client came in, with this version of MQTT."""
+        """A client logged in, with this version of MQTT."""
 
     def refused(
         self,
@@ -428,10 +433,10 @@ class AuditLog(Protocol):
         username: str | None = None,
         tls_info: TlsInfo | None = None,
     ) -> None:
-        """A connection, or the client on it, did not come in; who it is, it said itself."""
+        """A connection or a login was refused; id and user name are the client's own claims."""
 
     def denied(self, session: Session, action: Action, topic: str, reason: str) -> None:
-        """The rules do not let a client publish or subscribe."""
+        """The access rules denied a PUBLISH or SUBSCRIBE."""
 
     def disconnected(self, session: Session, address: str, reason: str) -> None:
         """A client's connection ended."""
@@ -439,7 +444,7 @@ class AuditLog(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """What the standard leaves to the server's operator; see `broker` in appliance.yaml."""
+    """Options that the standard leaves to the server's operator; `broker` in appliance.yaml."""
 
     check_payload_format: bool = False
     reason_strings: bool = False
@@ -447,16 +452,16 @@ class Features:
     response_information: str = ""
 
 
-#: What client ids of sessions inside the appliance begin with, and no client's.
+#: The prefix of the client ids of sessions inside the appliance; clients may not use it.
 INSIDE = "_"
 
-#: The largest packet that a client can count on without being told, in bytes.
+#: The largest packet, in bytes, that is accepted where CONNACK announces no limit.
 USUAL_PACKET_SIZE = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class UserLimits:
-    """What one user may have of what all share, see `accounts`; None is as others leave room."""
+    """Limits of one user, see `accounts`; None lets a user have more while others leave room."""
 
     connections: int | None = None
     sessions: int | None = None
@@ -469,7 +474,7 @@ class UserLimits:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Bounds of everything that a client can make grow; see `broker.limits` in appliance.yaml."""
+    """Limits of everything that clients can make grow; see `broker.limits` in appliance.yaml."""
 
     connections: int = 1000
     packet_size: int = USUAL_PACKET_SIZE
@@ -477,7 +482,7 @@ class Limits:
     queue_messages: int = 1000
     queue_bytes: int = 16 * 1024 * 1024
     queue_full: str = "refuse"
-    #: QoS 0 messages that wait for a slow client; 0: the latest of each topic.
+    #: QoS 0 messages that are queued for a slow client; 0: only the latest of each topic.
     keep: int = 0
     inflight: int = 20
     subscriptions: int = 1000

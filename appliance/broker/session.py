@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 class Delivery(NamedTuple):
     """A message on its way to one session.
 
-    On the data path it is a plain tuple, made with `cast`, which costs a fifth. The compiled broker
-    has to know it by a class nevertheless: it would take a tuple apart between two functions and
-    make another, and the store tells deliveries apart by their identity.
+    On the data path it is a plain tuple, made with `cast`, which costs a fifth. It still needs a
+    class: mypyc would unpack a tuple that is passed between functions and create another one, but
+    the store distinguishes deliveries by their identity.
     """
 
     message: Message
@@ -38,50 +38,52 @@ class Delivery(NamedTuple):
     share: Share | None
 
 
-#: Retained messages that a new subscription is sent in one turn of the event loop, and those it may
-#: not see that are passed over: some milliseconds, then it is the turn of other clients.
+#: Retained messages that are sent or skipped for new subscriptions in one turn of the event loop:
+#: some milliseconds, then it is the turn of other clients.
 REPLAYED_A_TURN = 512
 
-#: Bytes from which on a message is large: an image or a map, not a state or a command. To a slow
-#: client it goes when everything else that waits has gone, see `Link.is_behind`.
+#: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
+#: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
 LARGE_MESSAGE = 32 * 1024
 
-#: What a subscription takes, roughly, in bytes: itself, and each level that its filter has.
+#: The approximate memory of a subscription, in bytes: itself, and each level of its filter.
 SUBSCRIPTION_SIZE = 600
 LEVEL_SIZE = 350
 
 
-#: What QoS 2 keeps of a message beside it until its PUBREL, and of each that had no room for it.
+#: Bytes counted for a held QoS 2 message beside itself, and for each receiver without room.
 HELD_SIZE = 200
 FULL_SIZE = 64
 
 
 def subscription_size(topic_filter: str) -> int:
-    """Bytes that are counted for a subscription: the filter is in the session, and in the tree."""
+    """Bytes counted for a subscription: its filter is in the session, and in the tree."""
     return SUBSCRIPTION_SIZE + 2 * text_size(topic_filter) + LEVEL_SIZE * topic_filter.count("/")
 
 
-#: Keys for messages that wait, in the order of their coming.
+#: Keys for queued QoS 0 messages, in their order of arrival.
 _NUMBERS = itertools.count()
 
 
 class UnreleasedPublish(NamedTuple):
-    """A QoS 2 message that waits for PUBREL, and who had no room for it at its PUBREC."""
+    """A QoS 2 message that waits for PUBREL, and the receivers without room at its PUBREC."""
 
     message: Message
     full: frozenset[Session | Share]
-    #: When it came, in seconds of `Wire.now`; not known when it was sent on another connection.
+    #: When it arrived, in seconds of `Transport.now`; unknown if it was sent on another connection.
     since: float = -math.inf
 
 
 def held_size(held: UnreleasedPublish) -> int:
-    """Bytes that are counted for it."""
+    """Bytes that are counted for a held QoS 2 message."""
     return held.message.size + HELD_SIZE + FULL_SIZE * len(held.full)
 
 
 class PendingWill(NamedTuple):
-    """A will, the seconds that it waits after the connection ended, and those that it is good for
-    once it is published; None for ever."""
+    """A will, its delay after the end of the connection, and its expiry interval once published.
+
+    Both times are in seconds; the expiry is None for a will that does not expire.
+    """
 
     message: Message
     delay: int
@@ -94,10 +96,10 @@ def _wrong(kind: str, packet_id: int) -> ProtocolError:
 
 
 class Session:
-    """The state that the standard keeps for a client id (sections 3.1.1 of 3.1.1, 4.1 of 5.0).
+    """The session state of a client id (3.1.1 section 3.1.1, 5.0 section 4.1).
 
-    `identity` is None for a session inside the appliance, which may do everything. `expiry` is the
-    time in seconds that the session is kept after its connection ended.
+    `identity` is None for a session inside the appliance, which has all rights. `expiry` is the
+    time in seconds for which the session outlives its connection.
     """
 
     __slots__ = (
@@ -139,51 +141,50 @@ class Session:
         self.client_id = client_id
         self.identity = identity
         self.accounting = accounting
-        #: Of its user, whose memory it takes.
+        #: The account of its user, in which its memory is counted.
         self.account = accounting.accounts.of(identity)
         self.link: Link | None = None
         self.expiry = 0
         #: When its connection began, in seconds of the broker's clock.
         self.connected_at = accounting.now
-        #: Whether its last connection ended with a DISCONNECT that its will is not for.
+        #: Whether its last connection ended with a DISCONNECT that discards the will.
         self.ended_well = False
         self.ends_at: float | None = None
-        #: Whether the log says that its queue is full, while its client is away.
+        #: Whether it was logged that the queue has become full during the client's absence.
         self.is_full_logged = False
         self.will: PendingWill | None = None
         self.will_at: float | None = None
         self.subscriptions: dict[str, Subscription] = {}
         #: Sent and not acknowledged, in the order sent; None after PUBREC [MQTT-4.3.3-8].
         self.inflight: dict[int, Delivery | None] = {}
-        #: Of those in flight, the ids that a new connection was not sent yet.
+        #: Packet ids in flight that were not yet sent again on the new connection.
         self.resends: deque[int] = deque()
-        #: Messages that may be in flight; none while those that are could not be kept.
+        #: The number of messages that may be in flight; 0 while the store cannot store them.
         self.window = self._agreed_window = accounting.limits.inflight
-        #: The batch of the store that what this session sends depends on.
+        #: The batch of the store that the session's output depends on.
         self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
-        #: While publishers may have to wait for its client.
+        #: Set while publishers may have to wait for its client.
         self.congestion: Congestion | None = None
-        #: Retained messages of new subscriptions, by filter; they go before anything newer. They
-        #: are looked up when their turn comes, so that a slow client's take no memory.
+        #: Retained messages of new subscriptions, by filter; they are sent before newer messages.
+        #: Each is looked up when it can be sent, so that a slow client's replay takes no memory.
         self.replays: dict[str, Iterator[Delivery | None]] = {}
         self.replays_left = REPLAYED_A_TURN
-        #: QoS 0, waiting for a slow client, oldest first: the newest of each topic, or by number
-        #: when the limit `keep` says how many.
+        #: QoS 0 messages for a slow client, oldest first: the latest of each topic or, if the limit
+        #: `keep` is set, that many messages, by number.
         self.latest: dict[str | int, Delivery] = {}
-        #: The large ones among these, unless the limit `keep` says how many wait: then their order
-        #: is kept.
+        #: The large ones among these; empty if the limit `keep` is set, which preserves the order.
         self.large: dict[str | int, Delivery] = {}
         #: QoS 2 from the client, waiting for PUBREL.
         self.received: dict[int, UnreleasedPublish] = {}
         self.bytes = 0
-        #: Whether the access rules have changed since they let in what waits.
+        #: Whether the access rules have changed since they allowed the queued messages.
         self.unchecked = False
-        #: Topics that the client may receive, or not; valid while the epoch is the access rules'.
+        #: Whether the client may receive a topic; valid while the epoch is the access rules'.
         self.readable: dict[str, bool] = {}
         self.readable_epoch = -1
-        #: Where this session's messages go, by topic; valid while `epoch` is the broker's.
+        #: The routes of what this session publishes, by topic; valid while `epoch` is the router's.
         self.routes: dict[bytes, Fanout] = {}
         self.epoch = -1
         self._last_packet_id = 0
@@ -205,7 +206,7 @@ class Session:
 
     @property
     def ready(self) -> bool:
-        """Whether a message would be on its way at once."""
+        """Whether a message would be sent immediately."""
         link = self.link
         return (
             link is not None
@@ -232,12 +233,12 @@ class Session:
         link = self.link
         if not qos:
             if link is None:
-                return False  # QoS 0 is not kept for an absent client, as the standard allows
-            if link.writable:  # then replays wait for the window only, which is no matter of QoS 0
+                return False  # QoS 0 is not queued for an absent client, as the standard allows
+            if link.writable:  # replays then wait for the window only, which QoS 0 does not need
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
-        # `fits` and `_count`, written out here and in `_send`: two calls less a message.
+        # `fits` and `_count` are inlined here and in `_send`, which saves two calls per message.
         accounting = self.accounting
         size = message.size
         if (
@@ -265,14 +266,14 @@ class Session:
             )
         if accounting.limits.queue_full == "disconnect" and link is not None:
             accounting.overflowed.append(self)
-        self._is_full(size)
+        self._report_full(size)
         self._drop(message)
         return False
 
     def deliver_promised(self, delivery: Delivery) -> None:
-        """Deliver a QoS 2 message that there was room for at its PUBREC, though it is gone now.
+        """Deliver a QoS 2 message that had room at its PUBREC, even if there is none now.
 
-        PUBREL cannot be refused. What is kept like this above the limits is no more than what all
+        A PUBREL cannot be refused. The limits are exceeded by no more than the messages that all
         publishers have between PUBREC and PUBREL.
         """
         if not self.deliver(*delivery):
@@ -297,15 +298,15 @@ class Session:
     def _enqueue(
         self, delivery: Delivery, refusable: bool = True, *, promised: bool = False
     ) -> bool:
-        """Let it wait; False when it had to be stored and cannot be, which is counted."""
+        """Queue it; False, and counted as dropped, when it has to be stored and cannot be."""
         message = delivery[0]
         if self.expiry:
             if not promised and not self._may_store(message, refusable):
                 if not (refusable and self.accounting.failing):
-                    self._is_full(message.size)
+                    self._report_full(message.size)
                 self.accounting.counters.publish_dropped += 1
                 return False
-            self._staged()
+            self._depend_on_batch()
             self.accounting.store.queued(self, delivery)
         message.settle()
         self._count(message)
@@ -314,12 +315,12 @@ class Session:
             self._congest()
         return True
 
-    def _staged(self) -> None:
-        """What is sent from now on depends on what is about to be staged."""
+    def _depend_on_batch(self) -> None:
+        """Make later output depend on the change that is about to be staged."""
         self.batch = self.accounting.store.batch
 
     def _drop_oldest_for(self, message: Message, refusable: bool) -> bool:
-        """Make room at the old end of the queue; False when even then there is none."""
+        """Drop the oldest queued messages to make room; False when that is not enough."""
         accounting = self.accounting
         if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
             return False
@@ -328,7 +329,7 @@ class Session:
         while self.queue and not (
             len(self.queue) < accounting.limits.queue_messages and self.fits(message.size)
         ):
-            self._is_full(message.size)
+            self._report_full(message.size)
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
@@ -336,20 +337,20 @@ class Session:
         return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
-        """Let `pump` send retained messages, behind others; asked for again, they begin anew.
+        """Let `pump` send retained messages, after other replays; a repeated replay starts anew.
 
-        None among the deliveries is a message that is not for this session.
+        A None among the deliveries is a message that is skipped.
         """
         self.replays.pop(topic_filter, None)
         self.replays[topic_filter] = deliveries
 
     def take_turn(self) -> None:
-        """Send what waits; the others have had their turn since the last time."""
+        """Send what is queued, in a new turn: other clients have had theirs in between."""
         self.replays_left = REPLAYED_A_TURN
         self.pump()
 
     def pump(self) -> None:
-        """Send what waits, as far as the window and the client allow."""
+        """Send what is queued, as far as the window and the link allow."""
         link = self.link
         if link is None:
             return
@@ -384,7 +385,7 @@ class Session:
                 self._cannot_be_sent(error, packet_id)
 
     def _pump_replays(self, link: Link) -> bool:
-        """Send retained messages; False when there are more than one turn is for."""
+        """Send retained messages; False when the limit of one turn is reached."""
         for topic_filter, deliveries in list(self.replays.items()):
             needs_window = self.subscriptions[topic_filter].qos > 0  # QoS 0 does not [MQTT-3.3.4-8]
             while link.writable and not (needs_window and len(self.inflight) >= self.window):
@@ -410,7 +411,7 @@ class Session:
                     if qos
                     else message.size > LARGE_MESSAGE and link.is_behind()
                 ):
-                    # More of these when some are acknowledged, or what was sent has gone out.
+                    # Continue when messages are acknowledged, or when output has been written.
                     self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
                     break
                 if qos:
@@ -426,13 +427,13 @@ class Session:
             self._uncount(message)
             if self.accounting.has_expired(message) or self._is_forbidden(message):
                 self._settled(delivery)
-                # Its number is used up, as by mosquitto, which gives them out on queueing.
+                # Its packet id is skipped, as in mosquitto, which assigns ids on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
                 self._send(link, delivery)
 
     def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
-        """Drop what waits and is too old; returns how many messages that were."""
+        """Drop queued messages that are too old; returns their number."""
         kept = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
         dropped = len(self.queue) - len(kept)
         if dropped:
@@ -447,20 +448,20 @@ class Session:
         return dropped
 
     def open_window(self, size: int) -> None:
-        """Let so many messages be in flight, once it can be kept that they are."""
+        """Allow `size` messages in flight, or none as long as the store fails."""
         self._agreed_window = size
         self.window = 0 if self.accounting.failing and self.expiry else size
 
     def hold_back(self) -> None:
-        """Send nothing that would have to be stored until `go_on`, as it cannot be."""
+        """Send no message that has to be stored until `go_on`: the store fails."""
         self.window = 0 if self.expiry else self._agreed_window
 
     def go_on(self) -> None:
-        """It can again."""
+        """The store works again: send what was held back."""
         self.window = self._agreed_window
         if self.link is not None:
             for packet_id, delivery in self.inflight.items():
-                if delivery is None:  # as PUBREC may have come meanwhile
+                if delivery is None:  # PUBREC may have arrived meanwhile
                     self.link.pubrel(packet_id)
             self.pump()
 
@@ -470,7 +471,7 @@ class Session:
         queue: list[Delivery],
         received: dict[int, UnreleasedPublish],
     ) -> None:
-        """Owe again what the session was owed when the broker ended."""
+        """Take over the messages that the store has for this session."""
         self.inflight.update(inflight)
         self.queue.extend(queue)
         self.received.update(received)
@@ -512,7 +513,7 @@ class Session:
         if self.congestion is not None:
             self.congestion.sent(packet_id)
         if self.expiry:
-            self._staged()
+            self._depend_on_batch()
             self.accounting.store.sent(self, delivery, packet_id)
         try:
             link.publish(message, qos, packet_id, False, retain, subscription_ids)
@@ -520,7 +521,7 @@ class Session:
             self._cannot_be_sent(error, packet_id)
 
     def _publish(self, link: Link, delivery: Delivery) -> None:
-        """Send what waited, and is of QoS 0."""
+        """Send a queued QoS 0 message."""
         message, _, retain, subscription_ids, _ = delivery
         try:
             link.publish(message, 0, 0, False, retain, subscription_ids)
@@ -528,7 +529,7 @@ class Session:
             self._cannot_be_sent(error)
 
     def _cannot_be_sent(self, error: Exception, packet_id: int = 0) -> None:
-        """A fault: the message is given up, so that it stands in nobody's way, at no later try."""
+        """Drop a message whose sending failed, so that it does not block the queue."""
         self.accounting.counters.publish_dropped += 1
         self.accounting.faults.caught("session.send", error, self)
         if packet_id:
@@ -546,14 +547,14 @@ class Session:
                 self._publish(link, delivery)
 
     def _is_forbidden(self, message: Message) -> bool:
-        """Whether rules that have changed meanwhile no longer let the client have it; counted."""
+        """Whether changed rules forbid a queued message; if so, it is counted as dropped."""
         if not self.unchecked or self.accounting.may_still_receive(self, message.topic):
             return False
         self.accounting.counters.publish_dropped += 1
         return True
 
     def keep_latest(self, delivery: Delivery) -> bool:
-        """Let a QoS 0 message wait for a slow client; False when it was dropped, and counted."""
+        """Queue a QoS 0 message for a slow client; False when it was dropped, and counted."""
         message = delivery[0]
         limits = self.accounting.limits
         replaced: Delivery | None = None
@@ -578,20 +579,20 @@ class Session:
         return False
 
     def overtake(self, topic: str) -> None:
-        """A newer QoS 0 message of the topic is sent: a large one that waits comes too late."""
+        """Drop a queued large message of the topic, because a newer QoS 0 message is sent."""
         waiting = self.large.pop(topic, None)
         if waiting is not None:
             self._uncount(waiting[0])
             self._drop(waiting[0])
 
-    def _is_full(self, size: int) -> None:
-        """Have it told, once an absence: nobody else knows what its client is missing."""
+    def _report_full(self, size: int) -> None:
+        """Have the full queue logged once in an absence: nobody else notices the lost messages."""
         if self.link is None and not self.is_full_logged:
             self.is_full_logged = True
             self.accounting.filled.append((self, self.shortage(size)))
 
     def _drop(self, message: Message) -> None:
-        """Count a message that the client was too slow for."""
+        """Count a message that is dropped because the client is too slow."""
         self.accounting.counters.publish_dropped += 1
         message.dropped()
 
@@ -608,10 +609,10 @@ class Session:
     # --- acknowledgements of the client --------------------------------------------------------
 
     def puback(self, packet_id: int) -> bool:
-        """The client has a QoS 1 message; False when none of that id is in flight.
+        """Process PUBACK; False when no message with that id is in flight.
 
         Raises:
-            ProtocolError: what is in flight under that id is not acknowledged like this.
+            ProtocolError: the message with that id does not wait for a PUBACK.
         """
         delivery = self.inflight.get(packet_id)
         if delivery is None or delivery[1] != 1:
@@ -635,10 +636,10 @@ class Session:
         return True
 
     def pubrec(self, packet_id: int, code: int) -> bool:
-        """The client has a QoS 2 message, or refused it; False when none of that id is there.
+        """Process PUBREC, which may refuse the message; False when no message has that id.
 
         Raises:
-            ProtocolError: what is in flight under that id is of QoS 1.
+            ProtocolError: the message with that id has QoS 1.
         """
         if packet_id not in self.inflight:
             return False
@@ -651,7 +652,7 @@ class Session:
             self.give_up(packet_id)
             self.pump()
         elif delivery is None:
-            pass  # PUBREC again: PUBREL goes out again
+            pass  # a repeated PUBREC: PUBREL is sent again
         else:
             self.inflight[packet_id] = None
             self._uncount(delivery[0])
@@ -660,15 +661,15 @@ class Session:
                 self.congestion.sent(packet_id)  # the PUBREL
                 self._relieve(self.congestion)
             if self.expiry:
-                self._staged()
+                self._depend_on_batch()
                 self.accounting.store.recorded(self, delivery, packet_id)
         return True
 
     def pubcomp(self, packet_id: int) -> bool:
-        """The QoS 2 exchange is over; False when none of that id is there.
+        """Process PUBCOMP; False when no message with that id is in flight.
 
         Raises:
-            ProtocolError: what is in flight under that id does not wait for it.
+            ProtocolError: the message with that id does not wait for a PUBCOMP.
         """
         if packet_id not in self.inflight:
             return False
@@ -684,7 +685,7 @@ class Session:
         return True
 
     def give_up(self, packet_id: int) -> None:
-        """Take a message out of flight that the client cannot be sent [MQTT-3.1.2-25]."""
+        """Remove a message from those in flight that cannot be sent [MQTT-3.1.2-25]."""
         delivery = self.inflight.pop(packet_id, None)
         if self.congestion is not None:
             self.congestion.settled(packet_id)
@@ -695,7 +696,7 @@ class Session:
     # --- QoS 2 from the client -----------------------------------------------------------------
 
     def hold(self, packet_id: int, held: UnreleasedPublish) -> bool:
-        """Keep a QoS 2 message of the client until PUBREL; False when there is no room."""
+        """Hold a QoS 2 message from the client until PUBREL; False when there is no room."""
         if not self.fits(held_size(held)):
             return False
         held.message.settle()
@@ -706,12 +707,12 @@ class Session:
         return True
 
     def reconnected(self) -> None:
-        """What is held was sent on another connection, whose time means nothing any more."""
+        """Forget when held messages arrived: the clock of the last connection is gone."""
         for packet_id, held in self.received.items():
             self.received[packet_id] = held._replace(since=-math.inf)
 
     def unhold(self, packet_id: int) -> UnreleasedPublish | None:
-        """The message that PUBREL releases, once."""
+        """Remove and return the held message with that id, if there is one."""
         held = self.received.pop(packet_id, None)
         if held is not None:
             self._take(-held_size(held))
@@ -722,13 +723,13 @@ class Session:
     # --- subscriptions and the will ------------------------------------------------------------
 
     def subscribe(self, subscription: Subscription) -> None:
-        """Count and keep a subscription; it takes the place of one with the same filter."""
+        """Add and count a subscription; it replaces one with the same filter."""
         if subscription.filter not in self.subscriptions:
             self._take(subscription_size(subscription.filter))
         self.subscriptions[subscription.filter] = subscription
 
     def unsubscribe(self, topic_filter: str) -> bool:
-        """Forget a subscription; False when there is none."""
+        """Remove a subscription; False when there is none."""
         if self.subscriptions.pop(topic_filter, None) is None:
             return False
         self.replays.pop(topic_filter, None)
@@ -736,13 +737,13 @@ class Session:
         return True
 
     def set_will(self, will: PendingWill | None) -> PendingWill | None:
-        """Keep a will, or none; returns the one before."""
+        """Set or remove the will; returns the previous one."""
         before, self.will = self.will, will
         self._take((will.message.size if will else 0) - (before.message.size if before else 0))
         return before
 
     def fits(self, size: int) -> bool:
-        """Whether the session may take so many bytes more."""
+        """Whether the session may take `size` more bytes."""
         accounting = self.accounting
         held = self.bytes + size
         return held <= accounting.queue_bytes and (
@@ -755,9 +756,9 @@ class Session:
         )
 
     def shortage(self, size: int) -> str:
-        """Why so many bytes more have no room with it, in words, and which key says so.
+        """Why the session has no room for `size` more bytes, with the configuration key.
 
-        It names neither the client nor its user: a publisher may be told, too.
+        The text names neither the client nor its user, because publishers may receive it.
         """
         accounting = self.accounting
         limits = accounting.limits
@@ -774,8 +775,10 @@ class Session:
     # --- backpressure --------------------------------------------------------------------------
 
     def is_full(self, size: int) -> bool:
-        """Whether a QoS 1 or 2 message of so many bytes finds no room in the queue, or only such
-        as others wait for."""
+        """Whether the queue has no room for a QoS 1 or 2 message of this size.
+
+        Room that other publishers already wait for does not count.
+        """
         accounting = self.accounting
         if self.congestion is not None and self.congestion.awaited:
             return True
@@ -795,7 +798,7 @@ class Session:
         )
 
     def _fits_tightly(self, size: int) -> bool:
-        """`fits`, for a message with which the session takes more than half of what it may."""
+        """`fits`, for a message that makes the session use more than half of its limit."""
         if self.congestion is None and self.bytes + size > self.accounting.half_queue:
             self._congest()
         return self.fits(size)
@@ -805,7 +808,7 @@ class Session:
             self.congestion = Congestion(self, self.accounting)
 
     def _relieve(self, congestion: Congestion) -> None:
-        """Let publishers go on when half of the queue is free, and forget all when it is empty."""
+        """Wake publishers when half of the queue is free; end the congestion when it is empty."""
         if self._is_crowded():
             return
         congestion.wake()
@@ -821,10 +824,11 @@ class Session:
     def hand_over(
         self, shares: Collection[Share] | None, give: Callable[[Delivery], bool], *, sent: bool
     ) -> None:
-        """Offer what these shared subscriptions (None: each there is) gave this session to others.
+        """Pass messages of these shared subscriptions (None: of all) on to other members.
 
-        What `give` finds nobody for stays. With `sent` what is in flight with QoS 1 is offered,
-        too: another member may get it a second time. QoS 2 stays [MQTT-4.8.2-4], [MQTT-4.8.2-5].
+        A message stays here if `give` returns False. With `sent`, QoS 1 messages in flight are
+        passed on, too: the other member may get a duplicate. QoS 2 messages stay [MQTT-4.8.2-4],
+        [MQTT-4.8.2-5].
         """
 
         def is_given(delivery: Delivery) -> bool:
@@ -849,9 +853,9 @@ class Session:
     # --- the session's end ---------------------------------------------------------------------
 
     def forget_transient(self) -> None:
-        """Drop what does not outlive the connection: QoS 0, and what is known of its topics.
+        """Drop the state that ends with the connection: QoS 0 messages, and caches of topics.
 
-        Nobody waits for a client that is not there.
+        Publishers no longer wait for the client.
         """
         if self.congestion is not None:
             self.congestion.end()
@@ -866,7 +870,7 @@ class Session:
         self.readable.clear()
 
     def clear(self) -> None:
-        """Give back all that this session holds."""
+        """Free everything that this session holds."""
         if self.congestion is not None:
             self.congestion.end()
             self.congestion = None
@@ -877,7 +881,7 @@ class Session:
             waiting.clear()
         self.resends.clear()
         self.replays.clear()
-        self.routes.clear()  # whose receivers may know this session: nobody looks for such circles
+        self.routes.clear()  # their targets may refer to this session: avoid a reference cycle
 
     def close_link(self, reason: ReasonCode, message: str) -> None:
         """End the session's connection, if it has one."""

@@ -13,28 +13,28 @@ from appliance.mqtt.packets import Subscription
 Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
 
 
-#: Members that are looked at for one message, where that is enough to find one for it.
-ASKED = 128
+#: Members that are checked for one message, if one of them can receive it.
+MAXIMUM_CHECKED = 128
 
 
 def as_target(session: Session, subscription: Subscription) -> Target:
-    """A member of a group as a receiver of a message."""
+    """A member of a group as the target of a message."""
     ids = [subscription.identifier] if subscription.identifier else None
     return session, subscription.qos, subscription.retain_as_published, ids
 
 
 class Share:
-    """One `$share/{group}/{filter}` and its members, in the order in which they came."""
+    """One `$share/{group}/{filter}` and its members, in the order in which they subscribed."""
 
     def __init__(self, topic_filter: str) -> None:
         self.filter = topic_filter
         self.members: dict[Session, Subscription] = {}
-        self._turn = 0
-        #: Members that the last `choose` looked at.
-        self.looked = 0
+        self._next = 0
+        #: Members that the last `choose` checked.
+        self.checked = 0
 
     def targets(self) -> list[Target]:
-        """All members, as receivers of a message."""
+        """All members as targets of a message."""
         return [as_target(*member) for member in self.members.items()]
 
     def choose(
@@ -44,23 +44,23 @@ class Share:
         may_receive: Callable[[Session, str], bool] | None = None,
         refusable: bool = True,
     ) -> Target | None:
-        """Who of these members gets the message; None when nobody can be given it.
+        """Choose the member that gets the message, round robin; None when no member can take it.
 
-        They take turns. A member that would have to queue the message is passed over as long as
-        another can be sent it at once, and an absent one as long as any is there: so many are
-        looked at, and on until one is found. `may_receive` is asked where the members are not only
-        those that may receive the topic; then no more than so many are looked at.
+        A member that can send the message immediately is preferred to one that would queue it, and
+        a connected member to an absent one. Up to MAXIMUM_CHECKED members are checked, and more
+        until one is found. `may_receive` is passed when `members` may contain some that must not
+        receive the topic; then no more than MAXIMUM_CHECKED are checked.
         """
         best: Target | None = None
         best_rank = 0
         best_index = 0
         count = len(members)
-        self.looked = count
+        self.checked = count
         for offset in range(count):
-            if offset >= ASKED and (best is not None or may_receive is not None):
-                self.looked = offset
+            if offset >= MAXIMUM_CHECKED and (best is not None or may_receive is not None):
+                self.checked = offset
                 break
-            index = (self._turn + offset) % count
+            index = (self._next + offset) % count
             session = members[index][0]
             qos = min(message.qos, members[index][1])
             if session.link is None:
@@ -74,8 +74,8 @@ class Share:
             ):
                 best, best_rank, best_index = members[index], rank, index
                 if rank == 3:
-                    self.looked = offset + 1
+                    self.checked = offset + 1
                     break
         if best is not None:
-            self._turn = (best_index + 1) % count
+            self._next = (best_index + 1) % count
         return best

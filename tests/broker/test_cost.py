@@ -14,7 +14,7 @@ from appliance.broker.broker import (
     Broker,
 )
 from appliance.broker.counters import COST_PER_TURN
-from appliance.broker.shared import ASKED
+from appliance.broker.shared import MAXIMUM_CHECKED
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
 
@@ -63,7 +63,7 @@ def test_the_members_of_a_group_cost_where_they_are_visited(join: Join, broker: 
     peer = join("peer")
     assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= count, "each may be allowed the topic"
     # Nobody is there, so as many are looked at as ever are for one message.
-    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= ASKED // CHECKS_PER_COST_UNIT
+    assert cost_of(broker, peer, Publish("t/1", b"", 0)) >= MAXIMUM_CHECKED // CHECKS_PER_COST_UNIT
 
 
 def test_what_a_member_leaves_is_offered_to_few_of_many(
@@ -76,7 +76,7 @@ def test_what_a_member_leaves_is_offered_to_few_of_many(
     count = 20
     for number in range(count):
         assert publisher.publish(f"t/{number}", b"x", 1) == 0
-    for number in range(2 * ASKED):
+    for number in range(2 * MAXIMUM_CHECKED):
         member = join(f"member{number}", **lasting(5))
         member.subscribe("$share/g/t/#", 1)
         member.lose()
@@ -85,7 +85,7 @@ def test_what_a_member_leaves_is_offered_to_few_of_many(
     monkeypatch.setattr(access, "decide", lambda *a: (asked.append(a[2]), decide(*a))[1])
     begun = broker.counters.cost
     join("leaving")  # anew: its session ends
-    assert broker.counters.cost - begun >= count * ASKED // CHECKS_PER_COST_UNIT
+    assert broker.counters.cost - begun >= count * MAXIMUM_CHECKED // CHECKS_PER_COST_UNIT
     assert len(asked) == count
     heard = [message for n in range(30) for message in join(f"member{n}", **lasting(5)).drain()]
     assert len(heard) == count

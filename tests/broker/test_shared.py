@@ -14,7 +14,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.ports import Action, Decision, Identity, Limits
 from appliance.broker.routing import CACHED_TOPIC
-from appliance.broker.shared import ASKED
+from appliance.broker.shared import MAXIMUM_CHECKED
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish
 
@@ -208,7 +208,7 @@ def test_who_may_read_from_now_on_is_found(join: Join, broker: Broker, access: F
 @pytest.mark.parametrize("qos", [0, 1])
 def test_a_message_finds_the_one_of_a_large_group_who_is_there(join: Join, qos: int):
     """Absent members are no receivers of QoS 0, be they ever so many."""
-    for number in range(3 * ASKED):
+    for number in range(3 * MAXIMUM_CHECKED):
         absent = join(f"absent{number}", **lasting(5))
         absent.subscribe("$share/g/a", 0)
         absent.lose()
@@ -220,7 +220,7 @@ def test_a_message_finds_the_one_of_a_large_group_who_is_there(join: Join, qos: 
 
 @pytest.mark.parametrize("limits", [Limits(queue_messages=1, inflight=1)])
 def test_a_message_finds_the_one_of_a_large_group_who_has_room(join: Join):
-    crowd = [join(f"m{number}") for number in range(2 * ASKED)]
+    crowd = [join(f"m{number}") for number in range(2 * MAXIMUM_CHECKED)]
     for member in crowd:
         member.subscribe("$share/g/a", 1)
     publisher = join("publisher")
