@@ -1,6 +1,7 @@
-"""A network client's conversation: what each of its packets does, and what it is answered.
+"""The handler of one network client: it processes received packets and answers them.
 
-Pure like the rest of the broker: bytes come in at `receive`, and go out through an `Output`.
+Like the rest of the broker it does no I/O: input is passed to `receive`, and an `Output` collects
+what is sent.
 """
 
 from __future__ import annotations
@@ -71,21 +72,22 @@ log = logging.getLogger(__name__)
 #: The cost of a packet that is not of the data path.
 PACKET_COST = 5
 
-#: Bytes of an unfinished packet, such as a CONNECT before its login, that there is always room for.
+#: Bytes of a partial packet, such as a CONNECT before its login, that there is always memory for.
 SMALL_PACKET = 1024
 
-#: And of the end of a connection that broke the protocol.
+#: The cost of ending a connection that violated the protocol.
 FAILURE_COST = 50
 
-#: Seconds that a publisher waits at once for what others may receive, and the part of its time that
-#: it does in the long run: less than makes a command old, so that nobody who subscribes stops it.
+#: Seconds that a publisher waits at a time for decisions on what others may receive, and the share
+#: of its time that it waits in the long run: too short to make a command old, so that subscribers
+#: cannot stop a publisher.
 RIGHTS_PATIENCE = LATE / 2
 RIGHTS_SHARE = 0.1
 
-#: Seconds after which it is looked at the earliest how long a message may still wait.
-LOOK_AGAIN = 0.01
+#: The shortest time, in seconds, until a waiting message is checked again.
+RECHECK = 0.01
 
-#: What may have to wait behind a message: a packet, or a PUBLISH that was only taken apart.
+#: What is queued behind a waiting message: a packet, or an undecoded PUBLISH.
 Arrived: TypeAlias = "Packet | RawPublish"
 
 #: Lines in one `rate_limited_log.INTERVAL` about one host and one kind of mistake: behind a host
@@ -94,7 +96,7 @@ HOST_BURST = 100
 
 
 def _size(arrived: Arrived) -> int:
-    """Bytes that are counted for what waits behind a message."""
+    """Bytes that are counted for a packet that is queued behind a waiting message."""
     if isinstance(arrived, tuple):
         return len(arrived[1]) + len(arrived[3]) + len(arrived[4]) + OVERHEAD
     if isinstance(arrived, Publish):
@@ -102,8 +104,8 @@ def _size(arrived: Arrived) -> int:
     return OVERHEAD
 
 
-#: Refusals of a CONNECT that may be told in words: they say nothing of who is known here.
-_TOLD: Final = frozenset(
+#: CONNACK codes that may have a reason string: they do not reveal which users exist.
+_EXPLAINED: Final = frozenset(
     (
         ReasonCode.BAD_AUTHENTICATION_METHOD,
         ReasonCode.PAYLOAD_FORMAT_INVALID,
@@ -114,7 +116,7 @@ _TOLD: Final = frozenset(
 
 
 class ClientHandler:
-    """One network connection: does what its packets say; what it is sent goes through `output`."""
+    """Handles the packets of one network connection; `output` encodes and sends the answers."""
 
     def __init__(self, broker: Broker, transport: Transport) -> None:
         self.broker = broker
@@ -125,66 +127,66 @@ class ClientHandler:
         )
         self.output = Output(broker, transport, self)
         self.session: Session | None = None
-        #: When what it publishes has come.
+        #: Tracks when the client's messages arrived.
         self.inflow = Inflow()
         self._router = broker.router
         self._accounting = broker.accounting
         self._counters = broker.counters
         self._store = broker.store
-        #: PUBRELs that wait until the store can keep what they release.
+        #: Packet ids of PUBRELs that wait until the store can store the released message.
         self._postponed: dict[int, None] = {}
-        #: QoS 2 messages that were refused, the last ones: some clients release them all the same.
+        #: Packet ids of the last refused QoS 2 messages: some clients send PUBREL all the same.
         self._refused: dict[int, None] = {}
-        #: A packet that is worked on in several turns.
+        #: The rest of the work on a packet that takes several turns.
         self._work: Iterator[Step] | None = None
-        #: Whether that waits for an answer of somebody else, which does not take turns.
+        #: Whether that waits for a pending decision instead of its next turn.
         self._is_awaiting = False
-        #: Whether the PUBLISH that is worked on has waited for such an answer.
+        #: Whether the PUBLISH that is processed has already waited for a pending decision.
         self._has_waited = False
         self._connect: Connect | None = None
-        self._held = 0  # bytes of the connection that are counted in the accounting
-        #: Who they are counted for: nobody in particular until the login.
+        self._held = 0  # bytes of buffered input that are counted in `accounting`
+        #: The account that they are counted for; until the login that of all unknown clients.
         self.account = broker.accounting.accounts.strangers
-        self._silence = 0.0  # seconds; 0 for none
-        self._heard_at = 0.0
+        self._keep_alive_timeout = 0.0  # seconds; 0 for none
+        self._last_packet_at = 0.0
         self._method = ""  # of its enhanced authentication
         self._exchange: Exchange | None = None
         self._unfinished_maximum = 0
         self._version = 0
         self._closed = False
-        #: A message that waits for its readers, and what came behind it; each with when it came.
+        #: A message that waits for its receivers, and the packets behind it; with arrival times.
         self._behind: deque[tuple[Arrived, float]] = deque()
         self._behind_size = 0  # bytes
         self._awaited: Sequence[Congestion] = ()
         self._waits_since = 0.0
-        self._dawdled = 0.0  # by those that it waits for, together, at that time
-        #: When what had to wait and is done now came, at the latest; 0 for what comes just now.
-        self._came_at = 0.0
-        #: Since when what came waits for an answer of somebody else; 0 when nothing does.
+        self._dawdled = 0.0  # the sum over the awaited congestions at that time
+        #: The latest possible arrival time of the delayed packet being processed; 0 if not delayed.
+        self._arrived_at = 0.0
+        #: Since when input waits for a pending decision; 0 when none does.
         self._awaits_since = 0.0
-        #: When the first of what the connection keeps while it is paused came; 0 when it is not.
-        self._left_since = 0.0
+        #: When the first bytes arrived that `protocol` buffers while it is paused; 0 for none.
+        self._buffered_since = 0.0
         self._allowance = Allowance(PUBLISHER_PATIENCE)
-        #: For answers about who else may receive its messages.
+        #: The allowance for decisions on which others may receive its messages.
         self._rights_allowance = Allowance(RIGHTS_PATIENCE)
         self._asked_at = 0.0
         self._congested = broker.accounting.congested
         self._hurries = False
-        #: Whether `send_on` will be called anyway.
+        #: Whether a call of `send_on` is already scheduled.
         self._later = False
 
     def __str__(self) -> str:
         name = str(self.session) if self.session else "client"
         return f"{name} at {self.transport.address}"
 
-    # --- bytes in ------------------------------------------------------------------------------
+    # --- input ---------------------------------------------------------------------------------
 
     def receive(self, data: bytes) -> None:
-        """Take in what came from the network and do what it says."""
+        """Process bytes that arrived from the network."""
         counters = self._counters
         counters.bytes_received += len(data)
         now = self._accounting.now
-        connection = self.protocol
+        protocol = self.protocol
         cost = counters.cost + COST_PER_TURN
         inflow = self.inflow
         if inflow.is_watched:
@@ -196,9 +198,9 @@ class ClientHandler:
             elif self._behind:
                 events = self._passing(data, cost)
             else:
-                events = connection.receive_data(data)
+                events = protocol.receive_data(data)
             for event in events:
-                self._heard_at = now  # complete packets count, dripping bytes do not
+                self._last_packet_at = now  # for keep alive only complete packets count
                 if type(event) is tuple:
                     self._on_raw_publish(event)
                 elif type(event) is int:
@@ -209,61 +211,61 @@ class ClientHandler:
                     else:
                         self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
-                    counters.cost += PACKET_COST + connection.cost
+                    counters.cost += PACKET_COST + protocol.cost
                     self._on_packet(event)  # type: ignore[arg-type]
-                if counters.cost > cost and not connection.paused:
-                    # What is left of the chunk waits until the others have had their turn.
-                    connection.pause()
+                if counters.cost > cost and not protocol.paused:
+                    # The rest of the chunk waits until the other clients have had their turn.
+                    protocol.pause()
                     self.later()
         except ProtocolError as error:
-            counters.cost += FAILURE_COST + connection.cost
+            counters.cost += FAILURE_COST + protocol.cost
             self.fail(error)
-        if self._behind and connection.paused and not self._later and self._work is None:
+        if self._behind and protocol.paused and not self._later and self._work is None:
             if self._has_place_behind():
                 self.receive(b"")
                 return
             self.transport.stop_reading()
         if self._store.fresh:
             self._depend()
-        held = connection.held
-        if held or inflow.unfinished or self._left_since:
+        held = protocol.held
+        if held or inflow.unfinished or self._buffered_since:
             self._note_unfinished(data, now)
         if held + self._behind_size != self._held:
             self._count_held()
 
     def _note_unfinished(self, data: bytes, now: float) -> None:
-        """Know when a packet that is not whole began to come: what was left, when it was left."""
-        inflow, connection = self.inflow, self.protocol
-        has_completed = self._heard_at == now
-        came_at = now if data else self._left_since or now
-        if connection.paused:  # what it keeps may be the beginning of a packet, and may be more
+        """Update when the first bytes of a partial packet, or of buffered input, arrived."""
+        inflow, protocol = self.inflow, self.protocol
+        has_completed = self._last_packet_at == now
+        arrived_at = now if data else self._buffered_since or now
+        if protocol.paused:  # it may buffer a partial packet, or more than that
             if has_completed:
                 inflow.unfinished = 0.0
-                self._left_since = came_at
-            self._left_since = self._left_since or came_at
+                self._buffered_since = arrived_at
+            self._buffered_since = self._buffered_since or arrived_at
             return
-        self._left_since = 0.0
-        if not connection.unfinished:
+        self._buffered_since = 0.0
+        if not protocol.unfinished:
             inflow.unfinished = 0.0
         elif not inflow.unfinished or has_completed:
-            inflow.unfinished = came_at
+            inflow.unfinished = arrived_at
 
     def _completing(self, data: bytes, cost: int) -> Iterator[Event]:
-        """What comes in; what has come in parts, slowly, is as old as the first of them."""
-        came_at, self._came_at = self._came_at, self.inflow.unfinished
-        connection = self.protocol
-        for event in self._passing(data, cost) if self._behind else connection.receive_data(data):
+        """The events of `data`; a packet that arrived in parts is as old as its first part."""
+        arrived_at, self._arrived_at = self._arrived_at, self.inflow.unfinished
+        protocol = self.protocol
+        for event in self._passing(data, cost) if self._behind else protocol.receive_data(data):
             yield event
-            self._came_at = came_at
-        self._came_at = came_at
+            self._arrived_at = arrived_at
+        self._arrived_at = arrived_at
 
     def _depend(self) -> None:
-        """What it was just answered depends on what was just staged."""
+        """Make the answers that were just sent depend on the changes that were just staged."""
         self._store.fresh = False
         self.output.batch = self._store.batch
 
     def _count_held(self) -> None:
-        """Count the memory of what came and is not done with: it is bounded, as all that waits."""
+        """Count the memory of unprocessed input, which is limited like that of all queues."""
         accounting = self._accounting
         grown = self.protocol.held + self._behind_size - self._held
         self._held += grown
@@ -292,7 +294,7 @@ class ClientHandler:
         counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(payload)
-        # The route has the topic decoded and checked, which would else be done for each message.
+        # A cached route has the topic decoded and checked, which saves this for each message.
         if session.epoch == router.epoch and topic_wire in session.routes:
             route = session.routes[topic_wire]
         else:
@@ -302,8 +304,8 @@ class ClientHandler:
         targets = route.targets
         if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.cost += 1 + len(targets)
-            # A plain QoS 0 message to receivers of the same version leaves as it came: no message
-            # object is made for it. Who cannot take it like this is left for the long way.
+            # A plain QoS 0 message is forwarded unchanged to receivers of the same version, without
+            # creating a Message. The remaining targets are those that need the slow path.
             targets = [
                 target
                 for target in targets
@@ -315,11 +317,11 @@ class ClientHandler:
                 return
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
-        if first & 8 or (self._came_at and self._is_old()):
+        if first & 8 or (self._arrived_at and self._is_old()):
             message = DelayedMessage(message, math.inf if first & 8 else self._age())
         else:
-            # What came in is what goes out to a receiver with the same version, QoS and flags:
-            # its bytes are taken over instead of being encoded again.
+            # A receiver with the same version, QoS and flags gets the header as it arrived,
+            # which saves encoding it.
             message.wire_key = self._version << 8 | first
             message.wire_head = head
         if qos and self._congested and self._must_wait(event, message, route):
@@ -336,7 +338,7 @@ class ClientHandler:
             self.output.acknowledge(0x40, packet_id, code, reason)
 
     def _on_publish(self, packet: Publish) -> None:
-        """A PUBLISH that the full decoder has read: with properties, most likely."""
+        """Process a PUBLISH from the full decoder; most likely it has properties."""
         session = self.session
         assert session is not None
         broker = self.broker
@@ -352,7 +354,7 @@ class ClientHandler:
             self._expires_at(packet.properties),
             properties_wire=packet.passed_on,
         )
-        if packet.dup or (self._came_at and self._is_old()):
+        if packet.dup or (self._arrived_at and self._is_old()):
             message = DelayedMessage(message, math.inf if packet.dup else self._age())
         route = self._router.route(session, message.topic_wire)
         if route.undecided and self._hold(route, len(packet.payload), self._on_publish, packet):
@@ -361,15 +363,15 @@ class ClientHandler:
         if packet.qos and self._congested and self._must_wait(packet, message, route):
             return
         if (
-            route.allowed  # asked before anything that costs much
+            route.allowed  # checked before anything costly
             and broker.features.check_payload_format
             and not is_text(message.payload, packet.properties)
         ):
             self._refuse_payload(session, message, packet_id)
         elif packet.qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
-        elif self._came_at and route.allowed and self._accounting.has_expired(message):
-            if packet.qos:  # it was received, and is for nobody any more [MQTT-3.3.2-5]
+        elif self._arrived_at and route.allowed and self._accounting.has_expired(message):
+            if packet.qos:  # it has expired: it is acknowledged, not delivered [MQTT-3.3.2-5]
                 self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
             code = broker.publish_to(route.targets, route, message, session)
@@ -380,7 +382,7 @@ class ClientHandler:
                 self.output.acknowledge(0x40, packet_id, code, reason)
 
     def _reason(self, code: int, route: Fanout, message: Message) -> str:
-        """Why a message was refused, in words, if the client is told any."""
+        """Why a message was refused, as a text; empty if the client gets no reason strings."""
         session = self.session
         if session is None or self._version != 5 or not self.output.explains:
             return ""
@@ -393,11 +395,11 @@ class ClientHandler:
     def _hold(
         self, route: Fanout, size: int, publish: Callable[[Any], None], packet: object
     ) -> bool:
-        """Let a PUBLISH, and all behind it, wait until it is known where it may go; False when it
-        has waited, or nobody is asked about it.
+        """Let a PUBLISH, and what follows it, wait for the pending decisions on its route.
 
-        It waits for what is asked about its user. Who else may receive it holds it for a moment
-        only, and misses it if nothing is known by then.
+        It waits for decisions on its own user. For decisions on who else may receive it, it waits
+        only for a moment; an undecided receiver then misses it. Returns False when the PUBLISH has
+        already waited, or need not.
         """
         session = self.session
         asked = self._router.pending_decisions
@@ -409,9 +411,9 @@ class ClientHandler:
         if allowance.used_up and not self._is_asked_about(route):
             return False
         until = now + asked.timeout
-        came_at = self._came_at or now
+        arrived_at = self._arrived_at or now
         topic_wire = encode_string(route.topic)
-        self._counters.publish_received -= 1  # it will be
+        self._counters.publish_received -= 1  # it is counted again when it is processed
         self._counters.publish_bytes_received -= size
 
         def questions() -> list[AccessQuery]:
@@ -427,23 +429,23 @@ class ClientHandler:
             if not allowance.used_up and questions():
                 soon = since + allowance.left
                 for step in answers(self.broker, questions, self._wake, soon):
-                    self.transport.wait(max(soon - self._accounting.now, LOOK_AGAIN))
+                    self.transport.wait(max(soon - self._accounting.now, RECHECK))
                     yield step
                 allowance.change(since - self._accounting.now)
             self._asked_at = self._accounting.now
             self._has_waited = True
-            self._came_at = came_at
+            self._arrived_at = arrived_at
             try:
                 publish(packet)
             finally:
                 self._has_waited = False
-                self._came_at = 0.0
+                self._arrived_at = 0.0
 
         self._begin(work())
         return True
 
     def _is_asked_about(self, route: Fanout) -> bool:
-        """Whether somebody is asked about the client itself, or another of its user."""
+        """Whether a decision is pending on this client, or another client of its user."""
         identity = self.session.identity if self.session is not None else None
         return identity is not None and any(
             who == identity or (who.username is not None and who.username == identity.username)
@@ -451,26 +453,26 @@ class ClientHandler:
         )
 
     def _is_old(self) -> bool:
-        """Whether what had to wait did so for long: who does not carry out what is old is told."""
-        return self._accounting.now - self._came_at > LATE
+        """Whether the packet has waited so long that its message counts as delayed."""
+        return self._accounting.now - self._arrived_at > LATE
 
     def _age(self) -> float:
-        """How old what is done now is: of what had to wait, nobody knows for how long it had."""
-        return self._accounting.now - self._came_at if self.inflow.unfinished else math.inf
+        """The age of the message being processed; infinity if it may have waited unread."""
+        return self._accounting.now - self._arrived_at if self.inflow.unfinished else math.inf
 
     def _wake(self) -> None:
-        """Somebody has answered what a packet waits for."""
+        """A pending decision that a packet waits for has been made."""
         if not self._closed:
             self.later()
 
-    # --- backpressure: see the module of that name ---------------------------------------------
+    # --- backpressure, see backpressure.py -----------------------------------------------------
 
     def _must_wait(self, arrived: Arrived, message: Message, route: Fanout) -> bool:
-        """Let the message wait if readers have no room for it, and soon will."""
+        """Let the message wait if receivers have no room for it now, but soon will."""
         congestions = self.broker.congestions(route, message) if route.allowed else []
         allowance = self._allowance
         if not congestions or allowance.used_up or self._hurries:
-            self._get_on()
+            self._end_wait()
             return False
         self._waits_since = now = self._accounting.now
         for congestion in self._awaited:
@@ -482,17 +484,17 @@ class ClientHandler:
         for congestion in congestions:
             congestion.wait(self)
             seconds = min(seconds, congestion.left)
-        self.transport.wait(max(seconds, LOOK_AGAIN))
-        # It will come again, and is counted then.
+        self.transport.wait(max(seconds, RECHECK))
+        # It is counted when it is processed again.
         self._counters.publish_received -= 1
         self._counters.publish_bytes_received -= len(message.payload)
-        self._behind.appendleft((arrived, self._came_at or now))
+        self._behind.appendleft((arrived, self._arrived_at or now))
         self._behind_size += _size(arrived)
         self.protocol.pause()
         return True
 
-    def _get_on(self) -> None:
-        """A message waits for nobody, or not any more."""
+    def _end_wait(self) -> None:
+        """Note that a message need not wait, or not any longer."""
         if self._allowance.left < PUBLISHER_PATIENCE:
             self._allowance.change(MESSAGE_PATIENCE)
         if self._awaited:
@@ -504,13 +506,13 @@ class ClientHandler:
         self._awaited = ()
 
     def proceed(self) -> None:
-        """A reader that it waits for has room again."""
+        """A receiver that it waits for has room again."""
         self.transport.proceed()
 
     def _has_place_behind(self) -> bool:
-        """Whether more may come behind the message that waits: as many bytes as may wait for it.
+        """Whether more packets may be queued behind the waiting message: as many bytes as a queue.
 
-        Nothing comes behind what is no PUBLISH, which may change what is to be done with it.
+        No packet is queued behind one that is not a PUBLISH, because that may change its meaning.
         """
         accounting = self._accounting
         grown = self._behind_size + self.protocol.held - self._held
@@ -524,30 +526,30 @@ class ClientHandler:
         )
 
     def _passing(self, data: bytes, limit: int) -> Iterator[Event]:
-        """What comes in while a message waits, and does not wait behind it.
+        """The events that need not wait behind a waiting message; the others are queued.
 
-        These are acknowledgements, for which others wait, and pings: all that the client may have
-        on its way is looked through for them. `limit` is the cost at which its turn ends.
+        Acknowledgements, for which others wait, and pings pass: all input that the client may have
+        on its way is searched for them. `limit` is the cost at which the client's turn ends.
         """
-        connection, counters = self.protocol, self._counters
-        if connection.paused and self._has_place_behind():
-            connection.resume()
-        for event in connection.receive_data(data):
+        protocol, counters = self.protocol, self._counters
+        if protocol.paused and self._has_place_behind():
+            protocol.resume()
+        for event in protocol.receive_data(data):
             if isinstance(event, int | Puback | Pubrec | Pubrel | Pubcomp | Pingreq):
                 yield event
                 continue
-            self._heard_at = self._accounting.now
-            self._behind.append((event, self._came_at or self._accounting.now))
+            self._last_packet_at = self._accounting.now
+            self._behind.append((event, self._arrived_at or self._accounting.now))
             self._behind_size += _size(event)
-            counters.cost += 1 if isinstance(event, tuple) else PACKET_COST + connection.cost
+            counters.cost += 1 if isinstance(event, tuple) else PACKET_COST + protocol.cost
             if not self._has_place_behind():
-                connection.pause()
+                protocol.pause()
             elif counters.cost > limit:
-                connection.pause()
+                protocol.pause()
                 self.later()
 
     def _try_again(self) -> None:
-        """Publish what waits, if anything, and what came behind it, as far as there is room."""
+        """Publish the waiting message, if any, and process the packets behind it."""
         behind = self._behind
         if not behind:
             return
@@ -555,7 +557,7 @@ class ClientHandler:
         if self._awaited:
             dawdled = sum(congestion.dawdled() for congestion in self._awaited)
             waited = self._accounting.now - self._waits_since
-            # All together cannot have kept it waiting for longer than it has waited.
+            # The congestions overlap: together they count no more than the time that it waited.
             counted = min(max(dawdled - self._dawdled, waited * LEAST_COUNTED), waited)
             self._allowance.change(-counted)
             self._waits_since, self._dawdled = self._accounting.now, dawdled
@@ -565,7 +567,7 @@ class ClientHandler:
                     self.later()
                     break
                 left = len(behind) - 1
-                arrived, self._came_at = behind.popleft()
+                arrived, self._arrived_at = behind.popleft()
                 self._behind_size -= _size(arrived)
                 if isinstance(arrived, tuple):
                     self._on_raw_publish(arrived)
@@ -575,28 +577,28 @@ class ClientHandler:
                 if len(behind) > left:
                     break  # it waits again
                 if self._awaited:
-                    self._get_on()  # with nobody congested it was not asked about
+                    self._end_wait()  # without any congestion `_must_wait` was not called
         except ProtocolError as error:
             self.fail(error)
-        self._came_at = 0.0
+        self._arrived_at = 0.0
         if self._store.fresh:
             self._depend()
         if self.protocol.held + self._behind_size != self._held:
             self._count_held()
 
     def hurry(self) -> None:
-        """The connection is lost: what came over it is done without waiting for anybody."""
+        """The connection is lost: process the received packets without waiting for receivers."""
         self._hurries = True
         if not self._behind:
-            return  # what else it waits for, as the end of its login, it waits for still
-        self._try_again()  # and what that is too much for, in the turns that it asked for
+            return  # other work, such as a login, still waits
+        self._try_again()  # what exceeds the limit of this turn is done in later turns
         if not self._behind and self._work is None and self.protocol.paused:
             self.protocol.resume()
 
     def _expires_at(self, properties: Properties | None) -> float | None:
         interval = (properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
-        came_at = self._came_at or self._accounting.now
-        return came_at + interval if isinstance(interval, int) else None
+        arrived_at = self._arrived_at or self._accounting.now
+        return arrived_at + interval if isinstance(interval, int) else None
 
     def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
         self._counters.publish_refused += 1
@@ -612,7 +614,7 @@ class ClientHandler:
     def _on_publish_qos2(
         self, session: Session, packet_id: int, message: Message, route: Fanout
     ) -> None:
-        """Keep the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
+        """Hold the message until PUBREL [MQTT-4.3.3-10]; it is published only then."""
         self._counters.cost += HELD_COST
         code, reason = ReasonCode.SUCCESS, ""
         held = session.received.get(packet_id)
@@ -626,15 +628,15 @@ class ClientHandler:
             self._refuse_qos2(packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
             return
         if held is not None and not held.message.is_like(message):
-            # A client that has lost its memory begins anew with the same ids: what it does not
-            # know of any more, it will not release. mosquitto sees it like this, too.
+            # A client that has lost its state reuses packet ids, and will never release the old
+            # message. mosquitto does the same.
             session.unhold(packet_id)
             held = None
         if held is not None:
-            pass  # sent again: PUBREC goes out again [MQTT-4.3.3-12]
+            pass  # a duplicate: PUBREC is sent again [MQTT-4.3.3-12]
         elif not route.allowed:
             self.broker.refuse_publish(session, route, message)
-            # 3.1.1 cannot refuse: the exchange goes on, and the message goes nowhere.
+            # 3.1.1 cannot refuse: the exchange continues, and the message is not delivered.
             code = ReasonCode.NOT_AUTHORIZED
         elif self._version == 5 and len(session.received) >= self._unfinished_maximum:
             raise ProtocolError(  # [MQTT-3.3.4-7]
@@ -643,7 +645,7 @@ class ClientHandler:
             )
         else:
             self.broker.announce(message, session)
-            # 3.1.1 cannot refuse: who objects does so when the message is published.
+            # 3.1.1 cannot refuse: the message may be rejected when it is published.
             rejection = self.broker.inspect(message, session) if self._version == 5 else None
             if rejection is not None:
                 self._counters.publish_refused += 1
@@ -689,8 +691,8 @@ class ClientHandler:
             if not known:
                 log.debug("%s: PUBREC %d for nothing in flight", self, packet_id)
             if code < 0x80 and not (self._accounting.failing and session.expiry):
-                # An unknown id is answered too, or a client that missed our end would wait forever;
-                # without 0x92, which says nothing that it needs (and as mosquitto does).
+                # An unknown id is answered, too, or a client that missed our restart would wait
+                # forever. 0x92 is left out: the client does not need it, and mosquitto does so.
                 self.output.acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
         elif kind == PUBREL:
             if self._accounting.failing and self._must_postpone(session, packet_id):
@@ -700,7 +702,7 @@ class ClientHandler:
             if held is not None:
                 self.broker.release(held, session, self.transport.now() - held.since)
             elif self._refused and packet_id in self._refused:
-                # paho-mqtt passes over the PUBREC that says so, and would tell of a success.
+                # paho-mqtt ignores a refusing PUBREC, and would report success.
                 del self._refused[packet_id]
                 answer = ReasonCode.PACKET_IDENTIFIER_NOT_FOUND
             self.output.acknowledge(0x70, packet_id, answer)
@@ -708,10 +710,10 @@ class ClientHandler:
             log.debug("%s: PUBCOMP %d for nothing in flight", self, packet_id)
 
     def _must_postpone(self, session: Session, packet_id: int) -> bool:
-        """Whether a PUBREL, which cannot be refused, has to wait until the store can keep it."""
+        """Whether a PUBREL, which cannot be refused, has to wait until the store works again."""
         held = session.received.get(packet_id)
         if held is None:
-            # Its PUBCOMP may depend on what is not kept yet.
+            # Its PUBCOMP may depend on a change that is not committed yet.
             postpone = session.persistent
         else:
             route = self._router.route(session, held.message.topic_wire)
@@ -721,7 +723,7 @@ class ClientHandler:
         return postpone
 
     def resume(self) -> None:
-        """The store keeps again what is to be kept: go on with what had to wait for it."""
+        """The store works again: process the PUBRELs that waited for it."""
         postponed, self._postponed = self._postponed, {}
         try:
             for packet_id in postponed:
@@ -755,13 +757,13 @@ class ClientHandler:
             self._on_auth(packet)
 
     def _begin(self, work: Iterator[Step]) -> None:
-        """Do what a packet asks for that may be much; None is for the turn of the others."""
+        """Work on a packet that may be costly, until a step asks for a pause."""
         for answer in work:
             if answer is None or isinstance(answer, AwaitingDecision):
-                # What comes behind the packet waits for its end.
+                # Later packets wait until this one is done.
                 self._work = work
                 self._is_awaiting = answer is not None
-                self._awaits_since = self._awaits_since or self._came_at or self._accounting.now
+                self._awaits_since = self._awaits_since or self._arrived_at or self._accounting.now
                 self.protocol.pause()
                 if answer is None:
                     self.later()
@@ -772,9 +774,9 @@ class ClientHandler:
         self._work = None
 
     def _go_on(self, work: Iterator[Step]) -> None:
-        """Go on with what the last turn was too short for."""
+        """Continue the work that the last turn was too short for."""
         self._is_awaiting = False
-        self._heard_at = self._accounting.now  # what it says meanwhile is not heard
+        self._last_packet_at = self._accounting.now  # its packets are not read meanwhile
         try:
             self._begin(work)
         except ProtocolError as error:
@@ -785,7 +787,7 @@ class ClientHandler:
     def _on_disconnect(self, packet: Disconnect) -> None:
         expiry = (packet.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
         session = self.session
-        if session is None:  # it gives up in the middle of its authentication
+        if session is None:  # it gives up during its authentication
             self._shut()
             return
         if isinstance(expiry, int) and expiry and not session.expiry:  # [MQTT-3.14.2-2]
@@ -816,7 +818,7 @@ class ClientHandler:
             return
         is_nameless = not packet.client_id and packet.version != V5
         if is_nameless and not packet.clean_start:
-            # [MQTT-3.1.3-8]: a session to come back to needs a name to come back with
+            # [MQTT-3.1.3-8]: a persistent session needs a client id
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, "no client id, but clean session 0")
             return
         if is_nameless and packet.version == V31:
@@ -846,12 +848,12 @@ class ClientHandler:
                 return
             self._authenticate(self._exchange, properties)
             return
-        # What follows a CONNECT is read only once it is known who sent it.
+        # Bytes behind a CONNECT are processed only after the login.
         self.protocol.pause()
         self.transport.authenticate(packet)
 
     def _on_auth(self, packet: Auth) -> None:
-        """A step of an enhanced authentication (5.0 section 4.12)."""
+        """Process a step of an enhanced authentication (5.0 section 4.12)."""
         properties = packet.properties or {}
         code = packet.reason_code
         if not self._method:  # [MQTT-4.12.0-7]
@@ -898,7 +900,7 @@ class ClientHandler:
         return properties
 
     def refuse(self, code: ReasonCode, reason: str) -> None:
-        """Answer CONNECT with the code and close; nothing that came behind it has any effect."""
+        """Answer CONNECT with the code and close; bytes behind the CONNECT are discarded."""
         if self._closed:
             return
         user = self._connect.username if self._connect else None
@@ -914,15 +916,15 @@ class ClientHandler:
             address, tls_info = self.transport.address, self.transport.tls_info()
             self.broker.audit_log.refused(address, reason, code, name, user, tls_info)
         self._counters.connects_refused += 1
-        tells = code in _TOLD and self.broker.features.reason_strings
+        tells = code in _EXPLAINED and self.broker.features.reason_strings
         words = in_words(reason) if tells else None
         self._send(Connack(False, code, words))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
 
     def accept(self, username: str | None, authentication: Properties | None = None) -> None:
-        """The client is who it says: open its session, send CONNACK, read on.
+        """The login succeeded: open the session, send CONNACK, continue reading.
 
-        `authentication` goes into the CONNACK: the end of an enhanced authentication.
+        `authentication` goes into the CONNACK: the last data of an enhanced authentication.
         """
         packet, self._connect = self._connect, None
         if self._closed or packet is None:
@@ -950,7 +952,7 @@ class ClientHandler:
         try:
             self._open(session, identity, present, packet, agreement, authentication)
         except Exception:
-            # It has not logged in after all: CONNECT is what is refused.
+            # Treat it as not logged in: it is the CONNECT that is refused.
             self.broker.disconnect(session, self.output, publish_will=False)
             self.session = None
             raise
@@ -978,7 +980,7 @@ class ClientHandler:
         agreement: Agreement,
         authentication: Properties | None,
     ) -> None:
-        """Begin to be the session's client, up to the CONNACK."""
+        """Attach to the session, and send CONNACK."""
         session.open_window(agreement.window)
         # A client's send quota begins anew with each connection (section 4.9).
         self._unfinished_maximum = self.broker.limits.inflight + len(session.received)
@@ -990,8 +992,10 @@ class ClientHandler:
         self.output.may_explain = agreement.explain
         explains = agreement.explain and self.broker.features.reason_strings
         self.output.open(session, agreement.aliases, explains=explains)
-        self._silence = 1.5 * agreement.keep_alive  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
-        self._heard_at = self._accounting.now
+        self._keep_alive_timeout = (
+            1.5 * agreement.keep_alive
+        )  # [MQTT-3.1.2-22], 3.1.1 [MQTT-3.1.2-24]
+        self._last_packet_at = self._accounting.now
         self.protocol.accept()
         counters = self._counters
         counters.connects += 1
@@ -1005,19 +1009,19 @@ class ClientHandler:
             self.broker.features,
             authentication or {},
         )
-        # In 3.1 the byte that says it is reserved.
+        # In 3.1 the byte of Session Present is reserved.
         self._send(Connack(present and packet.version != V31, ReasonCode.SUCCESS, properties))
 
-    # --- turns, and bytes out ------------------------------------------------------------------
+    # --- turns, and output ---------------------------------------------------------------------
 
     def later(self) -> None:
-        """Let the other clients have their turn."""
+        """Schedule `send_on` after the turns of the other clients."""
         if not self._later:
             self._later = True
             self.transport.later()
 
     def send_on(self) -> None:
-        """Go on where the last turn ended: with what waits for the client, and what it sent."""
+        """Continue where the last turn ended: with queued messages, and with received packets."""
         self._later = False
         if self.session is not None and self.session.link is self.output:
             self.session.take_turn()
@@ -1028,10 +1032,10 @@ class ClientHandler:
             if self._work is None and self.protocol.paused:
                 if not self._behind:
                     self.protocol.resume()
-                # What came meanwhile is as old as the wait is long, as far as is known.
-                self._came_at = self._awaits_since
+                # What arrived meanwhile may be as old as the wait.
+                self._arrived_at = self._awaits_since
                 self.receive(b"")
-                self._came_at = 0.0
+                self._arrived_at = 0.0
                 if not self.protocol.paused:
                     self._awaits_since = 0.0
 
@@ -1039,7 +1043,7 @@ class ClientHandler:
         if self.output.send(packet):
             return
         if self.session is None or isinstance(packet, Connack):
-            # There is nothing to refuse it with [MQTT-3.14.0-1].
+            # No packet can tell the client so [MQTT-3.14.0-1].
             self._log_rate_limited("%s: its Maximum Packet Size is too small for %s", self, packet)
             self._leave(f"its Maximum Packet Size is too small for {packet}", publish_will=False)
         elif not isinstance(packet, Disconnect):
@@ -1049,28 +1053,28 @@ class ClientHandler:
     # --- the end -------------------------------------------------------------------------------
 
     def fail(self, error: ProtocolError) -> None:
-        """The client broke the protocol: tell it why, where it can be told, and close."""
+        """The client violated the protocol: send it the reason code, if possible, and close."""
         self._log_rate_limited("%s broke the protocol: %s (0x%02X)", self, error, error.code)
         if self.session is None:
             if self.broker.audit_log is not None:
                 self.broker.audit_log.refused(self.transport.address, str(error), error.code)
-            # A CONNECT of an unknown version gets the refusal in the form of 3.1.1 [MQTT-3.1.2-2],
-            # a wrong one of 5.0 in its own; before CONNECT there is nothing to answer.
+            # A CONNECT of an unknown version is refused in the format of 3.1.1 [MQTT-3.1.2-2], an
+            # invalid one of 5.0 in that of 5.0; before CONNECT there is no packet to answer with.
             unknown = error.code == ReasonCode.UNSUPPORTED_PROTOCOL_VERSION
-            if error.told and (unknown or self.protocol.version == 5):
+            if error.notify_peer and (unknown or self.protocol.version == 5):
                 self.output.version = self.protocol.version
                 self._send(Connack(False, error.code))
             self._shut()
-        elif error.told:
+        elif error.notify_peer:
             self._end(error.code, str(error))
         else:
             self._leave(str(error), publish_will=True)
 
     def fault(self) -> None:
-        """Something went wrong in here: tell the client so (0x83), and end its connection."""
+        """An internal error occurred: send its code (0x83) to the client, and close."""
         if self._closed:
             self._make_sure()
-            self.output.end()  # it may be that which has failed
+            self.output.end()  # this call may be what has failed
             return
         code = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR
         if self.session is not None:
@@ -1082,7 +1086,7 @@ class ClientHandler:
         self._shut()
 
     def cut_off(self) -> None:
-        """Cut the connection, as not even its end went well; nothing refers to it any more."""
+        """Abort the connection because even closing it failed, and remove all references to it."""
         try:
             self._shut()
         except Exception as error:
@@ -1096,13 +1100,13 @@ class ClientHandler:
         self.transport.abort()
 
     def _make_sure(self) -> None:
-        """The connection has ended: so it has for its session, even if a fault came in between."""
+        """Make sure that the session is disconnected, even if an error interrupted the close."""
         self.broker.clients.discard(self)
         if self.session is not None:
             self.broker.disconnect(self.session, self.output, publish_will=True)
 
     def close(self, reason: ReasonCode, message: str) -> None:
-        """End the connection with a DISCONNECT that says why [MQTT-4.13.1-1]; its will is due."""
+        """Close with a reason code in DISCONNECT [MQTT-4.13.1-1]; the will is due."""
         log.info("%s: connection closed: %s", self, message)
         self._end(reason, message)
 
@@ -1112,7 +1116,7 @@ class ClientHandler:
         self._leave(message, publish_will=True)
 
     def _log_rate_limited(self, message: str, *args: object) -> None:
-        """Log what came from the client's address, unless it is a flood."""
+        """Log a warning about the client's address, rate limited for each host."""
         host, _, _ = self.transport.address.rpartition(":")
         now = self._accounting.now
         self.broker.rate_limited_log.warning(now, (host, message), message, *args, burst=HOST_BURST)
@@ -1127,16 +1131,20 @@ class ClientHandler:
             self._make_sure()
 
     def let_go(self, transport: Transport) -> None:
-        """The connection is gone, and not to be held any longer: `transport` replaces it now."""
+        """Release the closed connection: `transport` replaces it."""
         self.transport = self.output.transport = transport
 
     def tick(self, now: float) -> bool:
-        """Close a client that was silent for one and a half times its keep alive."""
+        """Disconnect a client that was silent for one and a half times its keep alive."""
         if self._behind:
-            self._heard_at = now  # it is not read to the end
-        if not self._silence or self._is_awaiting or now - self._heard_at <= self._silence:
+            self._last_packet_at = now  # it is not read while a message waits
+        if (
+            not self._keep_alive_timeout
+            or self._is_awaiting
+            or now - self._last_packet_at <= self._keep_alive_timeout
+        ):
             return False
-        self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._heard_at:.0f} s")
+        self.close(ReasonCode.KEEP_ALIVE_TIMEOUT, f"silent for {now - self._last_packet_at:.0f} s")
         return True
 
     def _leave(self, why: str, *, publish_will: bool, expiry: int | None = None) -> None:
@@ -1152,7 +1160,7 @@ class ClientHandler:
                 )
 
     def _shut(self) -> None:
-        """Take in nothing more, and give back what is held; may be called twice."""
+        """Process no further input, and free what is held; may be called twice."""
         self._closed = True
         self._work = None
         try:
@@ -1164,5 +1172,5 @@ class ClientHandler:
             self._behind.clear()
             self._behind_size = 0
             self.protocol.close()
-        finally:  # or the other end would learn of it only when the transport's patience is over
+        finally:  # without it the peer would be disconnected only after a timeout
             self.output.end()

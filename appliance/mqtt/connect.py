@@ -141,7 +141,7 @@ class Connect:
             raise ProtocolError(
                 ReasonCode.UNSUPPORTED_PROTOCOL_VERSION,
                 f"protocol {quote(name)} level {level} is not MQTT 3.1, 3.1.1 or 5.0",
-                told=name in _PROTOCOLS.values(),
+                notify_peer=name in _PROTOCOLS.values(),
             )
         v5 = level == V5
         # In 5.0 wrong properties are answered; other wrong bytes only end the connection.
@@ -194,7 +194,7 @@ def _untold() -> Iterator[None]:
     try:
         yield
     except ProtocolError as error:
-        error.told = False
+        error.notify_peer = False
         raise
 
 

@@ -7,8 +7,9 @@ three kinds of event:
 * a `RawPublish`, a PUBLISH without properties that is taken apart but not wrapped: the data path;
 * an `int`, ``type << 16 | packet id``: an acknowledgement without reason code or properties.
 
-The two short forms save an object and a property table a message. What they leave out is what the
-standard says is absent, and `tests/mqtt/test_connection.py` holds them against the full decoder.
+The two short forms save creating an object and a property table for each message. They are used
+only where properties and reason code are absent; `tests/mqtt/test_connection.py` compares them with
+the full decoder.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from appliance.mqtt.topics import check_topic
 RawPublish: TypeAlias = tuple[int, bytes, int, bytes, bytes]
 Event: TypeAlias = "Packet | RawPublish | int"
 
-#: The largest packets that are read and are no PUBLISH, in bytes. A CONNECT comes from a stranger:
-#: room for a will and some properties, and as much as mosquitto takes. Others are long lists of
-#: filters: thousands, and not the millions that would keep all others waiting.
+#: The largest packets other than PUBLISH, in bytes. A CONNECT is not authenticated yet: there is
+#: room for a will and some properties, as in mosquitto. Other packets are long lists of filters:
+#: thousands are accepted, but not millions, which would make all other clients wait.
 MAXIMUM_CONNECT = 100_000
 MAXIMUM_CONTROL = 384 * 1024
 
-#: User Properties that a packet of a client may hold that has not logged in.
-STRANGERS_PAIRS = 64
+#: The limit of User Properties in a packet before the login.
+UNAUTHENTICATED_PAIRS = 64
 
-#: And of one that has, where nothing else is said.
-USUAL_PAIRS = 1000
+#: The default limit of User Properties in a packet after the login.
+DEFAULT_PAIRS = 1000
 
 PUBACK = PacketType.PUBACK << 16
 PUBREC = PacketType.PUBREC << 16
@@ -52,17 +53,17 @@ _ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
 _MQTT_5 = b"\0\4MQTT\5"
 
 
-#: Chunks of a packet up to this size, in bytes, are joined as they come.
+#: A buffered chunk below this size, in bytes, is joined with the next one immediately.
 SMALL_CHUNK = 4096
 
-#: What a topic alias takes beside its topic, in bytes.
+#: The memory of a topic alias beside its topic, in bytes.
 ALIAS_SIZE = 150
 
-#: Bytes of a User Property that is empty.
+#: The size of an empty User Property, in bytes.
 SHORTEST_PAIR = 5
 
-# Where the properties of a packet that is no PUBLISH begin in its body, if it has any; CONNECT has
-# them in two places.
+# The index of the properties in the body of a packet other than PUBLISH; CONNECT has properties in
+# two places.
 _PROPERTIES_AT: dict[int, int] = {
     PacketType.PUBACK: 3,
     PacketType.PUBREC: 3,
@@ -84,7 +85,7 @@ class State(Enum):
     CLOSED = "after the end"
 
 
-# What a client may send, and when; an absent entry is the error 0x82.
+# The packets that a client may send in each state; any other is a protocol error (0x82).
 # [MQTT-3.1.0-1], [MQTT-3.1.0-2]
 _LEGAL: dict[State, frozenset[PacketType]] = {
     State.NEW: frozenset({PacketType.CONNECT}),
@@ -108,7 +109,7 @@ _LEGAL: dict[State, frozenset[PacketType]] = {
 }
 
 
-#: What the flags of the fixed header have to be, where not 0 (section 2.2.2).
+#: The required flags of the fixed header, where they are not 0 (section 2.2.2).
 _FLAGS_OF_V311 = {
     int(kind): 2 for kind in (PacketType.PUBREL, PacketType.SUBSCRIBE, PacketType.UNSUBSCRIBE)
 }
@@ -117,44 +118,45 @@ _FLAGLESS = frozenset({PacketType.SUBACK, PacketType.UNSUBACK, PacketType.PINGRE
 
 
 class ServerProtocol:
-    """The server's end of one MQTT connection, as bytes.
+    """The server side of one MQTT connection, without I/O.
 
-    `maximum_packet_size` bounds a whole packet, in bytes, once the client has logged in;
-    `topic_alias_maximum` is what CONNACK announces to a version 5 client; `user_properties` bounds
-    those of a packet, once the client has logged in. They are not decoded here.
+    `maximum_packet_size` is the limit of a whole packet, in bytes, after the login;
+    `topic_alias_maximum` is the value that CONNACK announces to a version 5 client;
+    `user_properties` is the limit of User Properties in a packet after the login. These are not
+    decoded here.
     """
 
     def __init__(
         self,
         maximum_packet_size: int,
         topic_alias_maximum: int,
-        user_properties: int = USUAL_PAIRS,
+        user_properties: int = DEFAULT_PAIRS,
     ) -> None:
         self.maximum_packet_size = maximum_packet_size
         self.topic_alias_maximum = topic_alias_maximum
         self.user_properties = user_properties
-        #: What it took to check the properties of the last `Packet`, see `Counters.cost`.
+        #: The cost of checking the properties of the last `Packet`, see `Counters.cost`.
         self.cost = 0
         self.state = State.NEW
         self.version = 0
-        #: Whether it is one of MQTT 3.1, where DUP and QoS may stand in any packet's first byte.
+        #: Whether it is MQTT 3.1, where the first byte of any packet may contain DUP and QoS.
         self._is_v31 = False
-        #: False while nothing may be yielded: paused, or closed.
+        #: False while no event may be yielded: while paused, and when closed.
         self._reading = True
-        #: Whether its CONNECT named an authentication method, so that AUTH may come.
+        #: Whether its CONNECT has an authentication method, so that AUTH is allowed.
         self.authenticates = False
-        #: What was received and not yet taken apart; joined once `_need` bytes are there.
+        #: Received, unparsed bytes; the chunks are joined when `_need` bytes have arrived.
         self._chunks: list[bytes] = []
         self._have = 0
         self._need = 0
         self._aliases: dict[int, str] = {}
-        #: Bytes of a CONNECT that nobody knows yet who sent it.
+        #: Bytes of a CONNECT whose login is not finished.
         self._connecting = 0
-        #: Bytes that the aliases' topics take.
+        #: Bytes of memory of the topic aliases.
         self._aliased = 0
-        #: The last PUBLISH of the data path: its bytes from the header to the topic's end, and what
-        #: they say. A client that repeats itself (same topic, same size: most of them do) is
-        #: recognised by these bytes, which saves taking them apart again.
+        #: The last PUBLISH of the data path: its bytes from the header to the end of the topic, and
+        #: their decoded values. Most clients repeat topic and size: comparing these bytes then
+        #: saves parsing them again.
         self._head_first = -1
         self._head = b""
         self._head_topic = b""
@@ -162,40 +164,39 @@ class ServerProtocol:
 
     @property
     def held(self) -> int:
-        """Bytes of memory: received and not done with, a CONNECT until the end of the login, and
-        for topic aliases."""
+        """Bytes of memory: unparsed input, a CONNECT until the end of its login, and aliases."""
         return self._have + self._connecting + self._aliased
 
     @property
     def unfinished(self) -> bool:
-        """Whether a packet has come in part, and nothing else is kept."""
+        """Whether the buffered bytes are exactly one partial packet."""
         return self._have > 0 and self._reading
 
     @property
     def paused(self) -> bool:
-        """Whether what comes is kept until `accept` or `resume`."""
+        """Whether input is buffered until `accept` or `resume`."""
         return not self._reading and self.state is not State.CLOSED
 
     def pause(self) -> None:
-        """Keep what comes from here on, until `accept` or `resume`."""
+        """Buffer all input until `accept` or `resume`."""
         self._reading = False
 
     def resume(self) -> None:
-        """Go on; `receive_data(b"")` yields what came in the meantime."""
+        """Continue; `receive_data(b"")` yields the events of the buffered input."""
         self._reading = True
 
     def forget_connect(self) -> None:
-        """It is known who sent the CONNECT: what of it stays is counted elsewhere."""
+        """The login is over: what is stored of the CONNECT is counted elsewhere."""
         self._connecting = 0
 
     def accept(self) -> None:
-        """The client has logged in; `receive_data(b"")` yields what came in the meantime."""
+        """The client has logged in; `receive_data(b"")` yields the events of the buffered input."""
         self.state = State.CONNECTED
         self._reading = True
         self._connecting = 0
 
     def close(self) -> None:
-        """Yield nothing more, keep nothing more."""
+        """Yield no further events, and free all buffers."""
         self.state = State.CLOSED
         self._reading = False
         self._chunks.clear()
@@ -204,16 +205,16 @@ class ServerProtocol:
         self._aliased = self._connecting = 0
 
     def receive_data(self, data: bytes) -> Iterable[Event]:
-        """What `data`, behind what came before it, completes.
+        """The events that `data` completes, together with the bytes before it.
 
-        It is taken apart as it is iterated over, so that what one packet changes (refused, paused,
-        closed) holds for the next; it is to be iterated to its end.
+        It is parsed during the iteration, so that a change by one packet (refused, paused, closed)
+        applies to the next; the iteration must not be abandoned.
 
         Raises:
             ProtocolError: the bytes or their order are wrong; the connection is closed.
         """
-        # A chunk that is one acknowledgement, or one PUBLISH like the last, is answered at once:
-        # for clients that send one packet at a time the generator would be a fifth of the cost.
+        # A chunk that is one acknowledgement, or one PUBLISH like the last, needs no generator: for
+        # clients that send one packet at a time that would be a fifth of the cost.
         size = len(data)
         if size >= 4 and not self._have and self._reading and self.state is State.CONNECTED:
             if size == 4 and data[0] in _ACKNOWLEDGEMENTS and data[1] == 2:
@@ -223,14 +224,14 @@ class ServerProtocol:
                 event = self._repeated(data, 0, size)
                 if event is not None:
                     return (event,)
-        return self._take_apart(data)
+        return self._parse(data)
 
-    def _take_apart(self, data: bytes) -> Iterator[Event]:
-        """`receive_data`, the way that always works."""
+    def _parse(self, data: bytes) -> Iterator[Event]:
+        """The general form of `receive_data`."""
         if self._have:
-            # A packet cut into many chunks is joined once, when it is whole: joining at every
-            # chunk would copy a 16 MiB packet a hundred times over. Tiny ones are joined at once,
-            # as each would take many times its bytes.
+            # The chunks of a packet are joined once, when it is complete: joining at every chunk
+            # would copy a 16 MiB packet a hundred times. Small chunks are joined immediately,
+            # because each object takes many times its bytes.
             if len(self._chunks[-1]) < SMALL_CHUNK:
                 self._chunks[-1] += data
             else:
@@ -274,8 +275,8 @@ class ServerProtocol:
                     need = stop - pos
                     break
                 if 0x30 <= first <= 0x3D and length > 4:
-                    # The data path: a PUBLISH is taken apart by index. What is not plain in it
-                    # (properties, a missing topic, forbidden flags) goes to the full decoder.
+                    # The data path: a PUBLISH is parsed by index. One with properties, without a
+                    # topic or with invalid flags goes to the full decoder.
                     topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
                     payload = topic_end
                     packet_id = 0
@@ -322,7 +323,7 @@ class ServerProtocol:
             self._need = need
 
     def _repeated(self, buf: bytes, pos: int, stop: int) -> RawPublish | None:
-        """A PUBLISH that begins as the last one did; None when it needs the full decoder."""
+        """A PUBLISH with the header and topic of the last; None if it needs the full decoder."""
         head = self._head
         first = self._head_first
         payload = pos + len(head)
@@ -345,7 +346,7 @@ class ServerProtocol:
         )
 
     def _check(self, first: int, size: int) -> None:
-        """Whether a packet of this kind may come now, and be of this size."""
+        """Raise ProtocolError if a packet of this type or size is not allowed now."""
         _check_type(first)
         kind = PacketType(first >> 4)
         if self.state is State.NEW and first == 0x16:
@@ -359,7 +360,7 @@ class ServerProtocol:
                 "what it sends is HTTP; is it meant for a listener with protocol: websocket?",
             )
         if kind in _FLAGLESS and first & 0x0F:
-            # Said of these before that they may not come at all, as mosquitto does.
+            # Checked before the packet type is, as in mosquitto.
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a {kind.name} with reserved flags")
         if kind not in _LEGAL[self.state] or (
             kind is PacketType.AUTH and not self.authenticates  # [MQTT-4.12.0-7]
@@ -378,18 +379,18 @@ class ServerProtocol:
             raise ProtocolError(
                 ReasonCode.QUOTA_EXCEEDED,
                 f"a {kind.name} of {size} bytes, more than the limit of {limit}",
-                told=kind is not PacketType.CONNECT,
+                notify_peer=kind is not PacketType.CONNECT,
             )
 
     def _decode(self, first: int, body: bytes) -> Packet:
         if first >> 4 == PacketType.PUBLISH:
             return self._publish(first, body)
         if first >> 4 == PacketType.CONNECT and body[:7] == _MQTT_5:
-            self.version = 5  # so that what is wrong behind it can be answered
+            self.version = 5  # so that an error in the rest can be answered
         if self._is_v31:
             first = first & 0xF0 | _FLAGS_OF_V311.get(first >> 4, 0)
-        most = self.user_properties if self.state is State.CONNECTED else STRANGERS_PAIRS
-        self.cost = _cost(most, len(body))  # and so it stays for one that is refused
+        most = self.user_properties if self.state is State.CONNECTED else UNAUTHENTICATED_PAIRS
+        self.cost = _cost(most, len(body))  # remains if decoding raises
         packet = decode_packet(first, body, self.version, most)
         self.cost = _cost(most, _properties_size(first >> 4, body, self.version))
         if isinstance(packet, Connect):
@@ -401,7 +402,7 @@ class ServerProtocol:
         return packet
 
     def _publish(self, first: int, body: bytes) -> Publish:
-        """The full decoder for a PUBLISH, with its alias resolved and its topic checked."""
+        """Decode a PUBLISH fully, resolve its topic alias and check its topic."""
         most = self.user_properties
         self.cost = _cost(most, len(body))
         packet = decode_packet(first, body, self.version, most)
@@ -438,12 +439,12 @@ class ServerProtocol:
 
 
 def _cost(most: int, size: int) -> int:
-    """The cost to check properties of so many bytes, with no more User Properties than that."""
+    """The cost of checking properties of `size` bytes with at most `most` User Properties."""
     return min(most, size // SHORTEST_PAIR) // 2 + (size >> 9)
 
 
 def _properties_size(kind: int, body: bytes, version: int) -> int:
-    """Bytes of a packet that may be properties; it was accepted, and is no PUBLISH."""
+    """Bytes of properties, at most, in a valid packet other than PUBLISH."""
     if version != 5:
         return 0
     begin = _PROPERTIES_AT.get(kind)
@@ -458,12 +459,12 @@ def _check_type(first: int) -> None:
 
 
 def _remaining_length(buf: bytes, pos: int) -> tuple[int, int]:
-    """The length of a packet and where its body begins; IndexError when bytes are missing."""
-    # [MQTT-1.5.5-1]: at most four bytes. Those that are there are checked before more come.
+    """The length of a packet and the index of its body; IndexError if bytes are missing."""
+    # [MQTT-1.5.5-1]: at most four bytes. The available ones are checked before more arrive.
     if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
         raise IndexError
     try:
         return decode_varint(buf, pos + 1)
     except ProtocolError as error:
-        error.told = False
+        error.notify_peer = False
         raise

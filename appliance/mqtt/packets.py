@@ -1,14 +1,14 @@
-"""The control packets of MQTT 3.1.1 and 5.0 (chapter 3): one class each, bytes in and out.
+"""The control packets of MQTT 3.1.1 and 5.0 (chapter 3): one class each, with encode and decode.
 
-All fifteen are found here; those that begin a connection are written in connect.py.
+All fifteen can be imported from here; those that open a connection are defined in connect.py.
 
-`encode(version)` gives the whole packet and leaves out what that version cannot say, such as
-properties in 3.1.1; it raises ValueError for a value that fits no packet. `decode(flags, body,
-version)` takes the low four bits of the first byte and what follows the fixed header; it is
+`encode(version)` returns the whole packet and leaves out what that version does not have, such as
+properties in 3.1.1; it raises ValueError for a value that cannot be encoded. `decode(flags, body,
+version)` takes the low four bits of the first byte and the bytes behind the fixed header; it is
 strict, and raises ProtocolError with the standard's reason code. With a limit of User Properties
-(`pairs`) these are counted and checked, and left out of `properties`: who only passes them on, or
-has no use for them, makes no objects of what a client has sent. `str()` is short, for logs, and
-shows no password and no payload. Reason codes are those of 5.0 in both versions.
+(`pairs`) these are counted and checked, but not decoded into `properties`: a server that only
+forwards or ignores them need not create objects for them. `str()` is short, for logs, and contains
+no password and no payload. Reason codes are those of 5.0 in both versions.
 """
 
 from __future__ import annotations
@@ -114,9 +114,8 @@ _DISCONNECT_REASONS = frozenset(code for code in _R if code >= 0x80 or code in (
 class Publish:
     """PUBLISH (section 3.3): one message.
 
-    `packet_id` is there for QoS 1 and 2, and None for QoS 0. Only what the packet alone can tell is
-    checked: whether the topic is valid is `topics.check_topic`, and an empty one is allowed where
-    a Topic Alias stands for it (5.0).
+    `packet_id` is set for QoS 1 and 2, and None for QoS 0. Only rules within the packet are checked;
+    `topics.check_topic` validates the topic, which may be empty if there is a Topic Alias (5.0).
     """
 
     TYPE: ClassVar[PacketType] = PacketType.PUBLISH
@@ -128,7 +127,7 @@ class Publish:
     dup: bool = False
     packet_id: int | None = None
     properties: Properties | None = None
-    #: Its properties as its receivers get them, when it was read to be passed on.
+    #: The encoded properties for the receivers, if it was decoded with `pairs`.
     passed_on: bytes = field(default=NO_PROPERTIES, repr=False, compare=False)
 
     def encode(self, version: int) -> bytes:
@@ -229,7 +228,7 @@ class _Acknowledgement:
 
 @dataclass(slots=True)
 class Puback(_Acknowledgement):
-    """PUBACK (section 3.4): the receiver has a message of QoS 1."""
+    """PUBACK (section 3.4): the receiver has received a QoS 1 message."""
 
     TYPE = PacketType.PUBACK
     REASONS = _RECEIVED_REASONS
@@ -237,7 +236,7 @@ class Puback(_Acknowledgement):
 
 @dataclass(slots=True)
 class Pubrec(_Acknowledgement):
-    """PUBREC (section 3.5): the receiver has a message of QoS 2."""
+    """PUBREC (section 3.5): the receiver has received a QoS 2 message."""
 
     TYPE = PacketType.PUBREC
     REASONS = _RECEIVED_REASONS
@@ -245,7 +244,7 @@ class Pubrec(_Acknowledgement):
 
 @dataclass(slots=True)
 class Pubrel(_Acknowledgement):
-    """PUBREL (section 3.6): the sender of a message of QoS 2 has seen PUBREC."""
+    """PUBREL (section 3.6): the sender of a QoS 2 message has received PUBREC."""
 
     TYPE = PacketType.PUBREL
     FLAGS = 0b0010  # [MQTT-3.6.1-1]
@@ -254,7 +253,7 @@ class Pubrel(_Acknowledgement):
 
 @dataclass(slots=True)
 class Pubcomp(_Acknowledgement):
-    """PUBCOMP (section 3.7): the packet identifier of a message of QoS 2 is free again."""
+    """PUBCOMP (section 3.7): the packet identifier of a QoS 2 message is free again."""
 
     TYPE = PacketType.PUBCOMP
     REASONS = _RELEASED_REASONS
@@ -510,7 +509,7 @@ class _Ping:
         check_flags(cls.TYPE, flags)
         if body:
             problem = f"{cls.TYPE.name} with {len(body)} bytes after its end"
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, problem, told=False)
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, problem, notify_peer=False)
         return cls()
 
     def __str__(self) -> str:
@@ -533,7 +532,7 @@ class Pingresp(_Ping):
 
 @dataclass(slots=True)
 class Disconnect:
-    """DISCONNECT (section 3.14): the last packet. In 3.1.1 only a client sends it, empty."""
+    """DISCONNECT (section 3.14): the last packet. In 3.1.1 it is empty; only clients send it."""
 
     TYPE: ClassVar[PacketType] = PacketType.DISCONNECT
 
@@ -558,7 +557,7 @@ class Disconnect:
         try:
             reason_code = decode_reason(cls.TYPE, body[0], _DISCONNECT_REASONS)
         except ProtocolError as error:
-            error.told = False  # it is leaving anyway
+            error.notify_peer = False  # it is leaving anyway
             raise
         properties = None
         if len(body) > 1:
@@ -609,10 +608,10 @@ _DECODERS: dict[int, Callable[[int, bytes, int, int | None], Packet]] = {
 
 
 def decode_packet(first_byte: int, body: bytes, version: int, pairs: int | None = None) -> Packet:
-    """The packet whose fixed header begins with `first_byte` and whose rest is `body`.
+    """Decode the packet whose fixed header begins with `first_byte` and whose rest is `body`.
 
-    `version` is that of the connection; a CONNECT brings its own. `pairs` is as for `decode`.
-    ProtocolError when it is no packet of that version.
+    `version` is that of the connection; a CONNECT contains its own. `pairs` is as for `decode`.
+    Raises ProtocolError if it is not a packet of that version.
     """
     decode = _DECODERS.get(first_byte >> 4)
     if decode is None:  # Packet type 0 is reserved, section 2.2.1.

@@ -6,9 +6,9 @@ from enum import IntEnum
 
 
 class ReasonCode(IntEnum):
-    """The reason codes of MQTT 5.0, section 2.4; from 0x80 on they are failures.
+    """The reason codes of MQTT 5.0, section 2.4; those from 0x80 on are failures.
 
-    All of this package speaks in these, for MQTT 3.1.1 too: packets translate at the wire.
+    This package uses them for MQTT 3.1.1, too: packets translate them when they are encoded.
     """
 
     SUCCESS = 0x00
@@ -59,16 +59,16 @@ class ReasonCode(IntEnum):
 
 
 class ProtocolError(Exception):
-    """The other side broke the protocol: `code` goes into CONNACK or DISCONNECT, then it closes.
+    """The peer violated the protocol: `code` goes into CONNACK or DISCONNECT before the close.
 
-    The message says what was wrong, for the log; it holds no payload and no secret. With `told`
-    False the other side is not told: where the standard leaves that open, mosquitto does not.
+    The message is for the log; it contains no payload and no secret. With `notify_peer` False the
+    code is not sent: where the standard leaves that open, this follows mosquitto.
     """
 
-    def __init__(self, code: ReasonCode, message: str, *, told: bool = True) -> None:
+    def __init__(self, code: ReasonCode, message: str, *, notify_peer: bool = True) -> None:
         super().__init__(message)
         self.code = code
-        self.told = told
+        self.notify_peer = notify_peer
 
 
 # 3.1.1 has five refusals (table 3.1). 3, "server unavailable", invites the client to try again;
@@ -96,9 +96,9 @@ _NOT_WORTH_A_RETRY = frozenset(
 
 
 def connack_v311(code: int) -> int:
-    """The CONNACK return code (0 to 5, MQTT 3.1.1 section 3.2.2.3) that says `code` best.
+    """The CONNACK return code (0 to 5, MQTT 3.1.1 section 3.2.2.3) that is closest to `code`.
 
-    A return code of 3.1.1 (1 to 5, none of which is a CONNACK reason code of 5.0) stays itself.
+    A return code of 3.1.1 (1 to 5, none of which is a CONNACK reason code of 5.0) is unchanged.
     """
     if code in _CONNACK_V5:
         return code

@@ -14,7 +14,7 @@ from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.rate_limited_log import BURST, INTERVAL
 from appliance.broker.session import REPLAYED_A_TURN, subscription_size
 from appliance.mqtt.codec import Properties, Property
-from appliance.mqtt.connection import STRANGERS_PAIRS
+from appliance.mqtt.connection import UNAUTHENTICATED_PAIRS
 from appliance.mqtt.packets import (
     MAXIMUM_FILTERS,
     Connack,
@@ -385,8 +385,8 @@ def test_a_stranger_has_fewer_user_properties(broker: Broker):
     """Those of CONNECT and of its will together"""
     for more in (0, 1):
         peer = Peer(broker)
-        will = Will("w", b"", properties=user_properties(STRANGERS_PAIRS // 2))
-        peer.say_connect(will=will, properties=user_properties(STRANGERS_PAIRS // 2 + more))
+        will = Will("w", b"", properties=user_properties(UNAUTHENTICATED_PAIRS // 2))
+        peer.say_connect(will=will, properties=user_properties(UNAUTHENTICATED_PAIRS // 2 + more))
         if more:
             assert peer.only(Connack).reason_code == ReasonCode.QUOTA_EXCEEDED  # type: ignore
             assert peer.transport.closed
