@@ -114,7 +114,7 @@ _DISCONNECT_REASONS = frozenset(code for code in _R if code >= 0x80 or code in (
 class Publish:
     """PUBLISH (section 3.3): one message.
 
-    `packet_id` is set for QoS 1 and 2, and None for QoS 0. Only rules within the packet are checked;
+    `packet_id` is set for QoS 1 and 2, None for QoS 0. Only rules within the packet are checked;
     `topics.check_topic` validates the topic, which may be empty if there is a Topic Alias (5.0).
     """
 
