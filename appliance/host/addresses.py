@@ -1,4 +1,4 @@
-"""What counts as one address where limits are an address's."""
+"""Network prefixes: what counts as one address where a limit applies to an address."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import socket
 
 
 def network_prefix(address: str) -> bytes:
-    """One address of IPv4; of IPv6 a network of 64 bits, as one site has; or one Unix socket.
+    """The key for limits of an address: an IPv4 address, an IPv6 /64, as a site has, or a Unix
+    socket.
 
     `address` is a host, with its port or without: "127.0.0.1", "127.0.0.1:54321", "[::1]:54321";
     or a Unix socket and the connection's number, "unix:/run/mqtt.sock:17".

@@ -1,4 +1,4 @@
-"""The environment that other programs are started with, and that of the service."""
+"""Environments: for programs that are started, and of the systemd service."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from contextlib import suppress
 from pathlib import Path
 
 LIBRARIES = "LD_LIBRARY_PATH"
-#: What it was before the one file's boot loader put its own libraries first.
+#: Its value before the boot loader of the one-file build put its own libraries first.
 ORIGINAL_LIBRARIES = f"{LIBRARIES}_ORIG"
 _MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 
 def for_other_programs(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """This process's environment as it was before the ROS wheels, or the one file, changed it.
+    """This process's environment as it was before the ROS wheels, or the one-file build, changed
+    it.
 
     They restart Python with an `LD_LIBRARY_PATH` that names their own libraries. Another program
-    (mosquitto, a system's Python) that inherits it would load those in place of its own.
+    (mosquitto, the system's Python) that inherits it would load those in place of its own.
     """
     result = dict(os.environ if environment is None else environment)
     if result.pop(_MARK, None) is None:
@@ -33,9 +34,9 @@ def for_other_programs(environment: Mapping[str, str] | None = None) -> dict[str
 
 
 def of_service(configuration: Path) -> dict[str, str]:
-    """What systemd gives to the service with that configuration, EnvironmentFile= in its unit.
+    """What systemd gives to the service with that configuration by EnvironmentFile= in its unit.
 
-    Empty for the configuration of no service, and for who may not read it.
+    Empty when it is not a service's configuration, or the file cannot be read.
     """
     *_, etc, folder, name = ("", "", *configuration.absolute().parts)
     if (etc, folder, name) != ("etc", "appliance", "appliance.yaml"):

@@ -1,7 +1,8 @@
-"""Whose files they are: root changes what is another user's as that user, and not as root.
+"""File owners: a command of root changes another user's files as that user, not as root.
 
-What appliance.yaml names, and what lies in the service's folders, its user can replace by a link to
-anything, and a command that root gives would write there. As that user it can do no more than that.
+The service's user can replace files in its folders, and files that appliance.yaml names, by links
+to anything. A command that root gives would follow them. Acting as that user, it can do no more
+than the user could.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ _ROOT = 0
 
 
 class OwnerError(Exception):
-    """Root does not touch this; the message says why and what to do."""
+    """Root does not write there; the message says why and what to do."""
 
 
 def owner_of(path: Path) -> int:
-    """The user id of who decides what is found under that path; root's when nobody else does.
+    """The id of the user who controls what is found under that path; root's if nobody else does.
 
     Raises:
-        OwnerError: that is anybody, or any of a group.
+        OwnerError: everybody controls it, or every member of a group.
     """
     path = path.absolute()
     for folder in reversed(path.parents):
@@ -47,7 +48,7 @@ def owner_of(path: Path) -> int:
 
 @contextlib.contextmanager
 def acting_for(*paths: Path | None) -> Iterator[None]:
-    """Be the first other user who decides about one of these paths, if this is root; else nothing.
+    """As root, act as the first other user who controls one of these paths; else change nothing.
 
     Raises:
         OwnerError: see `owner_of`.
@@ -68,7 +69,7 @@ def acting_for(*paths: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def acting_as_caller() -> Iterator[None]:
-    """Inside of `acting_for`, be who gave the command: for files that stand on its command line."""
+    """Within `acting_for`, act as the caller again: for files named on the command line."""
     with _being(os.getuid(), os.getgid(), [os.getgid()]):
         yield
 

@@ -1,4 +1,4 @@
-"""Files that are told of when they change: edited, replaced, made or removed."""
+"""Watches files for changes: edited, replaced, created or removed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from watchfiles import Change, awatch
 
 log = logging.getLogger(__name__)
 
-#: Milliseconds without a further change before a change is told of, as files that belong together
-#: are seldom written at once; and the longest that it is held back.
+#: Milliseconds without a further change before a change is reported, as files that belong together
+#: are seldom written at once; and the longest delay.
 QUIET = 200
 LONGEST = 1000
 
@@ -21,8 +21,8 @@ async def watch(
 ) -> None:
     """Call `changed` whenever one of the files has changed; runs until it is cancelled.
 
-    Which files is asked for anew after each call. A file need not be there; its folder must be, or
-    it is not looked for until the next call.
+    The files are listed anew after each call. A file need not exist; its folder must, or the file
+    is not watched until the next call.
     """
     while True:
         wanted = _with_targets(files())
@@ -31,7 +31,7 @@ async def watch(
         def is_wanted(change: Change, path: str, wanted: set[Path] = wanted) -> bool:
             return Path(path) in wanted
 
-        # A folder and not a file is watched: editors put a new file in the place of the old.
+        # Folders are watched, not files: editors replace a file by a new one.
         changes = awatch(
             *sorted(folders), watch_filter=is_wanted, step=QUIET, debounce=LONGEST, recursive=False
         )
@@ -42,6 +42,6 @@ async def watch(
 
 
 def _with_targets(files: Iterable[Path]) -> set[Path]:
-    """The files, and what links among them lead to."""
+    """The files, and the targets of links among them."""
     wanted = {path.absolute() for path in files}
     return wanted | {path.resolve() for path in wanted}

@@ -1,4 +1,4 @@
-"""Listening: TCP, TLS, WebSocket and Unix sockets, and how many may come, and how fast."""
+"""Listeners: TCP, TLS, WebSocket and Unix sockets, and the limits on new connections."""
 
 from __future__ import annotations
 
@@ -30,46 +30,47 @@ from appliance.net.sockets import allow_files, listen, listen_on_path
 
 log = logging.getLogger(__name__)
 
-#: Connections that are accepted in one go: a TLS handshake takes a millisecond, and other clients
-#: want their turn.
+#: Connections that are accepted in one turn: a TLS handshake takes a millisecond, and other clients
+#: wait.
 ACCEPTED_A_TURN = 16
 
 #: Seconds until connections are accepted again after the system refused one.
 ACCEPT_PAUSE = 0.5
 
-#: TLS handshakes at a time; who comes meanwhile waits in the system's backlog, where waiting costs
+#: TLS handshakes at a time. Further connections wait in the system's backlog, where they cost
 #: nothing and no time limit of ours runs.
 HANDSHAKES = 64
 
-#: Seconds without one handshake ending after which those under way no longer keep others waiting:
-#: it is the network that they wait for, or they are not meant to end.
+#: Seconds in which no handshake has ended, after which those in progress no longer delay others:
+#: they wait for the network, or are not meant to end.
 HANDSHAKE_STALL = 0.25
 
-#: Certificates that are looked at in one go when they are looked at anew, at most 0.2 ms each.
+#: Certificates that are checked again in one turn, at most 0.2 ms each.
 CHECKED_A_TURN = 16
 
-#: Seconds that one address may open connections ahead of `limits.connection_rate`.
+#: Seconds by which one address may exceed `limits.connection_rate` in a burst.
 CONNECTION_BURST = 5.0
 
-#: What stands for the address of Unix sockets.
+#: The address of all Unix sockets.
 UNIX = b""
 
-#: Addresses that are remembered before those are looked for that can be forgotten.
+#: Evict idle addresses when the table exceeds this size.
 ADDRESSES = 1024
 
-#: Seconds that clients get at the stop to read what was written to them.
+#: Seconds that clients have at shutdown to read what was written to them.
 STOP_TIMEOUT = 1.0
 
-#: Connections that have not logged in, or are closing, beside as many clients as there may be.
+#: Guests: connections that have not logged in, or are closing. So many may exist beside the
+#: clients.
 GUESTS = 256
 
-#: Files that the process opens beside its connections.
+#: Files that the process opens beside its clients' connections.
 OTHER_FILES = GUESTS + LINGERING_CLOSES + 256
 
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """How many may come, and how fast: of `broker.limits` in appliance.yaml, infinity for none."""
+    """Limits on connections, of `broker.limits` in appliance.yaml; infinity for no limit."""
 
     connections: int
     connect_timeout: float
@@ -82,9 +83,9 @@ class Admission:
 class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
-    `context` is asked at each connection for its TLS settings, so that these can be replaced; None
-    is for connections without TLS. `anonymous` is whether it lets in who gives no user name, None
-    for what holds everywhere.
+    `context` is called at each connection for its TLS settings, so that these can be replaced; None
+    means no TLS. `anonymous` is whether it admits clients without a user name; None means as
+    configured for all listeners.
     """
 
     host: str
@@ -97,12 +98,12 @@ class ListenerSettings:
 
     @property
     def place(self) -> tuple[str, int, Path | None]:
-        """What no two listeners can share."""
+        """The address, which no two listeners can share."""
         return self.host, self.port, self.path
 
 
 class Listeners:
-    """All listening sockets; `network_prefix` has the connections made to them."""
+    """All listening sockets; `scheduler` has the connections made to them."""
 
     def __init__(
         self,
@@ -130,30 +131,30 @@ class Listeners:
 
     @property
     def addresses(self) -> list[tuple[str, int]]:
-        """Where is listened, with the port that the system chose where it was 0."""
+        """The addresses, with the port that the system chose where it was 0."""
         return [sock.address for sock in self._sockets]
 
     def sockets(self) -> list[tuple[str, ListenerSettings]]:
-        """Each listener's address, as the log has it, and its settings."""
+        """Each listener's address, as the log shows it, and its settings."""
         return [(str(sock), sock.settings) for sock in self._sockets]
 
     def prepare(self, settings: list[ListenerSettings]) -> list[_ListeningSocket]:
-        """Get ready to listen there, for `take`; where is listened already nothing changes yet.
+        """Open the sockets for these settings, for `take`; sockets that exist are reused.
 
         Raises:
             OSError: an address cannot be listened on; nothing has changed then.
         """
         leaving = list(self._sockets)
-        kept: list[_ListeningSocket | None] = []
+        reused: list[_ListeningSocket | None] = []
         for listener in settings:
-            # The first of several: those whose ports the system chose are told apart by order.
+            # Of several with a port chosen by the system, the order decides.
             same = (sock for sock in leaving if sock.settings.place == listener.place)
-            kept.append(next(same, None))
-            if kept[-1] is not None:
-                leaving.remove(kept[-1])
+            reused.append(next(same, None))
+            if reused[-1] is not None:
+                leaving.remove(reused[-1])
         sockets: list[_ListeningSocket] = []
         try:
-            for listener, sock in zip(settings, kept, strict=True):
+            for listener, sock in zip(settings, reused, strict=True):
                 sockets.append(sock or _ListeningSocket(self, listener, leaving))
         except BaseException:
             self.drop(sockets)
@@ -161,7 +162,7 @@ class Listeners:
         return sockets
 
     def drop(self, sockets: list[_ListeningSocket]) -> None:
-        """Not to be taken after all."""
+        """Close prepared sockets that are not taken after all."""
         for sock in sockets:
             if sock not in self._sockets:
                 sock.close()
@@ -172,7 +173,7 @@ class Listeners:
         settings: list[ListenerSettings],
         admission: Admission,
     ) -> None:
-        """Listen there from now on, like this; connections that were made elsewhere stay."""
+        """Put prepared sockets into service and close the others; open connections stay."""
         self.admission = admission
         self._addresses.use(admission)
         self.scheduler.use(admission.connect_timeout, admission.publish_rate)
@@ -190,7 +191,7 @@ class Listeners:
                 log.info("listening%s on %s", kind, sock)
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
-        """Listen; returns the addresses, with the port that the system chose where it was 0.
+        """Start to listen; returns the addresses, with the port that was chosen where it was 0.
 
         Raises:
             OSError: an address cannot be listened on; nothing is left listening.
@@ -199,13 +200,13 @@ class Listeners:
         return self.addresses
 
     def admit(self, connection: socket.socket, peer: object, listener: ListenerSettings) -> None:
-        """Begin a new connection, or close it when there are as many as allowed."""
+        """Begin an accepted connection, or close it if the limits refuse it."""
         counters = self.broker.counters
         counters.sockets += 1
         now = asyncio.get_running_loop().time()
         refusal = host = ""
         if listener.path is not None:
-            # In the place of a port a number that no other connection has at the time.
+            # In the place of a port, a number that no other open connection has.
             address = f"unix:{listener.path}:{connection.fileno()}"
         else:
             host, port = cast("tuple[str, int]", peer)[:2]
@@ -246,11 +247,11 @@ class Listeners:
                 self._open_sockets()
 
     def _make_room(self) -> str:
-        """Let there be room for a connection more; or why there cannot be.
+        """Make room for one more connection; or return why there is none.
 
-        Who has logged in does not count: among users the broker decides who makes room, when it
-        knows who comes. Of the others the one goes that has waited longest, out of the address
-        with most of them: as many strangers as may come from everywhere keep nobody out.
+        Only guests make room here: among users the broker decides that, once the login says who
+        comes. Of the address with most guests the oldest one is closed, so that strangers cannot
+        keep anybody out, however many come and from wherever.
         """
         limit = self.admission.connections
         if len(self.scheduler.connections) < max(
@@ -265,18 +266,18 @@ class Listeners:
 
     @property
     def crowded(self) -> bool:
-        """Whether there are as many TLS handshakes as there may be at a time."""
+        """Whether as many TLS handshakes are in progress as allowed."""
         return len(self._handshakes) >= HANDSHAKES
 
     def wait_for_handshakes(self) -> None:
-        """Open the doors again when a handshake has ended, or when none does for a while."""
+        """Accept again when a handshake has ended, or when none does for a while."""
         if self._stall is None:
             self._stall = self.scheduler.entries.later(
                 "listener.stall", HANDSHAKE_STALL, self._pass_stalled, failed=self._open_sockets
             )
 
     def _pass_stalled(self) -> None:
-        self._handshakes.clear()  # they go on, and are not counted any more
+        self._handshakes.clear()  # they continue, and no longer count
         self._open_sockets()
 
     def _open_sockets(self) -> None:
@@ -291,7 +292,7 @@ class Listeners:
                 sock.pause()
 
     async def check_certificates(self) -> None:
-        """End the connections whose client's certificate is not, or no longer, accepted."""
+        """Close connections whose client's certificate is not, or no longer, accepted."""
         for number, member in enumerate(list(self.scheduler.connections)):
             try:
                 member.check_certificate()
@@ -301,7 +302,7 @@ class Listeners:
                 await asyncio.sleep(0)
 
     async def stop(self) -> None:
-        """Listen no more and close what is open; may be called twice."""
+        """Close all listeners and connections; may be called twice."""
         sockets, self._sockets = self._sockets, []
         for sock in sockets:
             sock.close()
@@ -314,7 +315,7 @@ class Listeners:
 
 
 class _ListeningSocket:
-    """One listening socket; it may take over the port of one that is `leaving`."""
+    """One listening socket; it may take over the port of one that is `leaving` (to be closed)."""
 
     def __init__(
         self, listeners: Listeners, settings: ListenerSettings, leaving: list[_ListeningSocket]
@@ -337,14 +338,14 @@ class _ListeningSocket:
         return host if self.settings.path is not None else f"{host or '*'}:{port}"
 
     def use(self, settings: ListenerSettings) -> None:
-        """Let these settings hold for those who come from now on."""
+        """Apply these settings to connections that are accepted from now on."""
         if settings.path is not None and settings.mode != self.settings.mode:
             with contextlib.suppress(OSError):  # it may be gone
                 settings.path.chmod(settings.mode)
         self.settings = settings
 
     def open(self) -> None:
-        """Accept what comes; does nothing when it is open, or closed for good."""
+        """Accept connections; does nothing when it is open already, or closed for good."""
         if not self._is_open and self._socket.fileno() >= 0:
             self._is_open = True
             self._entries.reader(
@@ -357,7 +358,7 @@ class _ListeningSocket:
             self._entries.loop.remove_reader(self._socket)
 
     def pause(self) -> None:
-        """Accept nothing for a while."""
+        """Accept nothing for `ACCEPT_PAUSE` seconds."""
         self._shut()
         self._entries.later(
             "listener.reopen", ACCEPT_PAUSE, self.open, served=self, failed=self.pause
@@ -374,7 +375,8 @@ class _ListeningSocket:
             except (BlockingIOError, InterruptedError, ConnectionAbortedError):
                 return
             except OSError as error:
-                # Out of file descriptors, most likely: it passes, and asking on would spin.
+                # Most likely out of file descriptors: that passes, and trying again at once would
+                # spin.
                 log.error("no connection can be accepted: %s", error)
                 self.pause()
                 return
@@ -385,7 +387,7 @@ class _ListeningSocket:
                 connection.close()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._shut()
         self._socket.close()
         path = self.settings.path
@@ -397,41 +399,40 @@ class _ListeningSocket:
 
 @dataclass(slots=True)
 class _AddressState:
-    """What is known of one address."""
+    """The connections of one address."""
 
-    #: Connections that have not logged in yet, or are closing, in the order of their coming.
+    #: Connections that have not logged in, or are closing, oldest first.
     guests: dict[ScheduledConnection, None] = field(default_factory=dict)
-    #: And those that have, by their users.
+    #: Connections that have logged in, counted by user.
     clients: dict[Account, int] = field(default_factory=dict)
-    #: When the connections that it opened are paid for at the rate allowed.
+    #: When the connections that it has opened are covered by the allowed rate (a virtual clock).
     paid_at: float = 0.0
 
 
 class _AddressLimits:
-    """How many connections each address has, and how fast it opens new ones: the `AdmissionPolicy`.
+    """The `AdmissionPolicy`: limits the connections of each address, and how fast it opens them.
 
-    Those of one user, and those before their login, are counted for themselves: who knows a
-    password keeps nobody out who shares its address. All Unix sockets are one address, without a
-    limit.
+    The connections of each user, and those before the login, are counted separately: a user cannot
+    keep out others who share its address. All Unix sockets are one address, without a limit.
     """
 
     def __init__(self, admission: Admission) -> None:
         self.use(admission)
         self._known: dict[bytes, _AddressState] = {}
-        self._many = ADDRESSES
+        self._evict_at = ADDRESSES
 
     def use(self, admission: Admission) -> None:
-        """Let these limits hold from now on."""
+        """Apply these limits from now on."""
         self._limit = admission.connections_per_address
         self._rate = admission.connection_rate
 
     def reserve(self, host: str, now: float) -> str:
-        """Count a new connection's coming; or, uncounted, why it is not allowed."""
+        """Count a new connection against the rate; or return why it is refused, uncounted."""
         where = network_prefix(host)
         state = self._known.get(where)
         if state is None:
-            if len(self._known) >= self._many:
-                self._forget_idle(now)
+            if len(self._known) >= self._evict_at:
+                self._evict_idle(now)
             state = self._known[where] = _AddressState()
         if len(state.guests) >= self._limit:
             return (
@@ -452,7 +453,7 @@ class _AddressLimits:
         return self._known.setdefault(where, _AddressState())
 
     def add_guest(self, member: ScheduledConnection) -> None:
-        """A new connection is there."""
+        """Count a connection that was accepted, as a guest."""
         self._of(member).guests[member] = None
 
     def admit(self, member: ScheduledConnection, account: Account) -> str:
@@ -483,15 +484,15 @@ class _AddressLimits:
             state.clients.pop(member.account, None)
 
     def oldest_guest(self) -> ScheduledConnection | None:
-        """Of the address that has most of them, the guest that came first."""
+        """The oldest guest of the address that has most guests."""
         most = max(self._known.values(), key=lambda each: len(each.guests), default=None)
         return next(iter(most.guests), None) if most is not None else None
 
-    def _forget_idle(self, now: float) -> None:
+    def _evict_idle(self, now: float) -> None:
         self._known = {
             where: state
             for where, state in self._known.items()
             if state.guests or state.clients or state.paid_at > now
         }
-        # Each is looked at once for every two that come: the work stays in proportion.
-        self._many = max(ADDRESSES, 2 * len(self._known))
+        # The table has to double before the next eviction, so the work per arrival is constant.
+        self._evict_at = max(ADDRESSES, 2 * len(self._known))

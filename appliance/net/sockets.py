@@ -1,4 +1,4 @@
-"""Sockets, of TCP and of Unix: listening ones, what the system knows of others, and how many."""
+"""TCP and Unix sockets: listening, file limits, and what the system knows about a connection."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from appliance.broker.ports import PeerStatus
 
 log = logging.getLogger(__name__)
 
-#: Connections that wait to be accepted, as far as the system allows.
+#: The backlog of connections that wait to be accepted, as far as the system allows.
 BACKLOG = 4096
 
-#: Why a port cannot be had, and what to do.
+#: Why a port is not available, and what to do.
 _REASONS = {
     errno.EADDRINUSE: "it is in use already; `appliance doctor` says who has it",
     errno.EADDRNOTAVAIL: "this computer does not have this address; 0.0.0.0 is for all that it has",
     errno.EACCES: "ports as low as this one are for root; `appliance doctor` says what else to do",
 }
 
-#: Where the configuration says where to listen.
+#: The configuration key of the listeners.
 _LISTENERS = "broker.listeners"
 
 
 def listen(host: str, port: int, leaving: Sequence[socket.socket] = ()) -> socket.socket:
-    """A listening socket; an empty host is every address, IPv6 ones too where there are any.
+    """A listening socket; an empty host is every address, those of IPv6 included.
 
-    Of the sockets that are `leaving` it takes over the port: `0.0.0.0` that of `127.0.0.1`, say.
+    It may take over the port of sockets that are `leaving`, such as `0.0.0.0` that of `127.0.0.1`.
     """
     everywhere = not host
     dualstack = everywhere and socket.has_dualstack_ipv6()
@@ -64,7 +64,7 @@ def listen(host: str, port: int, leaving: Sequence[socket.socket] = ()) -> socke
 
 @contextlib.contextmanager
 def _shared_ports(sockets: Sequence[socket.socket]) -> Iterator[None]:
-    """Meanwhile who asks for it (SO_REUSEPORT, socket(7)) may listen on their ports as well."""
+    """Meanwhile other sockets with SO_REUSEPORT (socket(7)) may listen on the same ports."""
     for sock in sockets:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
     try:
@@ -75,17 +75,17 @@ def _shared_ports(sockets: Sequence[socket.socket]) -> Iterator[None]:
 
 
 def listen_on_path(path: Path, mode: int, key: str = _LISTENERS) -> socket.socket:
-    """A listening Unix socket, in place of one that nobody listens on any more.
+    """A listening Unix socket; one that nobody listens on any more is replaced.
 
-    `key` of the configuration is what an error names.
+    `key` is the configuration key that an error names.
     """
     sock = socket.socket(socket.AF_UNIX)
     try:
         sock.setblocking(False)
         _clear(path)
-        os.fchmod(sock.fileno(), mode)  # before it has a name: it is at no time open to more
+        os.fchmod(sock.fileno(), mode)  # before it has a name: it is never open to more
         sock.bind(str(path))
-        path.chmod(mode)  # what the process's umask has taken away
+        path.chmod(mode)  # bits that the umask has cleared
         sock.listen(BACKLOG)
     except OSError as error:
         sock.close()
@@ -94,7 +94,7 @@ def listen_on_path(path: Path, mode: int, key: str = _LISTENERS) -> socket.socke
 
 
 def _clear(path: Path) -> None:
-    """Remove what an appliance that did not end well has left. OSError: it is something else."""
+    """Remove the socket of an appliance that has crashed. OSError: it is something else."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise FileExistsError(errno.EEXIST, "there is a file that is no socket")
@@ -106,7 +106,7 @@ def _clear(path: Path) -> None:
     except ConnectionRefusedError:
         path.unlink(missing_ok=True)
         return
-    except BlockingIOError:  # so many wait there that one more does not fit
+    except BlockingIOError:  # somebody listens there, and the backlog is full
         pass
     raise OSError(errno.EADDRINUSE, "another process listens there")
 
@@ -117,7 +117,7 @@ def _cannot_listen(where: str, error: OSError, key: str = _LISTENERS) -> OSError
 
 
 def allow_files(needed: int) -> None:
-    """Let the process open so many files, as far as the system allows."""
+    """Raise the process's limit of open files, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
@@ -134,23 +134,23 @@ def allow_files(needed: int) -> None:
 
 #: Where `tcpi_last_data_recv`, `tcpi_last_ack_recv` (milliseconds), `tcpi_rtt` (microseconds) and
 #: `tcpi_bytes_received` are in Linux's `struct tcp_info`, and the first bytes of it, with all of
-#: them; systems before 4.1 have not the last one.
+#: them; Linux before 4.1 lacks the last one.
 _LAST_DATA, _LAST_ACK, _ROUND_TRIP, _RECEIVED = 52, 56, 68, 128
 _TCP_INFO_SIZE = 136
 
-#: `SO_MEMINFO`, of which the first two numbers are the memory that unread bytes take, and the most.
+#: `SO_MEMINFO`; its first two numbers are the memory that unread bytes take, and its limit.
 _MEMORY = 55
 _MEMORY_SIZE = 36
 
-#: Bytes of a Unix socket, or where that is not known, that may be all that fits.
+#: Unread bytes from which on a buffer of unknown size counts as full.
 _MUCH = 4096
 
-#: Seconds of silence after which a probe is sent, and between two of them: the least there is.
+#: Seconds of silence before the first probe, and between two probes: the least that is possible.
 _PROBE_AFTER = 1
 
 
 def peer_status(connection: socket.socket) -> PeerStatus:
-    """What the system knows of the computer at the other end; a Unix socket's is this one."""
+    """What the system knows about the peer's computer; that of a Unix socket is this one."""
     try:
         unread = _unread(connection)
         if connection.family == socket.AF_UNIX:
@@ -165,7 +165,7 @@ def peer_status(connection: socket.socket) -> PeerStatus:
 
 
 class ReceiveBuffer(NamedTuple):
-    """What the system has received of a connection, as `Inflow.look` takes it."""
+    """The state of a socket's receive buffer, as `Inflow.look` takes it."""
 
     unread: bool
     full: bool
@@ -174,8 +174,8 @@ class ReceiveBuffer(NamedTuple):
 
 
 def receive_buffer(connection: socket.socket) -> ReceiveBuffer:
-    """How much of what has come is not read, and whether the other end may keep more back for that:
-    its window is much smaller than it may be."""
+    """How much is unread, and whether the buffer is so full that the peer may hold back more: its
+    TCP window is much smaller than it may be."""
     try:
         waits = _unread(connection)
         if connection.family == socket.AF_UNIX:
@@ -200,7 +200,7 @@ def _unread(connection: socket.socket) -> int:
 
 
 class Probe:
-    """Keep-alive probes of TCP, which the other end's system answers by itself, from now on."""
+    """TCP keep-alive probes, which the peer's system answers by itself, from now until `end`."""
 
     _SHORT = (("TCP_KEEPIDLE", _PROBE_AFTER), ("TCP_KEEPINTVL", _PROBE_AFTER))
 
@@ -216,7 +216,7 @@ class Probe:
                 connection.setsockopt(socket.IPPROTO_TCP, option, seconds)
 
     def end(self) -> None:
-        """No more of them than before."""
+        """Restore the probes' intervals."""
         with contextlib.suppress(OSError):
             for option, value in self._before:
                 self._connection.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -1,8 +1,8 @@
-"""TLS on the connections of a listener, made for many connections with small messages.
+"""TLS for accepted connections, optimised for many connections with small messages.
 
-asyncio and uvloop have TLS transports of their own. They look for another record behind every one,
-which ends in an exception and costs as much as the record itself, and keep a read buffer a
-connection. Here an idle connection takes half the memory, and a message less CPU time.
+asyncio and uvloop have TLS transports of their own. After each record they try to read another one,
+which ends in an exception and costs as much as the record itself, and they have a read buffer for
+each connection. Here an idle connection takes half the memory, and a message less CPU time.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from appliance.net.layers import LayerScheduler, UpperLayer
 
 Data: TypeAlias = "bytes | bytearray | memoryview"
 
-#: Bytes of plaintext in a record, at most (RFC 8446, section 5.1): a read of this size never leaves
+#: The most bytes of plaintext in a record (RFC 8446, section 5.1): a read of this size never leaves
 #: a part of a record behind.
 RECORD_SIZE: Final = 16 * 1024
 
-#: Bytes that OpenSSL is handed at once. Its buffers to and from the network never shrink: for each
-#: connection they would keep the size of its largest message.
+#: Bytes that OpenSSL is handed at once. Its buffers never shrink: those of each connection would
+#: keep the size of its largest message.
 PIECE = 2 * RECORD_SIZE
 
-#: Records that are read of one connection, then it is the turn of others: a chunk from the network
-#: may hold ten thousand, of a byte each. And the cost of one, where they are many.
+#: Records of one connection that are read in a turn: a chunk may hold ten thousand of a byte each.
+#: And the cost of a record, where a chunk has many.
 RECORDS_A_TURN = 256
 RECORD_COST = 1
 
-#: Bytes of a chunk that are little: it may be read although others have to be served.
+#: A chunk of at most this many bytes is small, and may be read although others wait for a turn.
 SMALL_CHUNK = 4096
 
-#: Seconds that a client gets to read the last bytes before its connection is cut.
+#: Seconds that a client has to read the last bytes before its connection is aborted.
 CLOSE_TIMEOUT = 10.0
 
-#: What `get_extra_info` knows besides what the TCP connection does.
+#: What `get_extra_info` returns beside what the TCP transport knows.
 _TLS_INFO: dict[str, Callable[[ssl.SSLObject], object]] = {
     "ssl_object": lambda tls: tls,
     "sslcontext": lambda tls: tls.context,
@@ -50,7 +50,7 @@ _TLS_INFO: dict[str, Callable[[ssl.SSLObject], object]] = {
 
 _NOTHING: Final = memoryview(b"")
 
-#: Who hears of a connection after its end.
+#: The protocol of a connection that has ended.
 _NOBODY: Final = asyncio.Protocol()
 
 
@@ -62,16 +62,17 @@ async def accept(
     scheduler: LayerScheduler,
     linger: Callable[[socket.socket], None] = socket.socket.close,
 ) -> None:
-    """Shake hands as the server on an accepted connection; from then on it is the protocol's.
+    """Perform the server's handshake on an accepted connection and hand it to the protocol.
 
-    Of many records in one chunk only some are read at a time, in `layers` with other connections.
+    Many records in one chunk are read in several turns, which `scheduler` gives.
 
-    When this fails the connection is closed, and the protocol has not heard of it. `linger` closes
-    one on which an alert was written, which says why: in TLS 1.3 the client may be sending already.
+    When this fails the connection is closed, and the protocol was not called. `linger` closes a
+    socket on which an alert was written, so that it arrives: in TLS 1.3 the client may be sending
+    already.
 
     Raises:
         asyncio.TimeoutError: no handshake within `timeout` seconds.
-        ssl.SSLError: what the client sends is not acceptable, or not to it what it was sent.
+        ssl.SSLError: one side does not accept what the other has sent.
         OSError: the client is gone.
     """
     error = await TlsTransport(protocol, context, scheduler, linger).shake_hands(
@@ -81,20 +82,21 @@ async def accept(
         try:
             raise error
         finally:
-            # It holds the frames that it comes through. None of them may hold it, as what holds
-            # itself is only freed when garbage is looked for; hence `with_traceback(None)` below.
+            # The exception refers to the frames that it has passed. A frame that refers to it would
+            # be a cycle, which only the garbage collector frees; hence `with_traceback(None)`
+            # below.
             del error
 
 
 class TlsTransport:
-    """A TLS connection: to its TCP connection the protocol, to the client's protocol the transport.
+    """A TLS connection: a protocol for its TCP connection, a transport for the protocol above.
 
-    What arrives in one chunk is handed on in one chunk, unless it has too many records, and before
-    the end of the connection or a broken record behind it takes effect. There are no half-closed
-    connections, as in asyncio.
+    The plaintext of one chunk is handed on in one chunk, unless it has too many records, and before
+    the end of the connection, or a broken record behind it, takes effect. As in asyncio, there are
+    no half-closed connections.
 
-    It is an `asyncio.Transport` and an `asyncio.Protocol` without being derived from them, which
-    makes it faster when compiled.
+    It is not derived from `asyncio.Transport` and `asyncio.Protocol`, which makes it faster when
+    compiled.
     """
 
     def __init__(
@@ -106,35 +108,35 @@ class TlsTransport:
     ) -> None:
         self._entries = scheduler.entries
         self._loop = self._entries.loop
-        #: The end of the handshake, and why it failed if it did.
+        #: Done when the handshake has ended; its result is why that failed, if it did.
         self._handshake: asyncio.Future[Exception | None] = self._loop.create_future()
         self._protocol = protocol
         self._linger = linger
-        #: The connection under the TCP transport, when an alert is the last thing written to it.
+        #: A copy of the socket, when an alert is the last that was written to it.
         self._connection: socket.socket | None = None
         self._scheduler = scheduler
-        #: What arrived and OpenSSL was not given, and whether that or OpenSSL has more to read.
+        #: What OpenSSL was not given yet, and whether there or in OpenSSL is more to read.
         self._rest = _NOTHING
-        self._buffered = 0  # bytes that it takes, as the protocol was told
+        self._buffered = 0  # its bytes, as reported to the protocol
         self._waits = False
         self._queued = False
         self._incoming = ssl.MemoryBIO()
         self._outgoing = ssl.MemoryBIO()
         self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
         self._tcp: asyncio.Transport
-        self._connected = False  # the protocol has heard of the connection
+        self._connected = False  # `connection_made` was called
         self._open = False  # connected, and not closing
         self._reading = True
         self._writable = True
-        self._ended = False  # nothing more is to be read
-        self._hung_up = False  # nothing more arrives
-        self._cut = True  # OpenSSL may have the beginning of a record
+        self._ended = False  # no record follows
+        self._hung_up = False  # the client has closed the TCP connection
+        self._cut = True  # OpenSSL may buffer the beginning of a record
         self._has_told_cut = False
         self._error: Exception | None = None
         self._deadline: asyncio.TimerHandle | None = None
 
     async def shake_hands(self, connection: socket.socket, timeout: float) -> Exception | None:
-        """Begin, on an accepted connection; returns why that failed if it did, see `accept`."""
+        """Perform the handshake; returns why that failed, if it did, see `accept`."""
         protocol = cast(asyncio.Protocol, self)
         await self._loop.connect_accepted_socket(lambda: protocol, connection)
         try:
@@ -149,14 +151,14 @@ class TlsTransport:
     # --- the protocol of the TCP connection ----------------------------------------------------
 
     def fault(self, entry: str, error: Exception) -> None:
-        """End this connection, as something that nobody expected escaped while it was served."""
+        """End this connection because an unexpected exception escaped while it was served."""
         if self._connected and self._protocol is not _NOBODY:
             cast(FaultHandler, self._protocol).fault(entry, error)
             return
         self._entries.faults.caught(entry, error)
         if not self._handshake.done():
             self._handshake.set_result(ConnectionAbortedError("a fault in the appliance"))
-        if hasattr(self, "_tcp"):  # else `contained_made` cuts it
+        if hasattr(self, "_tcp"):  # else `contained_made` aborts it
             self.abort()
 
     @contained_made("tls.made")
@@ -165,7 +167,7 @@ class TlsTransport:
         self._tcp = cast(asyncio.Transport, transport)
 
     def data_received(self, data: bytes) -> None:
-        """Hand on what a chunk from the network says."""
+        """Decrypt a chunk and hand it on, now or in a turn."""
         try:
             if not self._open:
                 if not self._connected:
@@ -182,7 +184,7 @@ class TlsTransport:
             self.fault("tls.chunk", error)
 
     def _take(self, data: Data) -> None:
-        """Hand on what the records in there say, and in those that OpenSSL has."""
+        """Decrypt the records in the data and in OpenSSL's buffer, and hand them on."""
         parts: list[bytes] = []
         if len(data) <= PIECE:
             self._incoming.write(data)
@@ -193,14 +195,14 @@ class TlsTransport:
                 self._incoming.write(view[:PIECE])
                 view = view[PIECE:]
                 self._read(parts)
-            self._rest = view or _NOTHING  # an empty part would keep the whole
+            self._rest = view or _NOTHING  # an empty slice would keep the whole chunk alive
         if self._rest or self._buffered:
             self._count_rest()
         if len(parts) > 1:
             self._scheduler.count_cost(RECORD_COST * len(parts), cast(UpperLayer, self._protocol))
         if parts:
             self._protocol.data_received(parts[0] if len(parts) == 1 else b"".join(parts))
-        if self._cut or self._has_told_cut:  # each time: what was told is over with what came
+        if self._cut or self._has_told_cut:  # each time: what arrived may have completed it
             self._has_told_cut = self._cut
             cast(UpperLayer, self._protocol).partial_record(self._cut)
         if self._waits and not self._ended:
@@ -209,14 +211,14 @@ class TlsTransport:
             self._react()
 
     def _read(self, parts: list[bytes]) -> None:
-        """Append the plaintext of complete records; `_ended` when none can follow them, `_waits`
+        """Append the plaintext of complete records. Sets `_ended` when no more can follow, `_waits`
         when these are enough for one turn."""
         try:
-            # Room for no more than there can be: OpenSSL's caller has it set apart beforehand.
+            # Not larger than needed: Python allocates a buffer of this size beforehand.
             size = RECORD_SIZE if self._cut else self._incoming.pending
             while linger := self._tls.read(size):
                 parts.append(linger)
-                if not self._incoming.pending:  # not to be told so by an exception
+                if not self._incoming.pending:  # another read would only raise
                     self._cut = False
                     return
                 if len(parts) >= RECORDS_A_TURN:
@@ -230,14 +232,14 @@ class TlsTransport:
             self._error = error.with_traceback(None)
 
     def _count_rest(self) -> None:
-        """Tell the protocol what memory is taken by what OpenSSL was not given: a whole chunk."""
+        """Report the memory of what OpenSSL was not given: of a chunk, all of it."""
         size = len(cast(bytes, self._rest.obj))
         if size != self._buffered:
             self._buffered = size
             cast(UpperLayer, self._protocol).count_buffered(size)
 
     def _wait(self) -> None:
-        """Read nothing more until the others have had their turn."""
+        """Read nothing more until the next turn."""
         self._waits = True
         if not self._open:
             return
@@ -248,7 +250,7 @@ class TlsTransport:
             self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
-        """The others have had their turn."""
+        """Continue: the others have had their turn."""
         self._queued = False
         if not (self._open and self._reading):
             return
@@ -265,18 +267,18 @@ class TlsTransport:
             self._tcp.resume_reading()
 
     def _react(self) -> None:
-        """Send what reading has caused, such as an alert, and close a connection that has ended."""
+        """Send what reading has caused, such as an alert; close a connection that has ended."""
         if not self._open:
             return
         if not self._writable and self._outgoing.pending:
-            # Whoever makes OpenSSL answer again and again must read the answers.
+            # A client that makes OpenSSL answer again and again must read the answers.
             self.abort()
             return
         if not self._ended:
             self._flush()
             return
         if self._error is None:
-            if not self._reading:  # what was said before it is still worked on
+            if not self._reading:  # data before the end is still being processed
                 return
             self._protocol.eof_received()
         self.close()
@@ -289,7 +291,7 @@ class TlsTransport:
             except ssl.SSLWantReadError:
                 continue
             except ssl.SSLError as error:
-                self._flush()  # the alert that tells the client
+                self._flush()  # the alert, which gives the client the reason
                 self._connection = _copy(self._tcp)
                 self._tcp.close()
                 if not self._handshake.done():
@@ -310,7 +312,7 @@ class TlsTransport:
     def eof_received(self) -> bool:
         """The client has closed the TCP connection; some do so without close_notify.
 
-        While there is more to read the connection stays as it is, which asyncio is told by True.
+        Returns True, which keeps the connection open, while there is more to read.
         """
         self._hung_up = True
         if self._waits and self._open:
@@ -336,7 +338,7 @@ class TlsTransport:
 
     @contained("tls.pause")
     def pause_writing(self) -> None:
-        """The client reads slower than it is written to."""
+        """The client reads more slowly than it is written to."""
         self._writable = False
         self._protocol.pause_writing()
 
@@ -349,7 +351,7 @@ class TlsTransport:
     # --- the transport of the client's protocol ------------------------------------------------
 
     def write(self, data: Data) -> None:
-        """Write, without waiting for a record to become full; nothing once it is closing."""
+        """Write at once, without filling a record; ignored once the connection is closing."""
         if not self._open:
             return
         try:
@@ -363,12 +365,12 @@ class TlsTransport:
                     sealed.append(self._outgoing.read())
                 self._tcp.write(b"".join(sealed))
         except ssl.SSLError as error:
-            # It must not reach the one whose message this is.
+            # The exception must not reach the publisher of the message.
             self._error = error.with_traceback(None)
             self.abort()
 
     def writelines(self, list_of_data: Iterable[Data]) -> None:
-        """Write them, one behind the other."""
+        """Write them in order."""
         self.write(b"".join(list_of_data))
 
     def _flush(self) -> None:
@@ -376,7 +378,7 @@ class TlsTransport:
             self._tcp.write(self._outgoing.read())
 
     def close(self) -> None:
-        """Write out what waits and a close_notify, then close.
+        """Write what is buffered and a close_notify, then close.
 
         The client's close_notify is not waited for (RFC 8446, section 6.1).
         """
@@ -384,7 +386,7 @@ class TlsTransport:
             return
         self._open = False
         self._deadline = self._entries.later("tls.cut", CLOSE_TIMEOUT, self._tcp.abort)
-        with contextlib.suppress(ssl.SSLError):  # it asks for the client's close_notify as well
+        with contextlib.suppress(ssl.SSLError):  # it wants the client's close_notify as well
             self._tls.unwrap()
         self._flush()
         self._tcp.close()
@@ -399,12 +401,12 @@ class TlsTransport:
         return self._tcp.is_closing()
 
     def pause_reading(self) -> None:
-        """Hand on nothing more."""
+        """Hand on nothing until `resume_reading`."""
         self._reading = False
         self._tcp.pause_reading()
 
     def resume_reading(self) -> None:
-        """Hand on what arrives, be it the end."""
+        """Hand on what arrives again, including the end of the connection."""
         self._reading = True
         if self._waits and not self._ended:
             self._wait()
@@ -419,15 +421,15 @@ class TlsTransport:
         return self._tcp.is_reading()
 
     def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        """From how many bytes on, encrypted, the protocol is told to pause, and to resume."""
+        """The encrypted bytes from which on the protocol has to pause, and to resume."""
         self._tcp.set_write_buffer_limits(high, low)
 
     def get_write_buffer_limits(self) -> tuple[int, int]:
-        """The two limits, the low one first."""
+        """The low and the high limit."""
         return self._tcp.get_write_buffer_limits()
 
     def get_write_buffer_size(self) -> int:
-        """Bytes, encrypted, that the network has not taken yet."""
+        """Encrypted bytes that the network has not taken yet."""
         return self._tcp.get_write_buffer_size()
 
     def can_write_eof(self) -> bool:
@@ -435,24 +437,24 @@ class TlsTransport:
         return False
 
     def get_extra_info(self, name: str, default: object = None) -> object:
-        """As of the TCP connection, and what asyncio's TLS transports know."""
+        """What the TCP transport knows, and what asyncio's TLS transports do."""
         if name in _TLS_INFO:
             return _TLS_INFO[name](self._tls)
-        if name == "has_unread":  # what has come and was not handed on, be it a part of a record
+        if name == "has_unread":  # received, not handed on; also a part of a record
             return self._waits or self._cut or len(self._rest) > 0
         return self._tcp.get_extra_info(name, default)
 
     def get_protocol(self) -> asyncio.BaseProtocol:
-        """Who is told what happens here."""
+        """The protocol above."""
         return self._protocol
 
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
-        """Tell another one what happens from now on."""
+        """Replace the protocol above."""
         self._protocol = cast(asyncio.Protocol, protocol)
 
 
 def _copy(transport: asyncio.Transport) -> socket.socket | None:
-    """The socket under a transport once more, to be closed after it; None when there is no room."""
+    """A copy of the transport's socket, to be closed after it; None without a file descriptor."""
     with contextlib.suppress(OSError):
         connection = socket.socket(fileno=os.dup(transport.get_extra_info("socket").fileno()))
         connection.setblocking(False)
@@ -461,9 +463,9 @@ def _copy(transport: asyncio.Transport) -> socket.socket | None:
 
 
 def reason(error: BaseException) -> str:
-    """What went wrong in a handshake, in words for the person who reads the log."""
-    said = getattr(error, "reason", None) or str(error) or type(error).__name__
-    text = str(said).replace("_", " ").lower()
+    """What went wrong in a handshake, in words for the log."""
+    detail = getattr(error, "reason", None) or str(error) or type(error).__name__
+    text = str(detail).replace("_", " ").lower()
     if "unknown ca" in text or "bad certificate" in text or "certificate unknown" in text:
         return f"the client does not trust our certificate; does it have ca.crt? ({text})"
     if "http request" in text or "wrong version number" in text:

@@ -1,4 +1,4 @@
-"""MQTT over WebSocket (section 6 of both versions): RFC 6455 between a transport and a protocol."""
+"""MQTT over WebSocket (section 6 of both versions): an RFC 6455 layer of a connection."""
 
 from __future__ import annotations
 
@@ -18,85 +18,84 @@ from appliance.broker.accounts import Account
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.layers import LayerScheduler, UpperLayer
 
-#: Where MQTT is, and what it is called: "mqtt" by the standard, the other by clients before it.
+#: The path, and the subprotocols: "mqtt" of the standard, the other one of clients before it.
 PATH = "/mqtt"
 SUBPROTOCOLS = ("mqtt", "mqttv3.1")
 
-#: The largest head of an HTTP request, in bytes: a browser's, with all the cookies it may have.
+#: The largest head of an HTTP request, in bytes: a browser may send many cookies.
 HEAD_LIMIT = 16 * 1024
 
-#: What the names of the headers begin with that a WebSocket is asked for with.
+#: Prefixes of the headers that ask for a WebSocket.
 _OWN_HEADERS = ("sec-websocket-", "upgrade", "connection")
 
-#: Bytes that these may hold in all: the library takes a microsecond for each, and more.
+#: The most bytes in their values: the library takes a microsecond and more for each byte.
 OWN_HEADERS_LIMIT = 1024
 
-#: The cost of a request for a WebSocket, see `Counters.cost`: it may have a hundred headers.
+#: The cost of an upgrade request, see `Counters.cost`: it may have a hundred headers.
 HEAD_COST = 100
 
-#: Bytes of frames that are little, and that are taken apart in one go: at worst, as frames may be
-#: empty, two milliseconds' work. And the cost of a frame, where they are many.
+#: Bytes of frames that are decoded at once: at worst two milliseconds' work, as frames may be
+#: empty. And the cost of a frame, where a chunk has many.
 PORTION = 2048
 FRAME_COST = 3
 
-#: Frames of one connection in its turn.
+#: Frames of one connection that are decoded in a turn.
 FRAMES_A_TURN = 256
 
 _NOTHING = memoryview(b"")
 
-# The library tells of every connection; what is of interest is told here, with the address.
+# The library logs every connection; what is of interest is logged here, with the address.
 _library_log = logging.getLogger(f"{__name__}.frames")
 _library_log.setLevel(logging.ERROR)
 
 
 class WebSocketHandler(UpperLayer, Protocol):
-    """What can be above a WebSocket: an `asyncio.Protocol` that answers for the connection."""
+    """The layer above a WebSocket: an `asyncio.Protocol` that is responsible for the connection."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def data_received(self, data: bytes) -> None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def eof_received(self) -> bool | None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def pause_writing(self) -> None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def resume_writing(self) -> None:
-        """As asyncio tells it."""
+        """See `asyncio.Protocol`."""
 
     def frame_limit(self) -> int:
-        """How large a frame may be that is received now, in bytes."""
+        """The largest frame that may be received now, in bytes."""
 
     def count_partial_frame(self, size: int) -> None:
-        """So many bytes of a frame are kept until it is complete."""
+        """So many bytes of an incomplete frame are buffered."""
 
     def log_refusal(self, what: str, why: str) -> None:
-        """Tell the log what was refused or ended."""
+        """Log what was refused or ended."""
 
     def close(self) -> None:
-        """Close the connection: what is below was told why."""
+        """Close the connection; the client was sent the reason."""
 
     def abort(self) -> None:
         """Close it at once."""
 
     def fault(self, entry: str, error: Exception) -> None:
-        """Count what escaped while the connection was served, and end it; never raises."""
+        """Count an exception that escaped and end the connection; never raises."""
 
 
 class WebSocket(asyncio.Transport, asyncio.Protocol):
-    """A protocol to the transport below, and a transport to the `protocol` above.
+    """A protocol for the transport below, and a transport for the `protocol` above.
 
-    What is above reads and writes bytes, and its flow control is that of the transport below. It
-    receives a message in the fragments that it comes in, and none while it has paused reading.
+    The protocol above reads and writes bytes, with the flow control of the transport below. It
+    receives a message in the fragments in which it arrives, and none while it has paused reading.
 
-    Whether a page of another origin opened the connection makes no difference: no browser adds a
-    password to it by itself.
+    The Origin header is not checked: no browser adds an MQTT password by itself.
     """
 
     def __init__(self, protocol: WebSocketHandler, scheduler: LayerScheduler) -> None:
@@ -108,31 +107,31 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._frames = _Frames(logger=_library_log)
         #: The HTTP request, until it is complete.
         self._head = bytearray()
-        #: Received, and not yet taken apart.
+        #: What was received and is not decoded yet.
         self._backlog = _NOTHING
-        #: Bytes that TLS below has kept, and that are kept here beside them.
+        #: Bytes that TLS below buffers, and that are buffered here in addition.
         self._below = 0
         self._buffered = 0
         self._reading = True
         self._writing = True
-        #: The answer to the last ping, while it cannot be written.
+        #: The pong for the last ping, while it cannot be written.
         self._pong = b""
 
     # --- towards the transport -----------------------------------------------------------------
 
     def fault(self, entry: str, error: Exception) -> None:
-        """End this connection, as something that nobody expected escaped while it was served."""
+        """End this connection because an unexpected exception escaped while it was served."""
         self._protocol.fault(entry, error)
 
     @contained_made("websocket.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The connection is there; what is above may close it, and read when it is upgraded."""
+        """The connection is there; the protocol above may close it, and reads after the upgrade."""
         self._transport = cast(asyncio.Transport, transport)
         self._protocol.connection_made(self)
 
     @contained("websocket.chunk")
     def data_received(self, data: bytes) -> None:
-        """Hand on what the frames hold, whole or in part."""
+        """Decode the frames in the chunk, now or in a turn."""
         self._backlog = memoryview(bytes(self._backlog) + data if self._backlog else data)
         is_small = len(self._backlog) <= PORTION
         if self._queued or self._scheduler.must_wait(self._protocol, is_small=is_small):
@@ -142,7 +141,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._count_backlog()
 
     def _count_backlog(self) -> None:
-        """Tell what is above what memory is taken by what is not taken apart: a whole chunk."""
+        """Report the memory of what is not decoded: of a chunk, all of it."""
         size = len(cast(bytes, self._backlog.obj)) + len(self._head)
         if size != self._buffered:
             self._buffered = size
@@ -150,34 +149,34 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     @property
     def account(self) -> Account:
-        """Whose user is charged for what TLS does below."""
+        """The account that is charged for what TLS does below."""
         return self._protocol.account
 
     def count_buffered(self, size: int) -> None:
-        """TLS below keeps so many bytes."""
+        """TLS below buffers so many bytes."""
         self._below = size
         self._protocol.count_buffered(size + self._buffered)
 
     def input_paused(self) -> None:
-        """What has come waits in TLS."""
+        """Received bytes wait in TLS."""
         self._protocol.input_paused()
 
     def input_resumed(self) -> None:
-        """It waits there no longer."""
+        """Nothing waits in TLS any more."""
         self._protocol.input_resumed()
 
     def partial_record(self, part: bool) -> None:
-        """Whether TLS keeps the beginning of a record."""
+        """Whether TLS buffers the beginning of a record."""
         self._protocol.partial_record(part)
 
     def _take(self) -> None:
-        """Take apart what is there, until others have their turn; reading is paused then."""
+        """Decode what is there, until the turn is over; reading is paused then."""
         self._frames_left = FRAMES_A_TURN
         while self._backlog and self._reading and not self._transport.is_closing():
             data = bytes(self._backlog[:PORTION])
             self._backlog = (
                 self._backlog[PORTION:] or _NOTHING
-            )  # an empty part would keep the whole
+            )  # an empty slice would keep the whole chunk alive
             if self._frames.state is State.CONNECTING:
                 data = self._receive_head(data)
             if data:
@@ -187,7 +186,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
                 break
 
     def _take_later(self) -> None:
-        """Let the others have their turn first."""
+        """Decode in a later turn, when the others had theirs."""
         self._transport.pause_reading()
         self._protocol.input_paused()
         if not self._queued:
@@ -195,7 +194,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._scheduler.queue_turn(self)
 
     def take_turn(self) -> None:
-        """The others have had their turn."""
+        """Continue: the others have had their turn."""
         self._queued = False
         self._take()
         self._count_backlog()
@@ -208,7 +207,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:
-        """Answer the HTTP request once it is complete; returns what came behind it."""
+        """Answer the HTTP request once it is complete; returns the bytes behind it."""
         head = self._head
         head += data
         end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
@@ -216,8 +215,8 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
         elif end > 3:
             self._scheduler.count_cost(HEAD_COST, self._protocol)
-            # The library would read frames before the answer to the request, so it gets the two
-            # one after the other.
+            # The library would read frames before it answers the request, so it gets them
+            # afterwards.
             self._frames.receive_data(bytes(head[:end]))
             behind = bytes(head[end:])
             head.clear()
@@ -242,7 +241,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         for name, value in request.headers.raw_items():
             if not name.lower().startswith(_OWN_HEADERS):
                 continue
-            # What is not ASCII is for other headers, and the library would stumble over it.
+            # The library fails on what is not ASCII in these headers.
             if not value.isascii():
                 self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
                 return False
@@ -289,10 +288,10 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         if payload:  # [MQTT-6.0.0-2]
             self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
         self._answer(frames.data_to_send())
-        kept = len(frames.reader.buffer)
-        if kept and events:  # of the next one
+        buffered = len(frames.reader.buffer)
+        if buffered and events:  # of the next one
             self._protocol.count_partial_frame(0)
-        self._protocol.count_partial_frame(kept)
+        self._protocol.count_partial_frame(buffered)
         error = frames.parser_exc
         if is_text:
             self._fail(CloseCode.UNSUPPORTED_DATA, "a text frame; MQTT is in binary frames")
@@ -301,15 +300,15 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         elif error is not None:
             self._fail(CloseCode.PROTOCOL_ERROR, str(error))
         elif frames.close_rcvd is not None and self._reading:
-            # Else what is above has not read all that came before: a CONNECT, it may be.
+            # Else the protocol above has not read all that came before, perhaps a CONNECT.
             self._transport.close()
 
     def _answer(self, writes: list[bytes]) -> None:
-        """Send the pongs and the close frame that the library has ready."""
+        """Send the pongs and the close frame that the library has prepared."""
         if self._writing or self._frames.state is not State.OPEN:
             self._send(writes)
         elif writes:
-            # Who pings on and does not read is owed the last answer only (RFC 6455, 5.5.3).
+            # A client that pings without reading gets the last pong only (RFC 6455, 5.5.3).
             self._pong = writes[-1]
 
     def _fail(self, code: CloseCode, reason: str) -> None:
@@ -325,7 +324,7 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     @contained("websocket.pause")
     def pause_writing(self) -> None:
-        """The other side reads slower than it is written to."""
+        """The client reads more slowly than it is written to."""
         self._writing = False
         self._protocol.pause_writing()
 
@@ -340,24 +339,24 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
 
     @contained("websocket.eof")
     def eof_received(self) -> bool | None:
-        """The other side will send no more."""
+        """The client sends nothing more."""
         return self._protocol.eof_received()
 
     @contained("websocket.lost")
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection ended, whoever ended it."""
+        """The connection has ended, from either side."""
         self._protocol.connection_lost(exc)
 
     # --- towards the protocol ------------------------------------------------------------------
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Send a binary frame; what comes after the other side's close frame is dropped."""
+        """Send a binary frame; nothing is sent after the client's close frame."""
         if self._frames.state is State.OPEN:
             self._frames.send_binary(data)  # type: ignore[arg-type]
             self._send(self._frames.data_to_send())
 
     def close(self) -> None:
-        """Send a close frame behind what was written, and close."""
+        """Send a close frame after what was written, and close."""
         if self._frames.state is State.OPEN and not self._transport.is_closing():
             self._frames.send_close(CloseCode.NORMAL_CLOSURE)
             self._send(self._frames.data_to_send())
@@ -368,16 +367,16 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         self._transport.abort()
 
     def is_closing(self) -> bool:
-        """Whether it is closed, or about to be."""
+        """Whether the connection is closed, or closing."""
         return self._transport.is_closing()
 
     def pause_reading(self) -> None:
-        """Take nothing apart until `resume_reading`."""
+        """Decode nothing until `resume_reading`."""
         self._reading = False
         self._transport.pause_reading()
 
     def resume_reading(self) -> None:
-        """Go on with what was received meanwhile."""
+        """Continue with what was received meanwhile."""
         self._reading = True
         if self._backlog or self._frames.close_rcvd is not None:
             self._take_later()
@@ -397,25 +396,25 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         return self._transport.get_write_buffer_size()
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """What the transport below knows; `has_unread`: whether any of the two keeps what has come
-        and was not handed on, be it a part of a frame."""
+        """What the transport below knows. `has_unread` is whether either of the two buffers
+        received bytes that were not handed on, such as a part of a frame."""
         if name == "has_unread" and (self._backlog or self._frames.reader.buffer):
             return True
         return self._transport.get_extra_info(name, default)
 
 
 class _Frames(ServerProtocol):
-    """The library's side of a connection, without I/O."""
+    """The protocol of the `websockets` library, without I/O."""
 
     def select_subprotocol(self, subprotocols: Sequence[Subprotocol]) -> Subprotocol:
-        """The first one known of what the client offers, in its order [MQTT-6.0.0-3]."""
+        """The first of the client's offers that is known [MQTT-6.0.0-3]."""
         for subprotocol in subprotocols:
             if subprotocol in SUBPROTOCOLS:
                 return subprotocol
         raise NegotiationError(f"offer the subprotocol {' or '.join(SUBPROTOCOLS)}")
 
     def recv_frame(self, frame: Frame) -> None:
-        """Take a frame in; the limit of sizes is for a frame, as no message is put together."""
+        """Receive a frame; the size limit is per frame, as no message is assembled."""
         super().recv_frame(frame)
         if self.cur_size:
             self.cur_size = 0

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from appliance.host.clock import LEAST_SHARE, TURN_TAKES, SpareClock
+from appliance.host.clock import LEAST_SHARE, SWITCH_TIME, SpareClock
 
 
 def grown(*, worked: float, waited: float, turns: int = 10, seconds: float = 10.0) -> float:
@@ -28,7 +28,7 @@ def test_work_is_taken_off() -> None:
 
 def test_a_moment_until_a_turn_is_no_load() -> None:
     """As it is on a computer that has time: it is taken off, and nothing else."""
-    waited = 10 * TURN_TAKES / 0.01
+    waited = 10 * SWITCH_TIME / 0.01
     assert grown(worked=0.3, waited=waited) == pytest.approx(0.7 - waited)
 
 
