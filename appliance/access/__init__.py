@@ -1,4 +1,4 @@
-"""Who may come in and what they may do: the users file and the ACL file, in mosquitto's formats."""
+"""Authentication and authorization: the users file and the ACL file, in mosquitto's formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Access by the users file and the ACL file: logins off the event loop, decisions on it."""
+"""Access by the users file and the ACL file: passwords are checked in threads, topics at once."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ from appliance.mqtt.reason import ReasonCode
 
 _log = logging.getLogger(__name__)
 
-# Logins that wait for a worker. More would wait longer than clients do, some 20 ms of CPU each.
+# Logins that wait for a thread, some 20 ms of CPU each. More would wait longer than clients do.
 _MAX_WAITING: Final = 64
 
-# Seconds that a login may wait for its turn after others from its address failed: less than clients
-# wait.
+# Seconds that a login may be delayed after failures from its address: less than clients wait.
 _MAX_WAIT: Final = 6.0
 
-# Failed logins that are known to be wrong, some 150 bytes each, and those that were sent away
-# unchecked: of the second kind there are many in a flood, and one that counts among them.
+# Logins that are known to be wrong, some 150 bytes each, and logins that were rejected unchecked. A
+# flood has many of the second kind, and the one that matters may be among them.
 _MAX_KNOWN_WRONG: Final = 1024
 _MAX_UNCHECKED: Final = 16_384
 
-# Logins with a password that is known to be wrong that are answered late, at a time.
+# Logins with a password known to be wrong whose refusals are delayed at a time.
 _MAX_DELAYED_REPEATS: Final = 64
 
-#: Failed logins a minute, from one address or of one user, that slow nothing down.
+#: Failed logins a minute, from one address or of one user, that are not throttled.
 FAILED_LOGINS: Final = 30
 
 _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
@@ -56,7 +55,7 @@ _TRY_LATER: Final = Refusal(
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What both files say, read and checked as a whole, and not in force yet."""
+    """The content of both files, read and checked as a whole; not in force before `adopt`."""
 
     users_path: Path | None
     acl_path: Path | None
@@ -67,7 +66,7 @@ class Rules:
 
     @classmethod
     def read(cls, users: Path | None, acl: Path | None, robot: str, anonymous: bool) -> Rules:
-        """Reads both files; AccessFileError names all that is wrong with either."""
+        """Read both files; AccessFileError lists all errors in either."""
         passwords, rules = Passwords(Path()), None
         problems: list[FileProblem] = []
         if users is not None:
@@ -86,14 +85,14 @@ class Rules:
 
     @property
     def files(self) -> frozenset[Path]:
-        """What they were read from, included files too."""
+        """The files that were read, included ones too."""
         named = {path for path in (self.users_path, self.acl_path) if path is not None}
         return frozenset(named) | (self.acl.files if self.acl else frozenset())
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What is different after a reload; users by their names, sorted."""
+    """What a reload has changed; users by name, sorted."""
 
     users_added: list[str]
     users_removed: list[str]
@@ -102,7 +101,7 @@ class Changes:
 
     @classmethod
     def between(cls, before: Rules, after: Rules) -> Changes:
-        """What makes `after` another than `before`."""
+        """The differences between two states of the files."""
         old, new = before.passwords, after.passwords
         known, now = set(old.users()), set(new.users())
         return cls(
@@ -114,18 +113,17 @@ class Changes:
 
 
 class FileAccess:
-    """The `Access` port on a users file and an ACL file; all methods are the event loop's.
+    """The `Access` port on a users file and an ACL file; all methods belong to the event loop.
 
-    Passwords are checked by threads of its own. The password that was right for a user is
-    remembered, as an HMAC under a key that only this process has ever had, until the user's hash
-    changes: when all clients come back at once, nothing is hashed again, however many users, and
-    no guesser is in their way.
+    Passwords are checked in threads. A verified login is cached until the user's hash changes, as
+    an HMAC under a key of this process: when all clients reconnect at once nothing is hashed again,
+    however many users there are, and nobody who guesses delays them.
 
-    Other logins are guesses until they are checked: see `LoginThrottle`. When an address has made
-    so many wrong ones that the next would wait too long, it is told to come again (0x89), and
-    nothing is hashed. Who then comes again with the same password waits in a line of its own: a
-    guesser tries others. A password that was found wrong is no guess when it comes again, but a
-    device that was set up wrongly: it slows nobody, and is not hashed again.
+    Other logins are guesses until they are checked, see `LoginThrottle`. When the next guess of an
+    address would wait too long, it is answered with 0x89 Server busy, and nothing is hashed. A
+    login that comes again with the same password waits in a queue of its own, because a guesser
+    tries other passwords. A password that is known to be wrong is not a guess when it comes again,
+    but a device with a wrong configuration: it delays nobody else, and is not hashed again.
     """
 
     def __init__(
@@ -138,11 +136,11 @@ class FileAccess:
         failed_logins: int = FAILED_LOGINS,
         max_wait: float = _MAX_WAIT,
     ) -> None:
-        """Reads both files; AccessFileError names all that is wrong with either.
+        """Read both files; AccessFileError lists all errors in either.
 
-        Without a users file nobody has a password here. Without an ACL file whoever came in may
-        do everything, as in mosquitto. `failed_logins` in a minute cost an address or a user
-        nothing; who would have to wait longer than `max_wait`, in seconds, is to come again.
+        Without a users file no user has a password here. Without an ACL file every client may do
+        everything, as in mosquitto. `failed_logins` a minute of an address, or of a user, are not
+        throttled; a login that would wait for more than `max_wait` seconds is rejected.
         """
         self.epoch = 0
         self._in_force = rules = Rules.read(users, acl, robot, anonymous)
@@ -150,37 +148,37 @@ class FileAccess:
         if acl is None:
             _log.warning("no ACL file: whoever is let in may read and write every topic")
         self._key = secrets.token_bytes(32)
-        #: By user name: the login that was right, and the hash that it was right for.
+        #: By user name: the login that was verified, and against which hash.
         self._verified: dict[str, tuple[bytes, str]] = {}
         self._known_wrong = RecentKeys(_MAX_KNOWN_WRONG)
         self._unchecked = RecentKeys(_MAX_UNCHECKED)
         self._delayed_repeats = 0
-        #: By address and login: what is found about it by the users file that is named.
+        #: Checks in progress, by address and login.
         self._checking: dict[tuple[bytes, bytes], asyncio.Task[str | Refusal | None]] = {}
         self._closed = False
         self._max_wait = max_wait
         self.throttle = LoginThrottle(failed_logins)
-        # One of two cores stays with the event loop.
+        # Of two cores one is left to the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._hashing: HashingPool[str | None] = HashingPool(workers, max_waiting)
 
     @property
     def in_force(self) -> Rules:
-        """What both files said when they were last read."""
+        """The content of both files that is in force."""
         return self._in_force
 
     def reload(self) -> Changes:
-        """Reads both files again. AccessFileError leaves what was in force in force."""
+        """Read both files again; on AccessFileError nothing changes."""
         before = self._in_force
         return self.adopt(
             Rules.read(before.users_path, before.acl_path, before.robot, before.anonymous)
         )
 
     def adopt(self, rules: Rules) -> Changes:
-        """Puts into force what was read; returns what is different now. It does not fail."""
+        """Put files that were read into force; returns the changes. It does not fail."""
         before, self._in_force = self._in_force, rules
         self._passwords, self._acl = rules.passwords, rules.acl
-        self._checking.clear()  # They are about the old hashes, and are not joined any more.
+        self._checking.clear()  # They check the old hashes: nobody may join them now.
         self._known_wrong.clear()
         self._verified = {
             username: (login, stored)
@@ -191,7 +189,7 @@ class FileAccess:
         return Changes.between(before, rules)
 
     def close(self) -> None:
-        """Stops the threads; logins that wait are refused. May be called twice."""
+        """Stop the threads; logins that wait are refused. May be called twice."""
         self._closed = True
         self._hashing.close()  # A hash takes some 20 ms.
 
@@ -204,13 +202,13 @@ class FileAccess:
         return username is not None and self._passwords.hash_of(username) is not None
 
     def exchange(self, method: str, address: str | None) -> Exchange | None:
-        """Begins an enhanced authentication; None when the method is not offered.
+        """Begin an enhanced authentication; None when the method is not offered.
 
-        A stranger's, from this address, is a guess; with None it is one who has logged in, and
-        whom the guesses of others must not throw out.
+        SCRAM-SHA-256 is offered where there is a users file. Each step uses the users that are in
+        force then, so a reload between two steps is noticed.
 
-        SCRAM-SHA-256 is, where there is a users file. The exchange knows the users as they are at
-        each of its steps, a reload between them included.
+        With an address it counts as a guess. `address` is None for a client that has logged in and
+        authenticates again, which others' guesses must not throw out.
         """
         if method != METHOD or self._in_force.users_path is None:
             return None
@@ -241,9 +239,10 @@ class FileAccess:
         address: str,
         anonymous: bool | None = None,
     ) -> Identity | Refusal:
-        """Who the client is, or why it is refused. From where it comes counts for guesses only.
+        """Who the client is, or why it is refused; `address` matters for the throttle only.
 
-        `anonymous` is what its listener says of clients without a user name, None for nothing.
+        `anonymous` is whether its listener admits clients without a user name, None where it does
+        not say.
         """
         if username is None:
             if self._in_force.anonymous if anonymous is None else anonymous:
@@ -270,7 +269,7 @@ class FileAccess:
                     if turn is None:
                         return _TRY_LATER
                     check = self._begin_check((where, login), address, username, password, turn)
-                # Not the check itself is awaited: one that leaves must not cancel it for others.
+                # Not awaited directly: a client that leaves must not cancel the check for others.
                 await asyncio.wait([check])
                 if check.cancelled():
                     return _STOPPING
@@ -280,14 +279,14 @@ class FileAccess:
             if right is not None and right == self._passwords.hash_of(username):
                 self._verified[username] = login, right
             if self._passwords is not passwords:
-                continue  # Reloaded meanwhile: what was found is about a user of before.
+                continue  # Reloaded meanwhile: the result is about the old users.
             if right is not None:
                 return Identity(username, client_id)
             what = "unknown user" if stored is None else "wrong password for user"
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {quote(username)}")
 
     def _reserve(self, address: str, login: bytes) -> float | None:
-        """In how many seconds the login is looked at; None when that is too long."""
+        """Reserve a check for the login; returns the seconds until then, None when too many."""
         again = "again" if login in self._unchecked else ""
         turn = self.throttle.reserve(address, again, self._max_wait)
         if turn is None:
@@ -317,7 +316,7 @@ class FileAccess:
     async def _check(
         self, key: tuple[bytes, bytes], address: str, username: str, password: bytes, turn: float
     ) -> str | Refusal | None:
-        """The hash that the password is right for, None when it is wrong."""
+        """Check the password after the delay; returns the hash that it matches, None for none."""
         queue, login = key
         delay = max(turn, self.throttle.user_delay(username))
         if delay:
@@ -337,7 +336,7 @@ class FileAccess:
         return right
 
     async def _delay_repeat(self, address: str, username: str) -> None:
-        """Let who comes with a wrong password again wait as long as others that guess."""
+        """Delay the answer to a login that is known to be wrong, as long as that to a guess."""
         if self._delayed_repeats >= _MAX_DELAYED_REPEATS:
             return
         delay = max(self.throttle.user_delay(username), self.throttle.address_delay(address))

@@ -1,4 +1,4 @@
-"""The threads that hash passwords: few, behind everything else, and each address in its turn."""
+"""The threads that hash passwords: few, at low priority, and round-robin over the addresses."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Final, Generic, TypeVar
 
-#: How far the threads stand back behind the event loop, see nice(2).
+#: By how much the threads' priority is lower than the event loop's, see nice(2).
 NICE: Final = 10
 
 T = TypeVar("T")
 
 
 class QueueFullError(Exception):
-    """As many wait for a check as may."""
+    """Too many checks wait already."""
 
 
 class HashingPool(Generic[T]):
@@ -39,7 +39,7 @@ class HashingPool(Generic[T]):
         self._queues: OrderedDict[bytes, deque[tuple[asyncio.Future[T], Callable[[], T]]]]
         self._queues = OrderedDict()
         self._pool = ThreadPoolExecutor(
-            workers, thread_name_prefix="password", initializer=_stand_back
+            workers, thread_name_prefix="password", initializer=_lower_priority
         )
 
     @property
@@ -65,7 +65,7 @@ class HashingPool(Generic[T]):
         return await future
 
     def close(self) -> None:
-        """Cancel what waits, and wait for what runs. May be called twice."""
+        """Cancel the checks that wait, and wait for those that run. May be called twice."""
         self._closed = True
         for queue in self._queues.values():
             for future, _ in queue:
@@ -89,9 +89,9 @@ class HashingPool(Generic[T]):
             name, queue = self._queues.popitem(last=False)
             future, check = queue.popleft()
             if queue:
-                self._queues[name] = queue  # the others' turn is before its next
+                self._queues[name] = queue  # at the end: the other queues come first
             self._waiting -= 1
-            if future.done():  # who wanted to know has gone
+            if future.done():  # the client has gone
                 continue
             self._running += 1
             running = asyncio.get_running_loop().run_in_executor(self._pool, check)
@@ -107,12 +107,12 @@ class HashingPool(Generic[T]):
             else:
                 future.set_result(ran.result())
         if not self._closed:
-            self._start_next()  # last: should it fail, the one that is over has its answer
+            self._start_next()  # last: if it fails, the finished check has its result
 
 
-def _stand_back() -> None:
-    # On Linux a thread has a priority of its own, and needs no rights to lower it. Where there is
-    # none, hashing shares the processor like everything else.
+def _lower_priority() -> None:
+    # On Linux each thread has its own priority, and may lower it without rights. On other systems
+    # hashing competes with everything else.
     with contextlib.suppress(OSError):
         thread = threading.get_native_id()
         priority = os.getpriority(os.PRIO_PROCESS, thread) + NICE

@@ -1,4 +1,4 @@
-"""What is wrong with a users file or an ACL file, told so that it can be mended."""
+"""Errors in a users file or an ACL file, with file, line and column."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-#: Bytes of a file that can be meant: a hundred thousand users.
+#: The most bytes of a file: a hundred thousand users. A larger one is the wrong file.
 MAX_SIZE: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class FileProblem:
-    """One thing wrong in one file; lines and columns count from 1, and 0 means the whole file."""
+    """One error in one file; lines and columns count from 1, and line 0 means the whole file."""
 
     file: Path
     line: int
@@ -27,7 +27,7 @@ class FileProblem:
 
 
 class AccessFileError(ValueError):
-    """A users file or an ACL file cannot be used; `problems` has all that is wrong with it."""
+    """A users file or an ACL file cannot be used; `problems` lists all errors."""
 
     def __init__(self, problems: Sequence[FileProblem]) -> None:
         super().__init__("\n".join(map(str, problems)))
@@ -40,7 +40,7 @@ def read_text(path: Path, advice: str, limit: int = MAX_SIZE) -> str:
     AccessFileError when it is missing (then with `advice`), too large or not UTF-8.
     """
     try:
-        if path.is_fifo():  # somebody who writes to it would be waited for
+        if path.is_fifo():  # reading it would wait for a writer
             raise AccessFileError([FileProblem(path, 0, 0, "is no file, but a pipe")])
         with path.open("rb") as file:
             data = file.read(limit + 1)

@@ -1,4 +1,9 @@
-"""SCRAM-SHA-256 (RFC 5802 and 7677): what is kept of a password, and the server's exchange."""
+"""SCRAM-SHA-256 (RFC 5802 and 7677): what is stored of a password, and the server's exchange.
+
+The library `scramp` (1.5) is not used: it needs Python 3.11, asks for the user only once, so that a
+user changed between the two messages is not noticed, rejects an authzid and salts of less than 12
+bytes, has no limit on messages and names, and leaves decoys to its caller.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +25,13 @@ from appliance.mqtt.reason import ReasonCode
 
 METHOD: Final = "SCRAM-SHA-256"
 
-# The rule of thumb of RFC 7677, section 4. It is the client that has to do this work, and must have
-# done it within broker.limits.connect_timeout: a microcontroller takes seconds for what costs a
-# guesser nothing. Against guessing there are long passwords, and a file that others cannot read.
+# The rule of thumb of RFC 7677, section 4. The client has to do this work, and within
+# broker.limits.connect_timeout: a microcontroller takes seconds for what costs a guesser nothing.
+# Long passwords, and a file that others cannot read, protect against guessing.
 _ITERATIONS: Final = 15_000
 # RFC 7677 asks for at least these; clients refuse to answer to fewer.
 _MIN_ITERATIONS: Final = 4096
-# A slip of the pen in the file may not make logins take seconds.
+# A typing error in the file must not make logins take seconds.
 _MAX_ITERATIONS: Final = 1_000_000
 _SALT_SIZE: Final = 16
 _MAX_SALT_SIZE: Final = 128
@@ -34,8 +39,8 @@ _MAX_SALT_SIZE: Final = 128
 # A user name of 256 bytes, every one escaped, twice, and nonces of 256 characters.
 _MAX_MESSAGE: Final = 2048
 
-# Characters, of which SASLprep looks at each one, and strangers' names are prepared on the event
-# loop. A text in ASCII may be longer.
+# Characters that are prepared at most: SASLprep examines each one, and strangers' names are
+# prepared on the event loop. ASCII text may be longer.
 _MAX_PREPARED: Final = 256
 
 _STORED: Final = re.compile(
@@ -43,7 +48,8 @@ _STORED: Final = re.compile(
     r"\$([A-Za-z0-9+/]{43}=):([A-Za-z0-9+/]{43}=)"
 )
 
-# RFC 5802, section 7. What a client adds behind these ("extensions") is ignored, and proven.
+# RFC 5802, section 7. Attributes that a client adds (extensions) are ignored, but are part of what
+# the proof covers.
 _NAME: Final = r"(?:[^\0,=]|=2C|=3D)+"
 _NONCE: Final = r"[!-+\--~]+"
 _EXTENSIONS: Final = r"(?:,[A-Za-z]=[^\0,]+)*"
@@ -59,9 +65,9 @@ _CLIENT_FINAL: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Verifier:
-    """What a password is proven against; it is not enough to log in as the user.
+    """What a proof is verified against; it does not suffice to log in as the user.
 
-    `decoy` is the reason, for the log, why no proof is ever right; it is empty in a real one.
+    `decoy` is the reason, for the log, why no proof is ever right; it is empty in a real verifier.
     """
 
     iterations: int
@@ -72,9 +78,9 @@ class Verifier:
 
     @classmethod
     def of(cls, password: str | bytes) -> Verifier:
-        """A new one, with a salt of its own.
+        """A new verifier, with a new salt.
 
-        ValueError says what is wrong with a password that not every client would send the same.
+        ValueError says what is wrong with a password that clients may encode differently.
         """
         try:
             text = password if isinstance(password, str) else password.decode()
@@ -93,13 +99,13 @@ class Verifier:
         return cls(iterations, salt, hashlib.sha256(client_key).digest(), server_key)
 
     def encode(self) -> str:
-        """As it stands in the users file, which is as PostgreSQL stores it."""
+        """The entry of the users file, which has PostgreSQL's format."""
         salt, stored_key, server_key = map(_base64, (self.salt, self.stored_key, self.server_key))
         return f"{METHOD}${self.iterations}:{salt}${stored_key}:{server_key}"
 
     @classmethod
     def decode(cls, stored: str) -> Verifier:
-        """The reverse of `encode`; ValueError says what is wrong, without showing it."""
+        """The inverse of `encode`; ValueError says what is wrong, without showing the entry."""
         match = _STORED.fullmatch(stored)
         try:
             if match is None:
@@ -119,7 +125,7 @@ class Verifier:
         return cls(iterations, salt, stored_key, server_key)
 
     def check(self, password: bytes) -> bool:
-        """Whether this is the password. Takes milliseconds, and as long when it is not."""
+        """Whether this is the password. Takes milliseconds, the same for a wrong one."""
         try:
             prepared = saslprep(password.decode()).encode()
         except ValueError:
@@ -129,17 +135,17 @@ class Verifier:
 
 
 def decoy(username: str, shapes: Collection[tuple[int, int]], reason: str) -> Verifier:
-    """What is shown of a user that has no verifier; `reason` is for the log.
+    """A verifier for a user that has none, which no proof fits; `reason` is for the log.
 
-    It looks like one of the real ones: `shapes` are their iterations and salt sizes. Who asks for
-    it again sees the same, as long as there are other users of its shape.
+    It looks like a real one: `shapes` are the iterations and salt sizes of those. It stays the same
+    for a name, as long as there are users of its shape.
     """
 
     def made(what: str, size: int) -> bytes:
         text = f"{what}:{username}".encode()
         return hashlib.shake_256(_secret() + text).digest(size)
 
-    # Each shape bids for the name: when others come or go, most names stay with theirs.
+    # Rendezvous hashing: when shapes come or go, most names keep theirs.
     shape = max(shapes or [(_ITERATIONS, _SALT_SIZE)], key=lambda shape: made(f"{shape}", 8))
     iterations, size = shape
     keys = made("keys", 64)
@@ -148,10 +154,10 @@ def decoy(username: str, shapes: Collection[tuple[int, int]], reason: str) -> Ve
 
 @functools.cache
 def _secret() -> bytes:
-    """What makes the decoys of this computer.
+    """The secret from which this computer's decoys are derived.
 
-    It outlives a restart where it can: a salt that is another one after it would be known for a
-    decoy's. machine-id(5) is made for this: never told to a network, and hashed before use.
+    It should survive a restart: a salt that changes with a restart would reveal a decoy.
+    machine-id(5) is made for this purpose: it never leaves the computer, and is hashed before use.
     """
     try:
         machine = Path("/etc/machine-id").read_bytes().strip()
@@ -164,22 +170,22 @@ def _secret() -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Challenge:
-    """What the server has answered to a client-first-message, and what that was."""
+    """The client-first-message and the server's answer to it."""
 
     username: str
     verifier: Verifier
     header: str
     nonce: str
-    #: Both messages, as the proof is about them.
+    #: Both messages, which the proof covers.
     messages: str
 
 
 class ScramExchange:
     """The server's side of one exchange: an `Exchange` of the broker.
 
-    Every failure is the same refusal to the client, and comes with the proof when only the user or
-    its password is wrong: who is a user cannot be found out. There is no channel binding: that the
-    client talks to us, and not to one who passes its messages on, is for certificates to show.
+    Every failure looks the same to the client, and an unknown user fails only at the proof, as a
+    wrong password does: the exchange does not reveal who is a user. There is no channel binding:
+    TLS certificates protect against somebody who relays the messages.
     """
 
     def __init__(
@@ -190,7 +196,7 @@ class ScramExchange:
         admits: Callable[[], bool] = lambda: True,
         failed: Callable[[str], None] = lambda username: None,
     ) -> None:
-        """`verifier_of` is asked at both messages; one that has changed between them fails.
+        """`verifier_of` is called at both messages; a verifier that changes between them fails.
 
         `nonce` is the server's part of it, a random one unless a test brings its own. `admits` is
         asked before anything is revealed about a user, `failed` is called for a wrong proof of one.
@@ -202,7 +208,7 @@ class ScramExchange:
         self._next: Callable[[str], bytes | Accepted | Refusal] = self._begin
 
     def step(self, data: bytes) -> bytes | Accepted | Refusal:
-        """Take the client's next message; hashes a few short texts, and no password."""
+        """Process the client's next message; hashes a few short texts, and no password."""
         take, self._next = self._next, self._over
         try:
             if len(data) > _MAX_MESSAGE:
@@ -214,8 +220,8 @@ class ScramExchange:
     def _begin(self, message: str) -> bytes | Refusal:
         if message:
             return self._first(message)
-        # A CONNECT without data: the client is asked for its first message, as MQTT 5.0, section
-        # 4.12, has it in an example.
+        # A CONNECT without data: the client is asked for its first message, as in an example of
+        # MQTT 5.0, section 4.12.
         self._next = self._first
         return b""
 
@@ -275,9 +281,9 @@ class ScramExchange:
 
 
 def saslprep(text: str) -> str:
-    """`text` as RFC 4013 has it stored and sent, so that what looks the same is the same.
+    """`text` normalised by SASLprep (RFC 4013), so that what looks the same is the same.
 
-    ValueError says what is wrong with it, to be put behind what it is.
+    ValueError says what is wrong with it, worded to follow a subject ("a password ...").
     """
     if not text.isascii():
         _check_length(text)
@@ -338,7 +344,7 @@ def _unescaped(name: str) -> str:
 
 
 def _check_extensions(message: str) -> None:
-    """The attribute m= says that who does not know it must not go on."""
+    """Reject the attribute m=: who does not know that extension must not continue."""
     if ",m=" in message:  # no value holds a comma
         raise ValueError("the client asks for an extension that is not known here")
 

@@ -1,8 +1,8 @@
-"""Brute force: who has tried wrong passwords waits longer and longer before the next is looked at.
+"""The login throttle against brute force: after wrong passwords, further logins are delayed.
 
-Nobody is locked out by it. What slows an address slows no other one, and what slows a user slows it
-by `MAX_USER_DELAY` at most, however many guess its password, and from wherever. The password that
-was right for a user before is not a guess: it never comes here.
+Nobody is locked out. The delay of an address does not affect other addresses, and the delay of a
+user is at most `MAX_USER_DELAY`, however many clients guess its password, and from wherever. A
+password that was right for the user before is not a guess, and is not throttled.
 """
 
 from __future__ import annotations
@@ -18,33 +18,34 @@ from typing import Final
 
 from appliance.host.addresses import network_prefix
 
-#: The first delay when failures are more than allowed; each one more doubles it, up to this.
+#: The delay in seconds after the first failure beyond the allowed ones; each further failure
+#: doubles it, up to the second.
 FIRST_DELAY: Final = 0.125
 LONGEST_DELAY: Final = 4.0
 
-#: Seconds that a login waits at most because of failures of others for the same user.
+#: The most seconds that a login waits because of others' failures for the same user.
 MAX_USER_DELAY: Final = 2.0
 
-#: Addresses, and users, that are remembered. Those that failed last are.
+#: Addresses, and users, whose failures are stored; the least recent failures are evicted.
 MAX_ENTRIES: Final = 4096
 
 
 @dataclass(slots=True)
 class _Failures:
-    """How many failures count now: they are forgotten at the rate at which they are allowed."""
+    """A leaky bucket of failures: it drains at the rate at which failures are allowed."""
 
     level: float = 0.0
     at: float = 0.0
-    #: When the next guess may be looked at, by the line in which it waits.
+    #: When the next guess may be checked, by its queue.
     free_at: dict[str, float] = field(default_factory=dict)
 
 
 class LoginThrottle:
-    """How long a login has to wait before its password is looked at.
+    """Computes how long a login has to wait before its password is checked.
 
-    Of one address there is one guess after the other, the slower the more were wrong: `allowed` of
-    them in a minute cost nothing. Logins of one user are held up too, but beside each other: one
-    who has the right password comes through, whatever others do meanwhile.
+    Guesses from one address are checked one after the other, and the more were wrong, the larger
+    the gaps; `allowed` failures a minute cost nothing. Logins of one user are delayed too, but in
+    parallel: whoever has the right password gets in, whatever others do meanwhile.
     """
 
     def __init__(self, allowed: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -55,10 +56,10 @@ class LoginThrottle:
         self._users: OrderedDict[bytes, _Failures] = OrderedDict()
 
     def reserve(self, address: str, queue: str = "", max_wait: float = math.inf) -> float | None:
-        """Seconds until the next guess from this address is due, and it is taken; or None.
+        """Reserve the next check for this address; returns the seconds until it is due.
 
-        It is None, and nothing is taken, when that is longer than `max_wait`. Guesses in another
-        `queue` are not in each other's way.
+        None, and nothing is reserved, when that is more than `max_wait`. Different queues of an
+        address do not delay each other.
         """
         failures = self._networks.get(network_prefix(address))
         if failures is None:
@@ -73,17 +74,17 @@ class LoginThrottle:
         return due - now
 
     def address_delay(self, address: str) -> float:
-        """Seconds between two guesses from this address, as things are."""
+        """The current delay between two guesses from this address, in seconds."""
         failures = self._networks.get(network_prefix(address))
         return self._delay(failures, self._clock()) if failures else 0.0
 
     def user_delay(self, username: str) -> float:
-        """Seconds that a guess waits because others were wrong about the same user."""
+        """Seconds that a guess waits because of wrong ones for the same user."""
         failures = self._users.get(self._key_of(username))
         return min(MAX_USER_DELAY, self._delay(failures, self._clock())) if failures else 0.0
 
     def record_failure(self, address: str, username: str) -> None:
-        """A guess was wrong."""
+        """Count a wrong guess."""
         now = self._clock()
         for known, key in (
             (self._networks, network_prefix(address)),
@@ -108,19 +109,19 @@ class LoginThrottle:
         return min(LONGEST_DELAY, FIRST_DELAY * math.exp2(min(excess, 16)))
 
     def _key_of(self, username: str) -> bytes:
-        # Strangers' names are long, and are made to collide.
+        # A keyed hash: strangers' names can be long, or crafted to collide.
         return hashlib.blake2b(username.encode(), digest_size=16, key=self._key).digest()
 
 
 class RecentKeys:
-    """A set of the keys that were added last, `size` of them."""
+    """A set of the `size` keys that were added last."""
 
     def __init__(self, size: int) -> None:
         self._size = size
         self._keys: OrderedDict[bytes, None] = OrderedDict()
 
     def add(self, key: bytes) -> None:
-        """Add a key, or count it as added now."""
+        """Add a key, or renew it."""
         self._keys[key] = None
         self._keys.move_to_end(key)
         if len(self._keys) > self._size:
@@ -130,5 +131,5 @@ class RecentKeys:
         return key in self._keys
 
     def clear(self) -> None:
-        """Forget them all."""
+        """Remove all keys."""
         self._keys.clear()
