@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def bridge_cells() -> list[str]:
-    """The names of those among CELLS that measure the bridge."""
+    """The names of the cells that measure the bridge."""
     from appliance.bench.cells import CELLS, RosCell
 
     return [cell.name for cell in CELLS if isinstance(cell, RosCell)]
@@ -13,10 +13,10 @@ def bridge_cells() -> list[str]:
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
     """Measure and print; returns the exit status, 0 when every cell ran.
 
-    `cells` are names of CELLS (None: all), `seconds` the length of one run, `peer` the mosquitto to
-    compare with (None: the one that is installed). Unmet goals are shown and are no failure.
+    `cells` are names of CELLS (None: all), `seconds` is the length of one run, and `peer` the
+    mosquitto to compare with (None: the one that is installed). Unmet goals are no failure.
     """
-    # Only here: the load's processes are of this package too, and need nothing of it all.
+    # Imported here, as the processes of the load import this package too and need none of it.
     from appliance.bench import command
 
     return command.main(cells, seconds, peer, as_json)

@@ -1,4 +1,4 @@
-"""The rows of the comparison: what each drives, on which brokers, and what is to be reached."""
+"""The cells of the comparison: the load of each, its brokers, and its goals."""
 
 from __future__ import annotations
 
@@ -22,31 +22,33 @@ from appliance.bench.load import Result
 from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site
 from appliance.ros.ros2 import fastdds
 
-REPEATS = 3  # of each broker, in turn, so that both see the same disturbances; the median counts
-GRACE_SECONDS = 90.0  # a run's connecting and settling, above the time it measures
-PACE = 1000.0  # messages a second of the bridge's rows
+REPEATS = 3  # of each broker in turn, so that both meet the same disturbances; the median counts
+GRACE_SECONDS = 90.0  # for a run to connect and settle, beyond the time that it measures
+PACE = 1000.0  # messages a second of the bridge's cells
 IMAGE_PACE = 30.0  # the same of images
-PACES = [round(2000 * 1.5**step) for step in range(9)]  # up to 51,258; the sender's end is near
+PACES = [
+    round(2000 * 1.5**step) for step in range(9)
+]  # up to 51,258, which is near the sender's limit
 PACE_SECONDS = 2.0
-BACKLOG_US = 50_000.0  # of median latency: no loss yet, but only because a queue is growing
-LOSS = 0.001  # taken for none: a computer that does other things stalls for more than a queue
+BACKLOG_US = 50_000.0  # of median latency: a queue is growing, and will lose messages
+LOSS = 0.001  # counted as none: a computer with other work stalls for longer than a queue holds
 
-Figures = Result  # of one broker: each figure the median of its runs
+Figures = Result  # of one broker: the median of its runs, for each figure
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one cell gave on both brokers; None where it did not run."""
+    """The result of one cell on both brokers; None where it did not run."""
 
     cell: Cell
     ours: Figures | None = None
     peer: Figures | None = None
-    note: str | None = None  # what the cell tells beside its figures
+    note: str | None = None  # what the cell reports beside its figures
     problem: str | None = None  # what went wrong
     missing: str | None = None  # what this computer lacks to run it
 
     def ratio(self, figure: str) -> float | None:
-        """The peer's figure divided by ours, a rate the other way round: above 1 ours is better."""
+        """The peer's figure divided by ours, inverted for a rate: above 1 ours is better."""
         ours, peer = (getattr(each, figure, None) for each in (self.ours, self.peer))
         if figure == "rate":
             ours, peer = peer, ours
@@ -54,7 +56,7 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether every goal is met; None when that cannot be told."""
+        """Whether every goal is met; None when a figure is missing."""
         ratios = [(self.ratio(figure), goal) for figure, goal in self.cell.goals.items()]
         if any(ratio is None for ratio, _ in ratios):
             return None
@@ -62,11 +64,11 @@ class Row:
 
 
 class Side(Protocol):
-    """One broker, as a cell sees it."""
+    """One broker with the load that a cell drives it with."""
 
     @property
     def name(self) -> str:
-        """Whose figures these are."""
+        """The name of the broker."""
 
     def measure(self, seconds: float) -> Result:
         """Run the cell once."""
@@ -74,7 +76,7 @@ class Side(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One row: `goals` are the least ratios, mosquitto's figure divided by ours."""
+    """One row of the report. `goals` are minimum ratios of mosquitto's figures to ours."""
 
     name: str
     title: str
@@ -85,15 +87,15 @@ class Cell:
         return None
 
     def ours(self, site: Site) -> contextlib.AbstractContextManager[Side]:
-        """This appliance, running."""
+        """Run this appliance."""
         raise NotImplementedError
 
     def peer(self, site: Site, command: str) -> contextlib.AbstractContextManager[Side]:
-        """mosquitto, running, with what else the cell needs."""
+        """Run mosquitto, with what else the cell needs."""
         raise NotImplementedError
 
     def note(self, site: Site) -> str | None:
-        """What there is to tell beside the figures, when all is over."""
+        """What to report beside the figures, once the cell has ended."""
         return None
 
 
@@ -107,7 +109,7 @@ class LoadSide:
 
     @property
     def name(self) -> str:
-        """Whose figures these are."""
+        """The name of the broker."""
         return self.server.name
 
     def measure(self, seconds: float) -> Result:
@@ -152,7 +154,7 @@ class FloodCell(LoadCell):
 
 @dataclass(frozen=True, slots=True)
 class StoreCell(LoadCell):
-    """This broker with the store in the way of every message, against itself without it."""
+    """This broker storing every message, against itself without a store."""
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
@@ -165,7 +167,7 @@ class StoreCell(LoadCell):
             yield LoadSide(server, self.load, self.tls)
 
     def note(self, site: Site) -> str | None:
-        """The sizes of the groups in which messages were committed, out of the log."""
+        """How many messages each commit had, out of the log."""
         logs = [log.read_text(errors="replace") for log in site.directory.glob("*/log")]
         found = re.search(r"\d+ commits of .*", "\n".join(logs))
         return f"{found[0]}; in the peer's column: without the store" if found else None
@@ -184,11 +186,11 @@ class BridgeSide:
 
     @property
     def name(self) -> str:
-        """Whose figures these are."""
+        """The name of the broker."""
         return self.server.name
 
     def measure(self, seconds: float) -> Result:
-        """Run at the usual pace, or at ever higher ones up to the last that is kept up with."""
+        """Run at the usual pace, or at rising ones up to the highest without loss."""
         if not self.maximum:
             return self._measure(seconds, self.pace)
         best: Result | None = None
@@ -204,7 +206,7 @@ class BridgeSide:
         return best
 
     def _measure(self, seconds: float, pace: float) -> Result:
-        """Start a sender and a receiver, and stop the sender when the receiver has measured."""
+        """Run a sender and a receiver, until the receiver has measured."""
         site, options = self.server.site, self.server.arguments()
         sending = [*self.send, *options, "--rate", str(pace), "--seconds", str(GRACE_SECONDS)]
         command = [sys.executable, "-m", "appliance.bench.ends", *sending]
@@ -215,7 +217,7 @@ class BridgeSide:
 
 @dataclass(frozen=True, slots=True)
 class RosCell(Cell):
-    """A row of the bridge, for which ROS 2 has to be there."""
+    """A cell of the bridge, which needs ROS 2."""
 
     def missing(self) -> str | None:
         for module in ("rclpy", "std_msgs", "sensor_msgs"):
@@ -230,16 +232,16 @@ class BridgeCell(RosCell):
 
     send: Sequence[str] = ()
     receive: Sequence[str] = ()
-    maximum: bool = False  # the highest rate without loss, and not the usual one
+    maximum: bool = False  # measure the highest rate without loss instead of the usual one
 
     @property
     def queue(self) -> int:
-        """Messages that may wait for the bridge: ten as tutorials have it, or no obstacle."""
+        """Depth of the bridge's queues: ten as in tutorials, or enough not to limit the rate."""
         return 1000 if self.maximum else 10
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
-        # As the tutorial node does it: the text as it is, QoS 0, and as much may wait.
+        # Like the tutorial node: the plain text, QoS 0, and the same depth of queues.
         route = {"type": "std_msgs/msg/String", "encoding": "text", "keep": self.queue}
         to_mqtt = {"ros": "/chatter", "to": "mqtt", "qos": 0, **route}
         to_ros = {"ros": "/command", "to": "ros", **route}
@@ -261,7 +263,7 @@ class BridgeCell(RosCell):
 
 @dataclass(frozen=True, slots=True)
 class ListeningSide:
-    """A bare raw subscription of rclpy, which does nothing."""
+    """A bare raw subscription of rclpy, whose callback does nothing."""
 
     site: Site
     send: Sequence[str]
@@ -269,11 +271,11 @@ class ListeningSide:
 
     @property
     def name(self) -> str:
-        """Whose figures these are."""
+        """The name of the broker."""
         return "rclpy"
 
     def measure(self, seconds: float) -> Result:
-        """Start a sender, and stop it when the subscription has measured itself."""
+        """Run a sender, until the subscription has measured itself."""
         sending = [*self.send, "--rate", str(IMAGE_PACE), "--seconds", str(GRACE_SECONDS)]
         command = [sys.executable, "-m", "appliance.bench.ends", *sending]
         with peers.running(
@@ -300,26 +302,26 @@ class ImageCell(RosCell):
         yield ListeningSide(site, SEND_IMAGES, image_environment(1))
 
     def note(self, site: Site) -> str | None:
-        """What is in the peer's column."""
+        """What the peer's column has."""
         return "in the peer's column: a raw subscription of rclpy that does nothing"
 
 
 @dataclass(frozen=True, slots=True)
 class ConversionSide:
-    """One way to JSON, alone in a process."""
+    """One way to convert to JSON, alone in a process."""
 
     name: str
     site: Site
     how: str
 
     def measure(self, seconds: float) -> Result:
-        """Convert for so long."""
+        """Convert for `seconds`."""
         return run_measuring(["conversion", self.how], self.site, seconds)
 
 
 @dataclass(frozen=True, slots=True)
 class ConversionCell(RosCell):
-    """A message's conversion to JSON, against deserializing it and walking its fields."""
+    """The conversion of a message to JSON, against rclpy's deserialization and `json`."""
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
@@ -330,13 +332,13 @@ class ConversionCell(RosCell):
         yield ConversionSide("rclpy", site, "rclpy")
 
     def note(self, site: Site) -> str | None:
-        """What is in the peer's column."""
+        """What the peer's column has."""
         return "in the peer's column: rclpy's deserialize, its fields walked, json"
 
 
 def ros_environment(number: int) -> dict[str, str]:
-    """An environment whose ROS sees this computer only, in a domain of its own for each number."""
-    # Domains above 101 use ports that Linux gives to clients.
+    """An environment whose ROS is limited to this computer, with a domain for each number."""
+    # The ports of domains above 101 are among Linux's ephemeral ports.
     domain = 2 + (2 * os.getpid() + number) % 98
     return {
         **os.environ,
@@ -347,7 +349,7 @@ def ros_environment(number: int) -> dict[str, str]:
 
 
 def image_environment(number: int) -> dict[str, str]:
-    """The same where images pass through shared memory, for who sends them, too."""
+    """The same, with a profile that passes images through shared memory, for senders too."""
     profile = str(fastdds.PROFILE)
     names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
     return {**ros_environment(number), **dict.fromkeys(names, profile)}
@@ -359,7 +361,7 @@ def run_measuring(
     seconds: float,
     environment: Mapping[str, str] = os.environ,
 ) -> Result:
-    """Run one of this package's programs in a process of its own; its result. Raises PeerError."""
+    """Run a program of this package in a process of its own; its result. Raises PeerError."""
     module, *options = arguments
     command = [sys.executable, "-m", f"appliance.bench.{module}", *options]
     if module == "load":
@@ -412,7 +414,7 @@ CELLS: tuple[Cell, ...] = (
 
 
 def median(runs: Sequence[Result]) -> Figures:
-    """Each figure's median over the runs; losses are added up, as none may be overlooked."""
+    """The median of each figure over the runs; losses are added up, as every loss counts."""
     figures = {}
     for name in (each.name for each in dataclasses.fields(Result)):
         values = [getattr(run, name) for run in runs]
@@ -432,11 +434,11 @@ def compare(
     repeats: int = REPEATS,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Row:
-    """Run one cell on freshly started brokers, ours and the peer's in turn."""
+    """Run one cell on newly started brokers, ours and the peer's in turn."""
     if missing := cell.missing():
         return Row(cell, missing=missing)
-    # A connection's memory shows in a process that has not freed any: one run, a process each.
-    # The search for the highest rate is a series of runs by itself.
+    # The memory of a connection is measured once a process, before that has freed any. The search
+    # for the highest rate is a series of runs by itself.
     if "memory_kib" in cell.goals or (isinstance(cell, BridgeCell) and cell.maximum):
         repeats = 1
     runs: dict[str, list[Result]] = {"ours": [], "peer": []}
@@ -465,7 +467,7 @@ def compare(
                             except PeerError as error:
                                 problems[whose] = f"{side.name}: {error}"
                 progress("stopping")
-        except PeerError as error:  # what should be running at the end has ended before
+        except PeerError as error:  # a process that should still run at the end has ended before
             problems["end"] = str(error)
         note = cell.note(site)
     return Row(

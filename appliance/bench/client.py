@@ -1,6 +1,6 @@
-"""The load's side of an MQTT connection: raw sockets, and as little of MQTT 3.1.1 as a load needs.
+"""MQTT connections of the load generator: raw sockets and as much of MQTT 3.1.1 as it needs.
 
-It uses nothing of `appliance.mqtt`: the measure must not share a mistake with what it measures.
+It does not use `appliance.mqtt`, so as not to share a mistake with the code that it measures.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any, cast
 
 CONNECT_SECONDS = 60.0  # five hundred TLS handshakes and password checks on a small computer
 RECORDS_BYTES = 1 << 18  # TLS records taken in one system call
-RECORDS = memoryview(bytearray(RECORDS_BYTES))  # one for all: a new one a call costs more than TLS
+RECORDS = memoryview(bytearray(RECORDS_BYTES))  # shared: allocating one a call costs more than TLS
 
 
 class LoadError(Exception):
-    """The load could not be brought to the broker; the text says why."""
+    """The broker could not be driven; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadTarget:
-    """The broker to be driven."""
+    """The broker to drive: its address, credentials and processes."""
 
     host: str = "127.0.0.1"
     port: int = 1883
@@ -38,7 +38,7 @@ class LoadTarget:
 
     @staticmethod
     def add_options(parser: argparse.ArgumentParser) -> None:
-        """Let a program take a target on its command line."""
+        """Add a target's options to a command line."""
         parser.add_argument("--host", default="127.0.0.1")
         parser.add_argument("--port", type=int, help="default: 1883, with TLS 8883")
         parser.add_argument("--tls", action="store_true", help="connect over TLS")
@@ -51,7 +51,7 @@ class LoadTarget:
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> LoadTarget:
-        """What the options say. Raises LoadError, OSError."""
+        """The target that the options describe. Raises LoadError, OSError."""
         password = os.environ.get(options.password_env) if options.password_env else None
         if options.password_env and password is None:
             raise LoadError(f"there is no variable {options.password_env}")
@@ -66,7 +66,7 @@ class LoadTarget:
 
 
 def allow_files(count: int) -> bool:
-    """Let this process, and what it starts, open so many files; False when it may not."""
+    """Raise the limit of open files, for child processes too; False when that is denied."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = hard == resource.RLIM_INFINITY or hard >= count
     if soft != resource.RLIM_INFINITY and soft < count:
@@ -118,14 +118,14 @@ def subscribe_packet(filters: Sequence[str], qos: int) -> bytes:
 class TcpStream:
     """A TCP connection."""
 
-    has_unsent = False  # bytes were taken that the socket has not sent yet
-    has_more = False  # bytes have arrived that were not handed out yet
+    has_unsent = False  # bytes were accepted that the socket has not sent yet
+    has_more = False  # bytes have arrived that were not returned yet
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
 
     def send(self, data: memoryview) -> int:
-        """Send what the socket takes; returns how much that was."""
+        """Send what the socket accepts; returns the number of bytes."""
         try:
             return self._socket.send(data) if data else 0
         except BlockingIOError:
@@ -143,13 +143,13 @@ class TcpStream:
 
 
 class TlsStream:
-    """A TLS connection: one system call for many records, where SSLSocket takes two for each."""
+    """A TLS connection that reads many records a system call; SSLSocket takes two for each."""
 
     def __init__(self, connection: socket.socket, context: ssl.SSLContext, host: str) -> None:
         self._socket = connection
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._tls = context.wrap_bio(self._incoming, self._outgoing, server_hostname=host)
-        # Into a buffer, it returns the number of bytes; its declared type knows only the other way.
+        # With a buffer it returns the number of bytes, which its declared type does not know.
         self._read = cast("Callable[[int, memoryview], int]", cast(Any, self._tls.read))
         self._sealed = memoryview(b"")
         self.has_more = False
@@ -165,11 +165,11 @@ class TlsStream:
 
     @property
     def has_unsent(self) -> bool:
-        """Whether bytes were taken that the socket has not sent yet."""
+        """Whether bytes were accepted that the socket has not sent yet."""
         return bool(self._sealed)
 
     def send(self, data: memoryview) -> int:
-        """Send, one record at most a time; returns how many bytes were taken."""
+        """Send one record at most; returns the number of bytes accepted."""
         taken = 0
         if not self._sealed and data:
             taken = self._tls.write(data[:RECORDS_BYTES])
@@ -201,7 +201,7 @@ class TlsStream:
 
 
 class LoadClient:
-    """One MQTT connection: opened step by step while blocking, then without ever blocking."""
+    """One MQTT connection: it blocks while it is set up, and is non-blocking once attached."""
 
     def __init__(self, target: LoadTarget, client_id: str, *, clean: bool = True) -> None:
         self.client_id = client_id
@@ -216,7 +216,7 @@ class LoadClient:
         self._waiting = False
         self.write(connect_packet(client_id, target.username, target.password, clean))
 
-    def connected(self) -> None:
+    def wait_connected(self) -> None:
         """Wait for the CONNACK."""
         if (code := self.expect(0x20, 4)[3]) != 0:
             raise LoadError(f"{self.client_id}: the broker refuses the connection, code {code}")
@@ -228,7 +228,7 @@ class LoadClient:
             raise LoadError(f"{self.client_id}: subscription to {topic} answered with {code:#x}")
 
     def expect(self, first_byte: int, size: int) -> bytes:
-        """Wait for a packet of this length, and of this kind."""
+        """Wait for a packet of this length and type."""
         answer, filled = memoryview(bytearray(size)), 0
         while filled < size:
             filled += self.transport.recv_into(answer[filled:])
@@ -237,7 +237,7 @@ class LoadClient:
         return bytes(answer)
 
     def attach(self, poll: select.epoll, events: dict[int, Callable[[int], None]]) -> None:
-        """Hand the connection to a loop, which calls `ready` when there is something to do."""
+        """Register the connection with a loop that calls `ready` for its events."""
         self.socket.setblocking(False)
         descriptor = self.socket.fileno()
         events[descriptor] = self.ready
@@ -247,7 +247,7 @@ class LoadClient:
         )
 
     def ready(self, event: int) -> None:
-        """Do what epoll says can be done."""
+        """Handle an event of epoll."""
         if event & select.EPOLLOUT:
             self.write(b"")
             self.flush()
@@ -257,15 +257,15 @@ class LoadClient:
                 self.receive()
 
     def receive(self) -> None:
-        """Take what has arrived."""
+        """Receive what has arrived."""
         raise NotImplementedError
 
     def flush(self) -> None:
-        """Go on sending what the connection did not take."""
+        """Send what the connection did not accept before."""
         raise NotImplementedError
 
     def write(self, data: bytes | memoryview) -> int:
-        """Send what the connection takes; returns how much that was."""
+        """Send what the connection accepts; returns the number of bytes."""
         taken = self.transport.send(memoryview(data))
         if (full := taken < len(data) or self.transport.has_unsent) != self._waiting:
             self._waiting = full
@@ -273,6 +273,6 @@ class LoadClient:
         return taken
 
     def close(self) -> None:
-        """Close, in whatever state the connection is."""
+        """Close the connection in any state."""
         with contextlib.suppress(OSError):
             self.socket.close()

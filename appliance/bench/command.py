@@ -1,9 +1,9 @@
-"""The command: every cell in turn, and the report.
+"""The command: runs every cell in turn and prints the report.
 
-Both brokers are started with equal settings on this computer, driven in turn from a separate
-process, and compared by what they need: CPU time a delivered message first, as it is the steadiest
-on a computer that does other things, then messages a second and latency. The cells of growth have a
-table of their own, with goals for each broker by itself.
+Both brokers are started with equal settings on this computer and driven in turn from a separate
+process. They are compared by CPU time a delivered message first, as it varies least on a computer
+that has other work, then by messages a second and latency. Growth cells have a table of their own
+and goals for each broker by itself.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from appliance.bench.cells import CELLS, REPEATS, Cell, Row, compare
 from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, grow
 from appliance.bench.peers import find_mosquitto, mosquitto_version
 
-INTERRUPTED = 130  # as a shell says it
+INTERRUPTED = 130  # the exit status that shells use for SIGINT
 
 
 def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
-    """What `appliance.bench.main` says."""
+    """See `appliance.bench.main`."""
     console = Console(stderr=True)
     every: tuple[Cell | GrowthCell, ...] = (*CELLS, *GROWTH)
     known = {cell.name: cell for cell in every}
@@ -73,7 +73,7 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
 
 
 class _InterruptOnSigterm:
-    """Inside, SIGTERM ends the way Ctrl-C does: everything that was started is stopped."""
+    """Makes SIGTERM end like Ctrl-C, so that everything that was started is stopped."""
 
     def __enter__(self) -> None:
         if threading.current_thread() is threading.main_thread():

@@ -1,9 +1,9 @@
-"""Conversion alone: a serialized sensor_msgs/Imu to JSON, again and again in one process::
+"""Measures conversion alone: a serialized sensor_msgs/Imu to JSON, repeatedly in one process::
 
     python -m appliance.bench.conversion ours
     python -m appliance.bench.conversion rclpy
 
-`rclpy` is what a node does that has no converter: deserialize the message, walk its fields, `json`.
+`rclpy` does what a node without a converter does: deserialize, walk the fields, encode with `json`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from typing import Any
 from appliance.bench.load import Result
 
 TYPE = "sensor_msgs/msg/Imu"
-CONVERSIONS_PER_CLOCK_READ = 100  # conversions between two looks at the clock
+CONVERSIONS_PER_CLOCK_READ = 100  # conversions between two reads of the clock
 
 Convert = Callable[[bytes], str | bytes]
 
 
 def sample() -> bytes:
-    """A serialized message with a value of its own in each field."""
+    """A serialized message with a different value in each field."""
     from rclpy.serialization import serialize_message
 
     message = import_module("sensor_msgs.msg").Imu()
@@ -54,7 +54,7 @@ def ours() -> Convert:
 
 
 def rclpy() -> Convert:
-    """What a node does without one."""
+    """What a node without a converter does."""
     from rclpy.serialization import deserialize_message
 
     imu = import_module("sensor_msgs.msg").Imu
@@ -73,7 +73,7 @@ CONVERTERS = {"ours": ours, "rclpy": rclpy}
 
 
 def measure(how: str, seconds: float) -> Result:
-    """Convert for so long."""
+    """Convert for `seconds`."""
     cdr, convert = sample(), CONVERTERS[how]()
     count = 0
     convert(cdr)

@@ -1,7 +1,7 @@
 """A crowd: thousands of clients that connect at once, stay, and leave at once.
 
-Each line on standard input is one step, answered when it is done: the first lets them connect, the
-second leave. It ends with its input::
+Each line on standard input starts a step and is answered when that is done: the first line lets the
+clients connect, the second lets them leave. The program ends with its input::
 
     python -m appliance.bench.crowd --clients 5000 --port 8883 --tls --ca ca.crt --user NAME \
         --password-env VARIABLE
@@ -24,14 +24,14 @@ from appliance.bench.client import LoadError, LoadTarget, allow_files, connect_p
 from appliance.bench.load import percentile, pin
 from appliance.bench.probe import print_answer
 
-CONNECT_SECONDS = 30.0  # from the TCP connection to the CONNACK, as MQTT.js has it
+CONNECT_SECONDS = 30.0  # from the TCP connection to the CONNACK; the default of MQTT.js
 OTHER_FILES = 64
-NICENESS = 5  # clients are elsewhere, and a bystander is not to wait for them
+NICENESS = 5  # real clients run elsewhere: the probe must not wait for these
 _READ, _WRITE = select.EPOLLIN | select.EPOLLRDHUP, select.EPOLLOUT
 
 
 class ConnectingClient:
-    """One client on its way: TCP connection, TLS handshake, CONNECT, CONNACK."""
+    """One client that connects: TCP connection, TLS handshake, CONNECT, CONNACK."""
 
     def __init__(self, target: LoadTarget, client_id: str) -> None:
         self._target = target
@@ -44,10 +44,10 @@ class ConnectingClient:
         self.socket.setblocking(False)
         self.socket.connect_ex((target.host, target.port))
 
-    def go_on(self) -> int:
-        """Do what can be done; returns what epoll is to wait for.
+    def advance(self) -> int:
+        """Take the next step; returns the events to wait for.
 
-        Raises LoadError and OSError, of which those of TLS are, when it cannot connect.
+        Raises LoadError and OSError (TLS errors among them) when it cannot connect.
         """
         return self._step()
 
@@ -73,7 +73,7 @@ class ConnectingClient:
         return self._send()
 
     def _send(self) -> int:
-        self.socket.send(self._connect)  # the first bytes that it sends always fit
+        self.socket.send(self._connect)  # the socket's buffer is empty: they always fit
         self._step = self._on_connack
         return self._on_connack()
 
@@ -93,7 +93,7 @@ class ConnectingClient:
         return _READ
 
     def _on_more(self) -> int:
-        """TLS may say something more; else there is only an end to be read."""
+        """Read what TLS still sends, such as session tickets, or the end of the connection."""
         try:
             if not self.socket.recv(1):
                 raise LoadError("closed after the CONNACK")
@@ -103,30 +103,30 @@ class ConnectingClient:
 
 
 class Crowd:
-    """All of them, and the loop that serves them."""
+    """All clients, and the loop that serves them."""
 
     def __init__(self, target: LoadTarget) -> None:
         self._target = target
         self._poll = select.epoll()
-        self._waiting: dict[int, ConnectingClient] = {}
-        self._inside: dict[int, ConnectingClient] = {}
-        self._took: list[float] = []  # seconds, of each that connected, whether it stayed or not
+        self._connecting: dict[int, ConnectingClient] = {}
+        self._connected: dict[int, ConnectingClient] = {}
+        self._took: list[float] = []  # seconds to connect, of each client that connected at all
         self._problems: Counter[str] = Counter()
 
     def connect(self, count: int) -> dict[str, object]:
-        """Let so many connect at once; returns how that went when all have, or their time is up."""
+        """Connect `count` clients at once; returns the outcome when all have, or time is up."""
         began = time.perf_counter()
         for number in range(count):
-            newcomer = ConnectingClient(self._target, f"bench-crowd-{os.getpid()}-{number}")
-            self._waiting[newcomer.socket.fileno()] = newcomer
-            self._poll.register(newcomer.socket.fileno(), _WRITE)
+            client = ConnectingClient(self._target, f"bench-crowd-{os.getpid()}-{number}")
+            self._connecting[client.socket.fileno()] = client
+            self._poll.register(client.socket.fileno(), _WRITE)
         until = time.perf_counter() + CONNECT_SECONDS
-        while self._waiting and time.perf_counter() < until:
+        while self._connecting and time.perf_counter() < until:
             self._serve(0.1)
         took = self._took
         answer: dict[str, object] = {
             "failed": count - len(took),
-            "timed_out": len(self._waiting),
+            "timed_out": len(self._connecting),
             "seconds": time.perf_counter() - began,
             "problems": dict(self._problems.most_common(3)),
         }
@@ -136,38 +136,38 @@ class Crowd:
         return answer
 
     def stay(self) -> None:
-        """Serve the connections until there is a line of input, or its end."""
+        """Serve the connections until there is a line of input, or input ends."""
         self._poll.register(sys.stdin.fileno(), select.EPOLLIN)
         while not self._serve(None):
             pass
         self._poll.unregister(sys.stdin.fileno())
 
     def leave(self) -> dict[str, object]:
-        """Close all connections, without a word; returns how many there were."""
-        stayed = len(self._inside)
-        for client in (*self._inside.values(), *self._waiting.values()):
+        """Close all connections without a DISCONNECT; returns how many there were."""
+        stayed = len(self._connected)
+        for client in (*self._connected.values(), *self._connecting.values()):
             client.socket.close()
         return {"stayed": stayed, "problems": dict(self._problems.most_common(3))}
 
     def _serve(self, seconds: float | None) -> bool:
-        """Serve those who have something to do; whether there is a line of input."""
+        """Serve the clients with events; returns whether there is a line of input."""
         asked = False
         for descriptor, _ in self._poll.poll(seconds):
-            client = self._waiting.get(descriptor) or self._inside.get(descriptor)
+            client = self._connecting.get(descriptor) or self._connected.get(descriptor)
             if client is None:
                 asked = True
                 continue
             try:
-                self._poll.modify(descriptor, client.go_on())
+                self._poll.modify(descriptor, client.advance())
             except (LoadError, OSError) as error:
                 self._problems[getattr(error, "reason", None) or str(error)] += 1
-                self._waiting.pop(descriptor, None)
-                self._inside.pop(descriptor, None)
+                self._connecting.pop(descriptor, None)
+                self._connected.pop(descriptor, None)
                 client.socket.close()
             else:
-                if client.took is not None and descriptor in self._waiting:
+                if client.took is not None and descriptor in self._connecting:
                     self._took.append(client.took)
-                    self._inside[descriptor] = self._waiting.pop(descriptor)
+                    self._connected[descriptor] = self._connecting.pop(descriptor)
         return asked
 
 

@@ -1,13 +1,13 @@
 """The two ends of a bridge: a paced sender and a measuring receiver, on ROS or on MQTT.
 
-The sender puts the time and a number into each text; the receiver knows from them how long it took
-and what is missing::
+The sender puts the time and a number into each text, from which the receiver computes the latency
+and what was lost::
 
     python -m appliance.bench.ends mqtt-receive --port 1883 --topic bench/chatter --pid PID
     python -m appliance.bench.ends ros-send --topic chatter --rate 1000
 
-With `--image` it is the end of an image's bytes; `ros-listen` is a bare subscription, which is both
-the receiver and what is between.
+With `--image` the text ends an image's bytes. `ros-listen` is a bare subscription: the receiver and
+the measured process in one.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from appliance.bench.load import Result, cpu_seconds, percentile, pin
 
 TEXT_BYTES = 64
 IMAGE_BYTES = 1_000_000
-FIRST_SECONDS = 30.0  # discovery, on a computer that has other things to do
-SETTLE_SECONDS = 1.0  # after the first message: the backlog of the start has gone through
+FIRST_SECONDS = 30.0  # for discovery, on a computer that has other work
+SETTLE_SECONDS = 1.0  # after the first message, for what was queued at the start
 RECEIVE_BYTES = 1 << 21
-QUEUE = 1000  # of the ROS ends: they must not be what loses messages
-IMAGES = 10  # the same for images
+QUEUE = 1000  # depth of the ROS ends, which must not lose messages themselves
+IMAGE_QUEUE = 10  # the same for images
 
 
 def text(number: int) -> str:
-    """What is sent: the time it is sent at, and its number."""
+    """The text of a message: the time at which it is sent, and its number."""
     return f"{time.monotonic_ns():020d} {number:010d}".ljust(TEXT_BYTES)
 
 
 class LatencyMeter:
-    """Latency, loss, and the CPU time of everything between the two ends."""
+    """Measures latency, loss, and the CPU time of everything between the two ends."""
 
     def __init__(self, cell: str, pids: Sequence[int], seconds: float) -> None:
         self._cell, self._pids, self._seconds = cell, pids, seconds
@@ -53,11 +53,11 @@ class LatencyMeter:
 
     @property
     def complete(self) -> bool:
-        """Whether the time is over."""
+        """Whether the measurement is over."""
         return self._elapsed > 0
 
     def add(self, data: str | bytes) -> None:
-        """One message arrived."""
+        """Count a message that has arrived."""
         now = time.monotonic_ns() * 1e-9
         if self.complete:
             return
@@ -77,7 +77,7 @@ class LatencyMeter:
         self._latencies.append((now - int(data[:20]) * 1e-9, 1))
 
     def result(self) -> Result:
-        """The figures. Raises LoadError when the time was never over."""
+        """The measurement. Raises LoadError when it was not completed."""
         if not self.complete:
             raise LoadError("nothing comes through" if not self._starts else "it stopped flowing")
         messages = len(self._latencies)
@@ -96,7 +96,7 @@ class LatencyMeter:
 
 
 def paced(rate: float, seconds: float, send: Callable[[str], object]) -> None:
-    """Send `rate` texts a second for so long; what was missed is made up for."""
+    """Send `rate` texts a second for `seconds`; late ones are sent as soon as possible."""
     began = time.monotonic()
     for number in range(int(rate * seconds)):
         if (wait := began + number / rate - time.monotonic()) > 0:
@@ -110,7 +110,7 @@ def paced(rate: float, seconds: float, send: Callable[[str], object]) -> None:
 def mqtt_send(target: LoadTarget, topic: str, rate: float, seconds: float) -> None:
     """Publish with QoS 0."""
     with closing(LoadClient(target, f"bench-send-{os.getpid()}")) as client:
-        client.connected()
+        client.wait_connected()
         paced(rate, seconds, lambda data: client.write(publish_packet(topic, data.encode())))
 
 
@@ -118,7 +118,7 @@ def mqtt_receive(target: LoadTarget, topic: str, meter: LatencyMeter, seconds: f
     """Subscribe with QoS 0 and measure."""
     buffer, filled, size = memoryview(bytearray(RECEIVE_BYTES)), 0, 0
     with closing(LoadClient(target, f"bench-receive-{os.getpid()}")) as client:
-        client.connected()
+        client.wait_connected()
         client.subscribe(topic, 0)
         client.socket.settimeout(FIRST_SECONDS)
         until = time.monotonic() + FIRST_SECONDS + SETTLE_SECONDS + 2 * seconds
@@ -126,8 +126,8 @@ def mqtt_receive(target: LoadTarget, topic: str, meter: LatencyMeter, seconds: f
             try:
                 filled += client.transport.recv_into(buffer[filled:])
             except TimeoutError:
-                return  # which the meter puts into words
-            if not size and filled >= 5:  # a PUBLISH and its length; they are all as long
+                return  # the meter reports that nothing comes through
+            if not size and filled >= 5:  # a PUBLISH and its length; all have the same
                 size = packet_size(buffer)
             whole = filled - filled % size if size else 0
             for end in range(size, whole + 1, size or 1):
@@ -137,20 +137,20 @@ def mqtt_receive(target: LoadTarget, topic: str, meter: LatencyMeter, seconds: f
 
 
 def packet_size(head: memoryview) -> int:
-    """The size of the packet that begins so, in bytes (MQTT 3.1.1, section 2.2.3)."""
+    """The size of the packet with this fixed header, in bytes (MQTT 3.1.1, section 2.2.3)."""
     length = 0
     for position in range(1, 5):
         length |= (head[position] & 0x7F) << 7 * (position - 1)
         if not head[position] & 0x80:
             return 1 + position + length
-    raise LoadError("what comes is no MQTT")
+    raise LoadError("what arrives is no MQTT")
 
 
 # --- ROS ---
 
 
 def texts() -> tuple[Any, int, Callable[[str], Any]]:
-    """The type of texts, how many may wait, and the message of a text."""
+    """The message type of texts, the queue's depth, and a function from a text to its message."""
     string = import_module("std_msgs.msg").String
     return string, QUEUE, lambda data: string(data=data)
 
@@ -162,7 +162,7 @@ def images() -> tuple[Any, int, Callable[[str], Any]]:
     image = import_module("sensor_msgs.msg").Image
     pixels = bytes(IMAGE_BYTES - TEXT_BYTES)
     cdr = serialize_message(image(encoding="mono8", data=pixels + bytes(TEXT_BYTES)))
-    return image, IMAGES, lambda data: cdr[:-TEXT_BYTES] + data.encode()
+    return image, IMAGE_QUEUE, lambda data: cdr[:-TEXT_BYTES] + data.encode()
 
 
 def ros_send(topic: str, rate: float, seconds: float, is_image: bool) -> None:
@@ -178,7 +178,7 @@ def ros_send(topic: str, rate: float, seconds: float, is_image: bool) -> None:
     def send(data: str) -> None:
         if not rclpy.ok():  # a signal came
             raise KeyboardInterrupt
-        with suppress(refusal):  # for want of time or room; the receiver misses it
+        with suppress(refusal):  # for want of time or space; the receiver counts it as lost
             publisher.publish(make(data))
 
     try:
@@ -198,7 +198,7 @@ def ros_receive(topic: str, meter: LatencyMeter, seconds: float, is_image: bool)
 
     rclpy.init()
     node = rclpy.create_node("bench_receive")
-    try:  # from Jazzy on; a fifth of the other's cost, which would be part of the latency
+    try:  # from Jazzy on; costs a fifth of the other, and that cost is part of the latency
         executor: Any = import_module("rclpy.experimental").EventsExecutor()
     except ImportError:
         executor = SingleThreadedExecutor()

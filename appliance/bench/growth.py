@@ -1,8 +1,8 @@
-"""What must not grow: the cost of a publish with all else that the broker holds, and standstills.
+"""What must not grow with the broker's state: the cost of a publish, and the length of stalls.
 
-Its figures are absolute, or a broker's own with much divided by the same with little, so that each
-broker has its own verdict. What is measured is as slow as its slowest moment: one client's longest
-round trip while another asks for a lot.
+The figures are absolute, or those of a broker with much state divided by its own with little, so
+that each broker is judged by itself. A stall is one client's longest round trip while others cause
+much work.
 """
 
 from __future__ import annotations
@@ -36,18 +36,16 @@ from appliance.bench.load import Load, LoadSubscriber, MessageFlow, cpu_seconds,
 from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site, last_lines
 
 StartBroker: TypeAlias = (
-    "Callable[[], AbstractContextManager[Server]]"  # of a broker, a new one each
+    "Callable[[], AbstractContextManager[Server]]"  # starts another broker at each call
 )
 Progress: TypeAlias = "Callable[[str], object]"
 Figures: TypeAlias = "dict[str, float]"
 
-RUN_SECONDS = 0.5  # the longest that one run measures: there are many, in turn
+RUN_SECONDS = 0.5  # the longest that one run measures, as there are many
 RUNS = 3
-MAX_RATIO = (
-    1.15  # a ratio up to which two figures of a computer that does other things are the same
-)
+MAX_RATIO = 1.15  # up to which two figures count as the same, on a computer with other work
 MAX_STALL_MS = 50.0
-MAX_CROWD_STALL_MS = 500.0  # while thousands come or go at once, each with a TLS connection
+MAX_CROWD_STALL_MS = 500.0  # while thousands of TLS clients connect or leave at once
 FILTERS_A_PACKET = 100
 FILTERS_A_CLIENT = 800
 PACKETS_A_WINDOW = 1000
@@ -59,9 +57,9 @@ SETTLE_SECONDS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """One line of the report: a figure, and the most that it may be.
+    """One line of the report: a figure, and the maximum that is its goal.
 
-    `note` is shown behind it, with other figures of the same cell by their names in braces.
+    `note` is printed behind it; names in braces stand for other figures of the same cell.
     """
 
     figure: str
@@ -71,7 +69,7 @@ class Statement:
     note: str = ""
 
     def reached(self, figures: Mapping[str, float] | None) -> bool | None:
-        """Whether the goal is; None when there is none, or no figure."""
+        """Whether the goal is reached; None when there is no goal, or no figure."""
         if self.most is None or figures is None or self.figure not in figures:
             return None
         return figures[self.figure] <= self.most
@@ -79,7 +77,7 @@ class Statement:
 
 @dataclass(frozen=True, slots=True)
 class GrowthCell:
-    """Statements that are measured on the same brokers; `size` is how much "much" is."""
+    """Statements that are measured on the same brokers; `size` is the amount of state."""
 
     name: str
     title: str
@@ -97,7 +95,7 @@ class GrowthCell:
 
 @dataclass(frozen=True, slots=True)
 class GrowthRow:
-    """What one cell gave on both brokers; None where it did not run."""
+    """The result of one cell on both brokers; None where it did not run."""
 
     cell: GrowthCell
     ours: Figures | None = None
@@ -107,19 +105,19 @@ class GrowthRow:
 
     @property
     def reached(self) -> bool | None:
-        """Whether all goals are; None when that cannot be told."""
+        """Whether all goals are reached; None when a figure is missing."""
         goals = [each for each in self.cell.statements if each.most is not None]
         verdicts = [each.reached(self.ours) for each in goals]
         return None if None in verdicts else all(verdicts)
 
 
-# --- The same publish, with little and with much beside it ---
+# --- The same publish, with little and with much state ---
 
 
 def publish_costs(
     little: Server, much: Server, loads: Sequence[str], seconds: float, progress: Progress
 ) -> Figures:
-    """CPU µs a message of each load on both brokers, in turn, and the second by the first."""
+    """CPU µs a message of each load on both brokers in turn, and the ratio of much to little."""
     figures: Figures = {}
     for load in loads:
         costs: dict[str, list[float]] = {"little": [], "much": []}
@@ -138,7 +136,7 @@ def publish_costs(
 
 
 def same_cost(load: str, title: str, little: str) -> Statement:
-    """That a publish costs the same as with little."""
+    """The statement that a publish costs the same as with little state."""
     note = f"{{{load}-little-us:.1f}} → {{{load}-much-us:.1f}} µs"
     return Statement(load, f"CPU of a publish ÷ with {little}: {title}", "×", MAX_RATIO, note)
 
@@ -152,7 +150,7 @@ TOPICS = ("qos0-topics", "QoS 0, 10,000 topics in turn")
 
 @dataclass(frozen=True, slots=True)
 class SubscriptionCell(GrowthCell):
-    """A publish with 10, and with many subscriptions to other topics."""
+    """The cost of a publish with 10 and with many subscriptions to other topics."""
 
     def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         with start() as little, start() as much, contextlib.ExitStack() as stack:
@@ -175,14 +173,14 @@ class SubscriptionCell(GrowthCell):
 
 
 def subscribe(stack: contextlib.ExitStack, server: Server, count: int) -> None:
-    """Make so many subscriptions, of clients that stay connected until the stack is closed."""
+    """Make `count` subscriptions, of clients that stay connected until the stack is closed."""
     for first in range(0, count, FILTERS_A_CLIENT):
         filters = [
             other_filter(each) for each in range(first, min(first + FILTERS_A_CLIENT, count))
         ]
         client = LoadClient(server.target(tls=False), f"bench-other-{first}")
         stack.callback(client.close)
-        client.connected()
+        client.wait_connected()
         for start in range(0, len(filters), FILTERS_A_PACKET):
             some = filters[start : start + FILTERS_A_PACKET]
             client.write(subscribe_packet(some, 0))
@@ -192,7 +190,7 @@ def subscribe(stack: contextlib.ExitStack, server: Server, count: int) -> None:
 
 
 def other_filter(number: int) -> str:
-    """One of many filters that match nothing of what is published; three of ten are wildcards."""
+    """One of many filters that match no published topic; three of ten have wildcards."""
     robot, thing = divmod(number, 100)
     match number % 10:
         case 0:
@@ -210,7 +208,7 @@ def other_filter(number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RetainedCell(GrowthCell):
-    """A publish with none, and with many messages retained; and one who wants to have them all."""
+    """The cost of a publish with none and with many retained messages; and of sending them all."""
 
     def measure(self, start: StartBroker, seconds: float, progress: Progress) -> Figures:
         with start() as little, start() as much:
@@ -239,9 +237,9 @@ def retained_topic(number: int) -> str:
 
 
 def retain(server: Server, count: int) -> None:
-    """Have the broker retain so many messages."""
+    """Publish `count` retained messages."""
     with contextlib.closing(LoadClient(server.target(tls=False), "bench-retain")) as client:
-        client.connected()
+        client.wait_connected()
         for first in range(0, count, PACKETS_A_WINDOW):
             numbers = range(first, min(first + PACKETS_A_WINDOW, count))
             packets = [
@@ -255,19 +253,19 @@ def retain(server: Server, count: int) -> None:
 
 
 class _DeliveryCounter(MessageFlow):
-    """Counts what nobody has sent just now."""
+    """Counts deliveries of messages that were sent before."""
 
     def deliver(self, count: int) -> None:
         self.deliveries += count
 
 
 def receive_retained(server: Server, qos: int, count: int) -> int:
-    """Subscribe to the retained messages; returns how many came, so many if all is well."""
+    """Subscribe to the retained messages; returns how many arrived, `count` if none is lost."""
     tally = _DeliveryCounter(Load(qos=qos, payload=RETAINED_BYTES))
     poll, events = select.epoll(), dict[int, Callable[[int], None]]()
     client = LoadSubscriber(server.target(tls=False), f"bench-all-{qos}", tally, retained_topic(0))
     with poll, contextlib.closing(client):
-        client.connected()
+        client.wait_connected()
         client.subscribe("bench/kept/#", qos)
         client.attach(poll, events)
         while tally.deliveries < count:
@@ -328,38 +326,38 @@ class ClientCell(GrowthCell):
 
 
 def open_files(pids: Sequence[int]) -> int:
-    """How many files these processes have open."""
+    """The number of files that these processes have open."""
     return sum(1 for pid in pids for _ in Path(f"/proc/{pid}/fd").iterdir())
 
 
-# --- Programs that are asked ---
+# --- Subprocesses that answer ---
 
 
 class Subprocess:
-    """A program of this package in a process of its own, which answers lines with lines of JSON."""
+    """A program of this package in its own process, which answers lines with lines of JSON."""
 
     def __init__(self, name: str, process: subprocess.Popen[bytes], log: Path) -> None:
         self._name, self._process, self._log = name, process, log
         self._received = b""
 
     def ask(self, seconds: float = ANSWER_SECONDS) -> dict[str, Any]:
-        """Its answer. Raises PeerError when none comes in so many seconds."""
+        """Ask for an answer. Raises PeerError when none arrives within `seconds`."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(b"\n")
             self._process.stdin.flush()
         except BrokenPipeError:
-            pass  # which `answer` puts into words
+            pass  # `answer` reports it
         return self.answer(seconds)
 
     def answer(self, seconds: float = ANSWER_SECONDS) -> dict[str, Any]:
-        """What it says next. Raises PeerError as `ask` does."""
+        """Its next answer. Raises PeerError as `ask` does."""
         output, until = self._process.stdout, time.monotonic() + seconds
         assert output is not None
         while b"\n" not in self._received:
             left = max(until - time.monotonic(), 0)
             if not select.select([output], [], [], left)[0]:
-                raise PeerError(f"{self._name} says nothing for {seconds:g} s")
+                raise PeerError(f"{self._name} does not answer within {seconds:g} s")
             data = os.read(output.fileno(), 65536)
             if not data:
                 raise PeerError(f"{self._name} ended: {last_lines(self._log)}")
@@ -390,7 +388,7 @@ def probing(server: Server) -> AbstractContextManager[Subprocess]:
 
 
 def crowd(server: Server, count: int) -> AbstractContextManager[Subprocess]:
-    """Clients that connect when asked, and leave when asked again."""
+    """Run clients that connect when asked, and leave when asked again."""
     return program("crowd", server, tls=True, options=["--clients", str(count)])
 
 
@@ -488,7 +486,7 @@ def grow(
     seconds: float,
     progress: Progress = lambda text: None,
 ) -> GrowthRow:
-    """Measure one cell on this broker, and on the peer where there is one."""
+    """Measure one cell on this broker, and on the peer if there is one."""
     if missing := cell.missing():
         return GrowthRow(cell, missing=missing)
     measured: dict[str, Figures] = {}

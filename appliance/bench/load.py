@@ -1,12 +1,12 @@
-"""The load generator: one process that drives one broker with one cell's load, and measures it.
+"""The load generator: one process that drives one broker with the load of a cell, and measures it.
 
 Works against any MQTT 3.1.1 broker::
 
     python -m appliance.bench.load qos1-inflight50 --port 1883 --pid "$(pidof mosquitto)" --json
 
-It must never be what limits the figures. So packets are encoded before the clock starts, all of a
-cell have one size, what arrives is counted by its length, and packet identifiers are picked out of
-a received chunk, and put into the acknowledgements, by slices that step from packet to packet.
+The generator must never limit the figures. So packets are encoded before the clock starts, all of a
+cell have one size, received packets are counted by their length, and packet identifiers are copied
+from a received chunk into the acknowledgements by slices that step from packet to packet.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from pathlib import Path
 
 from appliance.bench.client import LoadClient, LoadError, LoadTarget, allow_files, publish_packet
 
-STALL_SECONDS = 3.0  # nothing arrives for so long: the broker has lost messages, or stands still
+STALL_SECONDS = 3.0  # without a delivery: the broker has lost messages, or has stalled
 RUN_SECONDS = 3.0  # of a run, unless said otherwise
-DRAIN_SECONDS = 2.0  # what is still on the way after the last message was sent
+DRAIN_SECONDS = 2.0  # for messages in flight after the last was sent
 WARM_UP_SECONDS = 0.3
 RECEIVE_BYTES = 1 << 20
-RING_BYTES = 8 << 20  # the most that a publisher's packets, encoded beforehand, take
-BESIDE_SECONDS = 0.002  # between two round trips of the client beside a flood
+RING_BYTES = 8 << 20  # limit of a publisher's packets that are encoded beforehand
+PROBE_SECONDS = 0.002  # between two round trips of the probe beside a flood
 CPUCLOCK_SCHED = 2  # clock_getcpuclockid(3): nanoseconds of all threads of a process
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """One cell: what is sent, to how many, and how much of it may be on the way."""
+    """The load of one cell: the messages, their subscribers, and how many may be in flight."""
 
     qos: int = 0
     pairs: int = 1
@@ -46,10 +46,10 @@ class Load:
     window: int = 1  # messages of one publisher neither delivered nor acknowledged
     batch: int = 1  # send only when this many fit into the window
     payload: int = 64  # bytes
-    topics: int = 1  # of each publisher, each in its turn; the subscriber has one wildcard for all
+    topics: int = 1  # of each publisher, in turn; the subscriber has one wildcard for all
     stored: bool = False  # the subscribers' sessions outlive their connections
-    flood: int = 0  # messages in all, sent as fast as they are acknowledged; with a client beside
-    idle: int = 0  # connections that only stay: measures memory, not messages
+    flood: int = 0  # messages in total, sent as fast as they are acknowledged, with a probe beside
+    idle: int = 0  # connections that stay idle: measures memory, not messages
 
 
 CELLS: dict[str, Load] = {
@@ -68,7 +68,7 @@ CELLS: dict[str, Load] = {
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What one run measured. None: does not apply to the cell, or no process was given."""
+    """The result of one run. None: does not apply to the cell, or no process was given."""
 
     cell: str
     tls: bool
@@ -79,19 +79,19 @@ class Result:
     cpu_us: float | None = None  # the broker's CPU time a delivered message, µs
     p50_us: float | None = None  # latency from sent to received, µs
     p99_us: float | None = None
-    beside_us: float | None = None  # 99 % of the round trips of a client beside the load, µs
+    beside_us: float | None = None  # 99th percentile of a probe's round trips beside the load, µs
     broker_busy: float | None = None  # CPU time / time; 1.0 is one core
     generator_busy: float | None = None
     memory_kib: float | None = None  # the broker's resident memory a connection, KiB
 
 
 def topic_of(topic: str, load: Load, number: int) -> str:
-    """The topic of a publisher's message with this number; all are equally long."""
+    """The topic of a publisher's message with this number; all have the same length."""
     return topic if load.topics == 1 else f"{topic}/{number:06d}"
 
 
 class MessageFlow:
-    """One publisher's messages: how many may be sent, and how long they took."""
+    """The messages of one publisher: flow control by the window, and latencies."""
 
     def __init__(self, load: Load) -> None:
         self.load = load
@@ -99,7 +99,9 @@ class MessageFlow:
         self.acknowledged = 0
         self.deliveries = 0  # over all subscribers
         self.latencies: list[tuple[float, int]] = []  # seconds, and of how many deliveries
-        self._marks: deque[tuple[int, float]] = deque()  # deliveries due, since when
+        self._marks: deque[tuple[int, float]] = (
+            deque()
+        )  # total deliveries when complete, and when sent
         self._publisher: LoadPublisher
 
     def start(self, publisher: LoadPublisher) -> None:
@@ -108,12 +110,12 @@ class MessageFlow:
         self._send()
 
     def acknowledge(self, count: int) -> None:
-        """The broker acknowledged messages."""
+        """Count messages that the broker has acknowledged."""
         self.acknowledged += count
         self._send()
 
     def deliver(self, count: int) -> None:
-        """Messages arrived at a subscriber."""
+        """Count messages that have arrived at a subscriber."""
         now, done, marks = time.perf_counter(), self.deliveries, self._marks
         self.deliveries = end = done + count
         while done < end:
@@ -129,7 +131,7 @@ class MessageFlow:
 
     @property
     def missing(self) -> int:
-        """Messages that were sent and have not arrived."""
+        """Deliveries of sent messages that have not arrived."""
         return self.sent * self.load.subscribers - self.deliveries
 
     @property
@@ -141,7 +143,7 @@ class MessageFlow:
         return self.sent - done
 
     def stop(self) -> None:
-        """Send nothing more."""
+        """Stop sending."""
         self.load = replace(self.load, window=0)
 
     def _send(self) -> None:
@@ -153,7 +155,7 @@ class MessageFlow:
 
 
 class FloodFlow(MessageFlow):
-    """A publisher that waits for its acknowledgements only, and not for the subscriber."""
+    """The flow of a publisher that waits for acknowledgements, and not for the subscriber."""
 
     @property
     def in_flight(self) -> int:
@@ -172,7 +174,7 @@ class FloodFlow(MessageFlow):
 
 
 class LoadPublisher(LoadClient):
-    """Sends packets out of a ring in which they lie ready, one after the other."""
+    """Sends packets out of a ring buffer of packets that are encoded beforehand."""
 
     def __init__(self, target: LoadTarget, client_id: str, flow: MessageFlow, topic: str) -> None:
         super().__init__(target, client_id)
@@ -181,7 +183,7 @@ class LoadPublisher(LoadClient):
         topics = [topic_of(topic, load, number) for number in range(load.topics)]
         self._flow = flow
         self._size = len(publish_packet(topics[0], payload, 1 if load.qos else None))
-        # Twice the window: an identifier is free again long before its packet's turn comes.
+        # Twice the window: an identifier is free again long before its packet is sent again.
         count = min(max(2 * load.window, 64), max(2 * load.window, RING_BYTES // self._size), 65535)
         self._ring = memoryview(
             b"".join(
@@ -197,7 +199,7 @@ class LoadPublisher(LoadClient):
         self._answered = 0
 
     def send(self, count: int) -> None:
-        """Send `count` messages, now or as soon as the socket takes them."""
+        """Send `count` messages, now or as soon as the socket accepts them."""
         if self._unsent:
             self._unsent += count * self._size
         else:
@@ -223,7 +225,7 @@ class LoadPublisher(LoadClient):
 
 
 class LoadSubscriber(LoadClient):
-    """Counts messages by their length, and acknowledges them where QoS 1 asks for it."""
+    """Counts messages by their length, and acknowledges them with QoS 1."""
 
     def __init__(self, target: LoadTarget, client_id: str, flow: MessageFlow, topic: str) -> None:
         load = flow.load
@@ -266,7 +268,7 @@ class LoadSubscriber(LoadClient):
 
 
 class ProbeClient(LoadClient):
-    """Publishes to itself, one message after the other with a pause between."""
+    """Measures round trips beside a load: publishes to itself, with a pause between messages."""
 
     def __init__(self, target: LoadTarget, client_id: str) -> None:
         super().__init__(target, client_id)
@@ -279,12 +281,12 @@ class ProbeClient(LoadClient):
         self._next = 0.0
 
     def subscribed(self) -> None:
-        """Connect to the end."""
-        self.connected()
+        """Wait for the CONNACK, and subscribe."""
+        self.wait_connected()
         self.subscribe(self._topic, 0)
 
     def tick(self, now: float) -> None:
-        """Begin the next round trip, when it is time."""
+        """Begin the next round trip when its time has come."""
         if now >= self._next:
             self._next = math.inf
             self._sent_at = now
@@ -296,17 +298,17 @@ class ProbeClient(LoadClient):
             self._filled = 0
             now = time.perf_counter()
             self.latencies.append((now - self._sent_at, 1))
-            self._next = now + BESIDE_SECONDS
+            self._next = now + PROBE_SECONDS
 
     def flush(self) -> None:
-        """A packet of this size is never sent in parts."""
+        """Do nothing: a packet of this size is never sent in parts."""
 
 
 # --- Runs ---
 
 
 def cpu_seconds(pids: Iterable[int]) -> float:
-    """CPU time that these processes used so far, all their threads, ended ones included."""
+    """CPU time of these processes so far, of all their threads, ended ones included."""
     return sum(time.clock_gettime((~pid << 3) | CPUCLOCK_SCHED) for pid in pids)
 
 
@@ -321,7 +323,7 @@ def resident_kib(pids: Iterable[int]) -> int:
 
 
 def pin(pids: Iterable[int]) -> bool:
-    """Give this process one core and the broker another; False where there is only one."""
+    """Pin this process to one core and the broker to another; False if there is only one."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return False
@@ -333,7 +335,7 @@ def pin(pids: Iterable[int]) -> bool:
 
 
 def percentile(weighted: Iterable[tuple[float, int]], part: float) -> float:
-    """The value that `part` (0 to 1) of the weighted samples do not exceed."""
+    """The value that a `part` (0 to 1) of the weighted samples does not exceed."""
     samples = sorted(weighted)
     left = part * sum(weight for _, weight in samples)
     for value, weight in samples:
@@ -344,7 +346,7 @@ def percentile(weighted: Iterable[tuple[float, int]], part: float) -> float:
 
 
 class LoadRun:
-    """All clients of one cell, and the loop that serves them."""
+    """One run of a cell: its clients, and the loop that serves them."""
 
     def __init__(self, target: LoadTarget, load: Load, spin: bool) -> None:
         self._target = target
@@ -356,10 +358,10 @@ class LoadRun:
         self._subscribers: list[tuple[LoadSubscriber, str]] = []
         self.flows: list[MessageFlow] = []
         self._load = load
-        self.arrived_at = 0.0  # when the last message of a flood did
+        self.arrived_at = 0.0  # when the last message of a flood arrived
 
     def open(self) -> None:
-        """Connect and subscribe everyone."""
+        """Connect all clients, and subscribe."""
         run = f"bench-{os.getpid()}"
         for pair in range(self._load.pairs):
             topic = f"bench/load/{pair:02d}"
@@ -372,9 +374,9 @@ class LoadRun:
             publisher = LoadPublisher(self._target, f"{run}-p{pair}", flow, topic)
             self._publishers.append(publisher)
             self._clients.append(publisher)
-        # Only now: a broker may take its time for a password, and checks several at once.
+        # Wait only now: checking a password takes time, and a broker may check several at once.
         for client in self._clients:
-            client.connected()
+            client.wait_connected()
         for subscriber, topic in self._subscribers:
             wanted = topic if self._load.topics == 1 else f"{topic}/+"
             subscriber.subscribe(wanted, self._load.qos)
@@ -387,7 +389,7 @@ class LoadRun:
             flow.start(publisher)
 
     def serve(self, until: float, drained: bool = False) -> None:
-        """Serve the connections up to a time of `perf_counter`, or until all has arrived."""
+        """Serve the connections until a time of `perf_counter`, or until all is `drained`."""
         poll, events, clock = self._poll.poll, self._events, time.perf_counter
         timeout = self._poll_timeout
         progress, seen = clock(), self.deliveries
@@ -400,8 +402,8 @@ class LoadRun:
                 if self.deliveries == seen and now - progress > STALL_SECONDS:
                     missing = sum(flow.in_flight for flow in self.flows)
                     raise LoadError(
-                        f"nothing arrives: {missing} messages are on the way"
-                        f" after {seen} deliveries (lost, or the broker stands still)"
+                        f"nothing arrives: {missing} messages are in flight"
+                        f" after {seen} deliveries (lost, or the broker has stalled)"
                     )
                 if self.deliveries != seen:
                     progress, seen = now, self.deliveries
@@ -412,16 +414,16 @@ class LoadRun:
         return sum(flow.deliveries for flow in self.flows)
 
     def add(self, client: LoadClient) -> None:
-        """Serve one connection more."""
+        """Serve another connection."""
         client.attach(self._poll, self._events)
 
     def serve_until_delivered(self, probe: ProbeClient) -> None:
-        """Serve the connections until all has been acknowledged and has arrived, or nothing does.
+        """Serve the connections until all messages are acknowledged and delivered, or none is.
 
-        What was lost does not arrive, so that the end is known only when the time is up.
+        Lost messages never arrive: then the end is known only after STALL_SECONDS.
         """
         poll, events, clock = self._poll.poll, self._events, time.perf_counter
-        timeout = min(self._poll_timeout, BESIDE_SECONDS)
+        timeout = min(self._poll_timeout, PROBE_SECONDS)
         seen = 0
         self.arrived_at = clock()
         while any(flow.in_flight or flow.missing for flow in self.flows):
@@ -435,7 +437,7 @@ class LoadRun:
                 return
 
     def reset_latencies(self) -> None:
-        """Leave the warm-up out of the figures."""
+        """Exclude the warm-up from the figures."""
         for flow in self.flows:
             flow.latencies = []
 
@@ -444,7 +446,7 @@ class LoadRun:
         return [sample for flow in self.flows for sample in flow.latencies]
 
     def drain(self) -> int:
-        """Stop sending and wait for what is on the way; returns the deliveries that never came."""
+        """Stop sending and wait for messages in flight; returns the deliveries that are lost."""
         for flow in self.flows:
             flow.stop()
         self.serve(time.perf_counter() + DRAIN_SECONDS, drained=True)
@@ -460,8 +462,8 @@ class LoadRun:
 def run_messages(cell: str, target: LoadTarget, load: Load, seconds: float, spin: bool) -> Result:
     """Drive a broker with messages for `seconds`, after a short warm-up.
 
-    With `spin` the loop never sleeps, which takes a core of its own: waking up a sleeping process
-    costs whoever writes to it, here the broker, more than a message does.
+    With `spin` the loop never sleeps, which takes a core of its own: to wake a sleeping process
+    costs the process that writes to it, here the broker, more than a message does.
     """
     run = LoadRun(target, load, spin)
     try:
@@ -494,9 +496,9 @@ def run_messages(cell: str, target: LoadTarget, load: Load, seconds: float, spin
 
 
 def run_flood(cell: str, target: LoadTarget, load: Load, seconds: float, spin: bool) -> Result:
-    """Send a number of messages as fast as they are acknowledged, and count what arrives.
+    """Send a number of messages as fast as they are acknowledged, and count the deliveries.
 
-    All that the cell says are meant for a run of RUN_SECONDS.
+    The cell's number is for a run of RUN_SECONDS; longer runs send more.
     """
     load = replace(load, flood=max(round(load.flood * seconds / RUN_SECONDS), load.window))
     run = LoadRun(target, load, spin)
@@ -534,13 +536,13 @@ def run_flood(cell: str, target: LoadTarget, load: Load, seconds: float, spin: b
 
 
 def run_idle(cell: str, target: LoadTarget, load: Load, seconds: float) -> Result:
-    """Open connections that stay idle, and see what memory each costs a freshly started broker."""
+    """Open connections that stay idle, and measure the memory of each in a new broker."""
     if not target.pids:
-        raise LoadError("the idle cell measures memory: tell the broker's process with --pid")
+        raise LoadError("the idle cell measures memory: give the broker's process with --pid")
     allow_files(2 * load.idle + 100)
     clients: list[LoadClient] = []
     try:
-        # The first connections also pay for what is made once.
+        # The first connections also pay for what is allocated once.
         _open_idle(target, "warm", max(load.idle // 10, 10), clients)
         before = _settled_kib(target.pids, seconds / 2)
         _open_idle(target, "idle", load.idle, clients)
@@ -559,11 +561,11 @@ def _open_idle(target: LoadTarget, name: str, count: int, clients: list[LoadClie
         clients.append(client)
         opened.append(client)
     for client in opened:
-        client.connected()
+        client.wait_connected()
 
 
 def _settled_kib(pids: Sequence[int], seconds: float) -> float:
-    """Resident memory over `seconds`: the median, as an allocator gives back in its own time."""
+    """The median of resident memory over `seconds`, as an allocator releases memory late."""
     until, samples = time.monotonic() + seconds, [resident_kib(pids)]
     while time.monotonic() < until:
         time.sleep(0.1)
@@ -580,10 +582,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("cell", choices=CELLS, metavar="CELL", help=", ".join(CELLS))
     LoadTarget.add_options(parser)
     parser.add_argument("--seconds", type=float, default=RUN_SECONDS, help="time to measure")
-    parser.add_argument("--no-pin", action="store_true", help="leave both to the scheduler")
+    parser.add_argument("--no-pin", action="store_true", help="do not pin the processes to cores")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     tuning = parser.add_argument_group("to change the cell")
-    tuning.add_argument("--window", type=int, help="messages on the way, each publisher")
+    tuning.add_argument("--window", type=int, help="messages in flight, each publisher")
     tuning.add_argument("--batch", type=int, help="send only when so many fit in the window")
     tuning.add_argument("--payload", type=int, help="bytes")
     tuning.add_argument("--pairs", type=int, help="publishers, each with its subscribers")
@@ -618,7 +620,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def describe(result: Result) -> str:
-    """A result in one line."""
+    """A result as one line."""
 
     def shown(name: str, value: float | None, unit: str) -> str:
         return "" if value is None else f"  {name} {value:,.1f}{unit}"

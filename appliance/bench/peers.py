@@ -1,9 +1,9 @@
 """The brokers that are compared: this appliance and mosquitto, with equal settings.
 
 Both have a password file, the same ACL in force, one TCP and one TLS listener on 127.0.0.1 with the
-same certificate, nothing on disk, and the same window towards a subscriber. What is mosquitto's own
-default and good for its figures stays (set_tcp_nodelay false takes 15 % off its QoS 1 in flight).
-All files lie in one directory that the caller removes.
+same certificate, no persistence, and the same inflight window. Defaults of mosquitto that are good
+for its figures stay (set_tcp_nodelay false takes 15 % off its QoS 1 in flight). All files are in
+one directory that the caller removes.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ user {USER}
 topic readwrite bench/#
 pattern readwrite clients/%c/#
 """
-INFLIGHT = 100  # towards a subscriber; mosquitto's default of 20 would stand in the load's way
-LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or does not meet it here
+INFLIGHT = 100  # of each subscriber; mosquitto's default of 20 would limit the load
+LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or does not reach it here
     "connections": 10_000,
     "connections_per_address": 10_000,
     "connection_rate": 1_000_000,
@@ -64,7 +64,7 @@ class PeerError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What the brokers of one comparison share: the directory with certificates, and the user."""
+    """What the brokers of one comparison share: a directory with certificates, and a user."""
 
     directory: Path
     password: str = field(default_factory=lambda: secrets.token_urlsafe(12), repr=False)
@@ -82,7 +82,7 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """A running broker, with what else works for it."""
+    """A running broker, with the processes that belong to it."""
 
     name: str
     site: Site
@@ -129,7 +129,7 @@ def mosquitto_version(command: str) -> str:
 
 @contextlib.contextmanager
 def mosquitto(command: str, site: Site, *, default_limits: bool = False) -> Iterator[Server]:
-    """Run mosquitto, with its usual queue and window or larger ones; it is stopped in the end.
+    """Run mosquitto with its default queue and window or larger ones, and stop it in the end.
 
     Raises PeerError.
     """
@@ -176,9 +176,9 @@ def appliance(
     *,
     default_limits: bool = False,
 ) -> Iterator[Server]:
-    """Run this appliance, with a bridge when there are routes; it is stopped in the end.
+    """Run this appliance, with a bridge when there are routes, and stop it in the end.
 
-    Its limits are raised, unless it is to have the usual ones. Raises PeerError.
+    Its limits are raised, unless it is to have the default ones. Raises PeerError.
     """
     directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
     passwords = Passwords(directory / "users.passwd")
@@ -224,7 +224,7 @@ def running(
     log: Path,
     talks: bool = False,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program whose output goes to `log`; it is stopped in the end. Raises PeerError.
+    """Run a program whose output goes to `log`, and stop it in the end. Raises PeerError.
 
     With `talks` its input and output are pipes, and only its errors go to `log`.
     """
@@ -261,7 +261,7 @@ def running(
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """End a process, by force when it does not follow."""
+    """Terminate a process, and kill it when that does not end it."""
     if process.poll() is None:
         process.terminate()
     try:
@@ -278,7 +278,7 @@ def wait_for(server: Server, process: subprocess.Popen[bytes], log: Path) -> Non
     while missing:
         try:
             with contextlib.closing(LoadClient(server.target(missing[0]), "bench-ready")) as client:
-                client.connected()
+                client.wait_connected()
             missing.pop(0)
         except (OSError, LoadError) as error:
             if process.poll() is not None:
@@ -290,13 +290,13 @@ def wait_for(server: Server, process: subprocess.Popen[bytes], log: Path) -> Non
 
 
 def last_lines(log: Path) -> str:
-    """The end of what a program said, in one line."""
+    """The last lines of a program's output, as one line."""
     lines = log.read_text(errors="replace").strip().splitlines()
-    return " | ".join(lines[-3:]) or "it said nothing"
+    return " | ".join(lines[-3:]) or "it printed nothing"
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 that were free just now; a program that takes no port 0 needs a number."""
+    """Ports of 127.0.0.1 that were free just now, for programs that accept no port 0."""
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
         for each in sockets:

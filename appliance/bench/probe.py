@@ -1,7 +1,7 @@
-"""A bystander: one client whose round trips show whether the broker stands still for others.
+"""A probe: one client whose round trips show whether the broker stalls for other clients.
 
 It publishes to itself, one message after the other with a pause between. Each line on its standard
-input is answered with the round trips since the line before; it ends with its input::
+input is answered with the round trips since the line before. The program ends with its input::
 
     python -m appliance.bench.probe --port 1883 --user NAME --password-env VARIABLE
 """
@@ -21,31 +21,31 @@ from contextlib import closing
 from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
 from appliance.bench.load import percentile
 
-PAUSE_SECONDS = 0.002  # between two round trips: the broker is watched, and not kept busy
-PATIENCE_SECONDS = 60.0  # for one round trip
+PAUSE_SECONDS = 0.002  # between two round trips, so that the probe itself is no load
+TIMEOUT_SECONDS = 60.0  # for one round trip
 
 
 def round_trips(client: LoadClient) -> Iterator[float]:
-    """Seconds of one round trip after the other. Raises LoadError when one never ends."""
+    """The seconds of each round trip. Raises LoadError when one times out."""
     topic = f"bench/probe/{os.getpid()}"
     packet = publish_packet(topic, bytes(64))
     client.subscribe(topic, 0)
-    client.socket.settimeout(PATIENCE_SECONDS)
+    client.socket.settimeout(TIMEOUT_SECONDS)
     while True:
         began = time.perf_counter()
         client.write(packet)
         try:
             client.expect(packet[0], len(packet))
         except TimeoutError:
-            raise LoadError(f"no answer within {PATIENCE_SECONDS:g} s") from None
+            raise LoadError(f"no answer within {TIMEOUT_SECONDS:g} s") from None
         yield time.perf_counter() - began
 
 
 def watch(client: LoadClient) -> None:
-    """Make round trips, and tell of them when asked, until the input ends."""
+    """Make round trips, and report them for each line of input, until it ends."""
     samples: list[tuple[float, int]] = []
     trips = round_trips(client)
-    next(trips)  # the first is not like the others
+    next(trips)  # the first is slower than the others
     print_answer({"ready": True})
     while True:
         samples.append((next(trips), 1))
@@ -58,7 +58,7 @@ def watch(client: LoadClient) -> None:
 
 
 def print_answer(answer: dict[str, object]) -> None:
-    """Print a line for the process that asks."""
+    """Print an answer for the process at the other end of the pipe, as a line of JSON."""
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
 
@@ -69,11 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="python -m appliance.bench.probe", description="Time an MQTT client's round trips."
     )
     LoadTarget.add_options(parser)
-    gc.disable()  # its pauses would be taken for the broker's
+    gc.disable()  # its pauses would be counted as the broker's
     try:
         target = LoadTarget.of(parser.parse_args(arguments))
         with closing(LoadClient(target, f"bench-probe-{os.getpid()}")) as client:
-            client.connected()
+            client.wait_connected()
             watch(client)
     except (LoadError, OSError) as error:
         sys.stderr.write(f"probe: {error}\n")

@@ -1,4 +1,4 @@
-"""What was measured: a table for people, JSON for machines."""
+"""Reports measurements: as tables for people, as JSON for machines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEADINGS = {
     "beside_us": "p99 µs of another client",
     "memory_kib": "KiB",
 }
-WIDTH_ELSEWHERE = 200  # of a file or a pipe, which wraps nothing
+WIDTH_ELSEWHERE = 200  # where the output is no terminal: lines are not wrapped
 LIMITS_NOTE = (
     "Limits of this broker that mosquitto has not, or does not meet here, were raised out of reach "
     f"(broker.limits: {', '.join(LIMITS)})."
@@ -94,14 +94,14 @@ def to_json(
 
 
 def number(value: float | None) -> str:
-    """With as many digits as say something."""
+    """A number with a sensible count of digits."""
     if value is None:
         return ""
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
 
 
 def table(rows: Sequence[Row], peer: str | None) -> Table:
-    """One line a figure: ours, the peer's, the ratio, the goal. CPU time, the steadiest, first."""
+    """One line a figure: ours, the peer's, the ratio, the goal. CPU time first: it varies least."""
     result = Table(title=f"appliance and {peer}" if peer else "appliance")
     result.add_column("cell")
     result.add_column("figure")
@@ -140,7 +140,7 @@ def table(rows: Sequence[Row], peer: str | None) -> Table:
 
 
 def growth_table(rows: Sequence[GrowthRow], peer: str | None) -> Table:
-    """One line a statement: ours, the peer's, the most that it may be, and whether ours is."""
+    """One line a statement: ours, the peer's, the goal, and whether ours has reached it."""
     result = Table(title="what must not grow, and how long others wait")
     result.add_column("")
     result.add_column("appliance", justify="right")
@@ -175,21 +175,21 @@ def growth_figure(statement: Statement, figures: Figures | None) -> str:
 
 
 def reached(verdict: bool | None) -> str:
-    """Whether a statement's goal is."""
+    """Whether a statement's goal is reached, in words."""
     if verdict is None:
         return ""
     return "[green]reached[/green]" if verdict else "[red]not reached[/red]"
 
 
 def verdict(ratio: float | None, goal: float | None) -> str:
-    """Whether a goal is met."""
+    """Whether a goal is met, in words."""
     if ratio is None or goal is None:
         return ""
     return "[green]met[/green]" if ratio >= goal else "[red]not met[/red]"
 
 
 def show(rows: Sequence[Row], grown: Sequence[GrowthRow], peer: str | None) -> None:
-    """The tables: on a terminal in its width, elsewhere as Markdown without colours."""
+    """Print the tables: on a terminal in its width, elsewhere as Markdown without colours."""
     console = Console()
     tables = [table(rows, peer)] if rows else []
     tables += [growth_table(grown, peer)] if grown else []

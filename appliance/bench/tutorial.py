@@ -1,7 +1,7 @@
 """The classic tutorial node: rclpy and paho-mqtt, copying `std_msgs/String` both ways.
 
-It is what a user would put together without an appliance, and is written as tutorials write it: the
-default executor, typed messages, one callback a direction. The benchmark runs it beside mosquitto.
+It is what a user would write without an appliance, in the way of tutorials: the default executor,
+typed messages, one callback a direction. The benchmark runs it beside mosquitto.
 """
 
 from __future__ import annotations
