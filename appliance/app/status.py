@@ -310,11 +310,11 @@ class Status:
             yield f"the last reload took nothing over: {report['reload']['text']}"
 
 
-def _endings(settings: Settings) -> list[certs.Ending]:
+def _endings(settings: Settings) -> list[certs.Expiry]:
     if not any(listener.tls for listener in settings.broker.listeners):
         return []
     try:
-        return certs.endings(tls_files(settings.broker))
+        return certs.expiries(tls_files(settings.broker))
     except certs.CertificateError:  # the loaded ones stay in use; the next reload reports it
         return []
 

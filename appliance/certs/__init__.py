@@ -26,7 +26,7 @@ from appliance.certs.contexts import (
 from appliance.certs.export import check_password, write_bundle, write_pkcs12
 from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
 from appliance.certs.identity import username_of
-from appliance.certs.listing import Ending, ListedCertificate, endings, listed
+from appliance.certs.listing import Expiry, ListedCertificate, expiries, list_certificates
 from appliance.certs.registry import Issued
 from appliance.certs.renewal import keep_server_certificate, server_outside, server_revoked
 from appliance.certs.requests import REQUEST_SIZE
@@ -36,7 +36,7 @@ __all__ = [
     "Address",
     "CertificateError",
     "ClientCertificates",
-    "Ending",
+    "Expiry",
     "Issued",
     "ListedCertificate",
     "LoadedTls",
@@ -45,13 +45,13 @@ __all__ = [
     "TlsPolicy",
     "check_password",
     "create_authority",
-    "endings",
+    "expiries",
     "issue_client",
     "issue_server",
     "issued",
     "issued_by",
     "keep_server_certificate",
-    "listed",
+    "list_certificates",
     "load_certificates",
     "load_key",
     "load_tls",

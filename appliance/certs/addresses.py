@@ -20,12 +20,12 @@ _IFA_F_TEMPORARY: Final = 0x01  # linux/if_addr.h
 
 
 def local_names() -> tuple[list[str], list[Address]]:
-    """What a certificate of this computer is for.
+    """The names and addresses that go into a certificate of this computer.
 
     The names are the host's, the one that the resolver has for it (waiting at most 3 s), the
-    multicast DNS name and `localhost`; the addresses those of all interfaces except link-local
-    IPv6, which is of no use without the name of the client's interface, and temporary IPv6, which
-    is another one every day and nobody dials.
+    multicast DNS name and `localhost`. The addresses are those of all interfaces, except link-local
+    IPv6, which clients cannot use without the name of their interface, and temporary IPv6, which
+    changes every day and which nobody dials.
     """
     hostname = socket.gethostname()
     short = hostname.partition(".")[0]
@@ -43,9 +43,9 @@ def local_names() -> tuple[list[str], list[Address]]:
 
 
 def _full_name(hostname: str) -> str:
-    """The fully qualified name; `hostname` when DNS does not answer soon, as in a field."""
+    """The fully qualified name; `hostname` when DNS does not answer in time, as in a field."""
     found = [hostname]
-    # getfqdn() has no timeout of its own, and a daemon thread keeps nothing from ending.
+    # getfqdn() has no timeout, and a daemon thread does not delay the end of the process.
     thread = threading.Thread(target=lambda: found.append(socket.getfqdn(hostname)), daemon=True)
     thread.start()
     thread.join(_RESOLVER_PATIENCE)
@@ -53,7 +53,7 @@ def _full_name(hostname: str) -> str:
 
 
 def _temporary() -> set[Address]:
-    """The addresses of RFC 8981, where the kernel tells: Linux."""
+    """The temporary addresses (RFC 8981), which only Linux lists."""
     try:
         lines = Path("/proc/net/if_inet6").read_text().splitlines()
     except OSError:

@@ -1,8 +1,8 @@
-"""The appliance's own certificate authority: what it issues, renews and revokes.
+"""The appliance's own certificate authority (CA): issues, renews and revokes certificates.
 
-Keys are on the curve P-256, which every TLS stack has, those of microcontrollers included.
-Certificates and revocation lists follow RFC 5280. A key that exists is not replaced, only certified
-again, unless a certificate of it was revoked.
+Keys are on the curve P-256, which every TLS stack supports, including those of microcontrollers.
+Certificates and revocation lists follow RFC 5280. An existing key is certified again and not
+replaced, unless a certificate of it was revoked.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ from appliance.host.owners import acting_as_caller
 log = logging.getLogger("appliance.certs")
 
 AUTHORITY_VALID: Final = timedelta(days=3650)
-# The longest that Apple's systems accept from a private authority. Shorter would not be safer, as
-# the authority's key is on the same computer, and a robot in the field must not fall silent.
+# The longest validity that Apple's systems accept from a private CA. A shorter one would not be
+# safer, because the CA's key is on the same computer, and would cut off a robot in the field.
 CERTIFICATE_VALID: Final = timedelta(days=825)
-# Clients whose clock is behind, and time zones taken for UTC.
+# For clients whose clock is behind, or is set to local time as UTC.
 _BACKDATED: Final = timedelta(days=1)
 
 _MAX_COMMON_NAME: Final = 64  # RFC 5280, appendix A: ub-common-name
 _FILE_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
-#: What `renew` knows by these names is not a client.
+#: Names that are no client's for `renew`.
 _RESERVED: Final = ("server", "all", "ca")
 _SERIAL: Final = re.compile(r"(?:0x)?((?:[0-9A-Fa-f]{2}:?){8,20})")
 
@@ -70,10 +70,10 @@ def create_authority(
     names: Sequence[str] = (),
     addresses: Sequence[Address] = (),
 ) -> None:
-    """Makes `ca.crt` and `ca.key`. `name`, by default the host's, is for people who look at it.
+    """Make `ca.crt` and `ca.key`. `name`, by default the host's, is shown to people.
 
-    It may sign for private names and addresses, and for these, see `constraints`.
-    CertificateError when either file is there.
+    The CA may sign for private names and addresses, and for those given, see `constraints`.
+    CertificateError when either file exists.
     """
     certificate_file, key_file = directory / "ca.crt", directory / "ca.key"
     for path in (certificate_file, key_file):
@@ -84,7 +84,7 @@ def create_authority(
     now = _now()
     key = ec.generate_private_key(ec.SECP256R1())
     identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
-    # Two authorities must not have one name, or clients that have both get confused.
+    # Clients confuse two CAs of the same name, so the name has a part of the key's identifier.
     suffix = f" CA {identifier.digest[:4].hex()}"
     common_name = (name or socket.gethostname())[: _MAX_COMMON_NAME - len(suffix)] + suffix
     subject = _name(common_name)
@@ -110,11 +110,11 @@ def issue_server(
     addresses: Sequence[Address],
     ca_key: Path | None = None,
 ) -> None:
-    """Makes `server.crt` for these DNS names and addresses, and `server.key` if it is not there.
+    """Make `server.crt` for these DNS names and addresses, and `server.key` if it does not exist.
 
-    A `server.crt` of this authority is replaced, so this is how one is renewed. `ca_key` is where
-    the authority's key is, if not beside its certificate. CertificateError when the authority is
-    missing or unfit, or the certificate that is there is someone else's.
+    An existing `server.crt` of this CA is replaced, and so renewed. `ca_key` is the path of the
+    CA's key, if that is not beside its certificate. CertificateError when the CA is missing or
+    unusable, or the existing certificate is of another CA.
     """
     alternatives: list[x509.GeneralName] = []
     for name in dict.fromkeys(names):
@@ -139,7 +139,7 @@ def issue_server(
 
 
 def may_not_sign(directory: Path, subjects: Sequence[str]) -> str:
-    """What to say of names and addresses that are outside of the authority's constraints."""
+    """The error text for names and addresses outside of the CA's constraints."""
     return (
         f"{directory / 'ca.crt'} may sign for private names and addresses, and those that this "
         f"computer had when it was made; not for {', '.join(subjects)}. For these make a new "
@@ -149,10 +149,10 @@ def may_not_sign(directory: Path, subjects: Sequence[str]) -> str:
 
 
 def issue_client(directory: Path, name: str, ca_key: Path | None = None) -> None:
-    """Makes `clients/NAME.crt`, whose common name is `name`, and its key if it is not there.
+    """Make `clients/NAME.crt` with the common name `name`, and its key if that does not exist.
 
-    After a revocation the key is a new one. CertificateError as for `issue_server`, and when
-    `name` cannot be a file's name.
+    After a revocation the key is a new one. CertificateError as for `issue_server`, and when `name`
+    is no valid file name.
     """
     check_client_name(name)
     path = directory / "clients" / name
@@ -164,11 +164,12 @@ def issue_client(directory: Path, name: str, ca_key: Path | None = None) -> None
 def sign(
     directory: Path, request: bytes, name: str | None = None, ca_key: Path | None = None
 ) -> Path:
-    """Makes `clients/NAME.crt` of a request (PKCS #10, PEM or DER) made where the key is.
+    """Make `clients/NAME.crt` from a request (PKCS #10, PEM or DER) that was made with the key.
 
-    Of the request only the key is taken over, and its common name unless `name` is given. Returns
-    the certificate's path. CertificateError when the request is malformed, its signature is wrong
-    or its key unfit, or there is a certificate of another key under this name.
+    The certificate has the request's key, and its common name unless `name` is given; everything
+    else in the request is ignored. Returns the certificate's path. CertificateError when the
+    request is malformed, its signature is wrong or its key unsuitable, or when there is a
+    certificate of another key under this name.
     """
     wanted = load_request(request)
     name = wanted.name if name is None else name
@@ -183,10 +184,10 @@ def sign(
 
 
 def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
-    """Makes `server.crt`, or `clients/NAME.crt`, anew for the same key and names.
+    """Renew `server.crt` or `clients/NAME.crt`, with the same key and names.
 
-    A server's that was revoked gets a new key. CertificateError when it is not there, is a client's
-    that was revoked, or is someone else's.
+    A revoked server certificate gets a new key. CertificateError when the certificate does not
+    exist, is a client's that was revoked, or is of another CA.
     """
     if name == "server":
         path = directory / "server"
@@ -208,10 +209,10 @@ def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
 
 
 def revoke(directory: Path, what: str, ca_key: Path | None = None) -> list[Issued]:
-    """Revokes what a name, a serial number or a certificate's file stands for, and writes `ca.crl`.
+    """Revoke by a name, a serial number or a certificate's file, and write `ca.crl`.
 
-    A name stands for all certificates of the client that have not expired: renewing leaves the one
-    before valid. Returns those that were revoked now. CertificateError when nothing is.
+    A name stands for all certificates of the client that have not expired, because a renewed
+    certificate stays valid. Returns those that were revoked now. CertificateError when none is.
     """
     with _opened(directory, ca_key) as authority:
         chosen = authority.find(what)
@@ -220,7 +221,7 @@ def revoke(directory: Path, what: str, ca_key: Path | None = None) -> list[Issue
             raise CertificateError(f"{what} was revoked on {chosen[0].revoked:%Y-%m-%d} already")
         now = _now()
         revoked = [dataclasses.replace(entry, revoked=now) for entry in fresh]
-        # First what takes effect: when the rest fails, the command can be given again.
+        # The CRL first, because it takes effect; if the rest fails, the command can be repeated.
         authority.write_crl([*authority.entries, *revoked])
         serials = {entry.serial: entry for entry in revoked}
         known = [serials.pop(entry.serial, entry) for entry in authority.entries]
@@ -229,22 +230,22 @@ def revoke(directory: Path, what: str, ca_key: Path | None = None) -> list[Issue
 
 
 def write_crl(directory: Path, ca_key: Path | None = None) -> int:
-    """Makes `ca.crl` anew, an empty one if need be; returns how many certificates it revokes."""
+    """Write `ca.crl` anew, even if it is empty; returns how many certificates it revokes."""
     with _opened(directory, ca_key) as authority:
         return authority.write_crl(authority.entries)
 
 
 def issued(directory: Path) -> list[Issued]:
-    """All certificates of the authority that is there now, the oldest first.
+    """All certificates of the present CA, the oldest first.
 
-    Those of before there was a list of them are found by their files.
+    Certificates from before there was a register are found by their files.
     """
     certificate = load_certificates(directory / "ca.crt")[0]
     return _entries(directory, certificate)
 
 
 def write_readme(directory: Path) -> None:
-    """Writes `README.md`: what each file is, who may have it, how clients get `ca.crt`."""
+    """Write `README.md`: what each file is, who may have it, how clients get `ca.crt`."""
     readme.write_readme(directory, CERTIFICATE_VALID)
 
 
@@ -267,7 +268,7 @@ def common_name(certificate: x509.Certificate) -> str | None:
 
 @dataclass(frozen=True)
 class _Authority:
-    """The authority with its key, while nobody else changes the directory."""
+    """The CA with its key, while the directory is locked."""
 
     directory: Path
     certificate: x509.Certificate
@@ -282,7 +283,7 @@ class _Authority:
         alternatives: x509.SubjectAlternativeName | None = None,
         key: CertificatePublicKeyTypes | None = None,
     ) -> None:
-        """Make `path`.crt for this public key, or for that of `path`.key, made if need be."""
+        """Make `path`.crt for this public key, or for that of `path`.key, made if needed."""
         certificate_file = path.with_name(f"{path.name}.crt")
         key_file = path.with_name(f"{path.name}.key")
         if certificate_file.exists():
@@ -310,9 +311,9 @@ class _Authority:
         certificate = self._sign(key, common_name, kind, alternatives)
         if new is not None:
             write_key(key_file, new, replace=True)
-        for made_of_it in (".p12", ".pem"):  # of the certificate before
-            path.with_name(path.name + made_of_it).unlink(missing_ok=True)
-        # The list first: what is in nobody's list cannot be revoked by its name.
+        for suffix in (".p12", ".pem"):  # exports of the previous certificate
+            path.with_name(path.name + suffix).unlink(missing_ok=True)
+        # The register first: a certificate that is not in it could not be revoked by its name.
         entry = registry.record(certificate, self.certificate, path.name, kind)
         self.save([*self.entries, entry])
         write_certificate(certificate_file, certificate)
@@ -327,7 +328,7 @@ class _Authority:
         )
 
     def _own_key(self, file: Path) -> ec.EllipticCurvePrivateKey | None:
-        """The key of that file; None when it is to be a new one."""
+        """The key of that file; None when a new one is needed."""
         if not file.exists():
             return None
         key = load_key(file)
@@ -336,7 +337,7 @@ class _Authority:
         return None if self.is_compromised(key.public_key()) else key
 
     def is_compromised(self, key: CertificatePublicKeyTypes) -> bool:
-        """Whether a certificate of this key was revoked: who has that device has the key."""
+        """Whether a certificate of this key was revoked: a thief of the device has the key."""
         revoked = {entry.key for entry in self.entries if entry.revoked is not None}
         return fingerprint(key) in revoked
 
@@ -370,16 +371,16 @@ class _Authority:
         return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier)
 
     def save(self, entries: Sequence[Issued]) -> None:
-        """Write the list, with what is in it of authorities before this one."""
+        """Write the register, and keep its entries of earlier CAs."""
         own = fingerprint(self.certificate.public_key())
         others = [entry for entry in registry.load(self.directory) if entry.authority != own]
         registry.save(self.directory, [*others, *entries])
 
     def write_crl(self, entries: Sequence[Issued]) -> int:
-        """Make `ca.crl` of these and what is in the one that is there."""
+        """Write `ca.crl` with these entries and those of the existing list."""
         path = self.directory / "ca.crl"
         now = _now()
-        number = int(now.timestamp())  # grows also when the file was lost
+        number = int(now.timestamp())  # increases even if the file was lost
         dates: dict[int, datetime] = {}
         if path.exists():
             for before in parse_crls(path, read(path, CRL_SIZE), [self.certificate]):
@@ -392,8 +393,7 @@ class _Authority:
             x509.CertificateRevocationListBuilder()
             .issuer_name(self.certificate.subject)
             .last_update(now)
-            # Nobody is there in the field to make a new one, and it is made anew when there is
-            # something to be said.
+            # In the field nobody renews the list, and a revocation writes it anew in any case.
             .next_update(self.certificate.not_valid_after_utc)
             .add_extension(x509.CRLNumber(number), critical=False)
             .add_extension(self._key_identifier(), critical=False)
@@ -407,7 +407,7 @@ class _Authority:
         return len(dates)
 
     def find(self, what: str) -> list[Issued]:
-        """The certificates that a name, a file or a serial number stands for, one at least."""
+        """The certificates that a name, a file or a serial number stands for, at least one."""
         now = _now()
         found = [e for e in self.entries if e.name == what and (e.expires > now or e.revoked)]
         if found:
@@ -433,7 +433,7 @@ class _Authority:
 
 @contextlib.contextmanager
 def _opened(directory: Path, ca_key: Path | None) -> Iterator[_Authority]:
-    """The authority, to be used by one at a time."""
+    """The CA with its key; the directory is locked meanwhile."""
     certificate_file = directory / "ca.crt"
     key_file = ca_key or directory / "ca.key"
     certificate = load_certificates(certificate_file)[0]
@@ -463,7 +463,7 @@ def _entries(directory: Path, authority: x509.Certificate) -> list[Issued]:
     entries = [entry for entry in registry.load(directory) if entry.authority == own]
     known = {entry.serial for entry in entries}
     for file in (directory / "server.crt", *sorted((directory / "clients").glob("*.crt"))):
-        with contextlib.suppress(CertificateError):  # what is no certificate is not ours
+        with contextlib.suppress(CertificateError):  # a file that is no certificate is not ours
             certificate = load_certificates(file)[0]
             if certificate.serial_number not in known and issued_by(certificate, authority):
                 kind: Kind = "server" if file.parent == directory else "client"
@@ -517,19 +517,19 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
 
 
 def _now() -> datetime:
-    """The time that certificates are made by; see `usable_time`."""
+    """The time for new certificates; see `usable_time`."""
     now = usable_time().replace(microsecond=0)
     clock = datetime.now(timezone.utc)
     if clock < now:
-        _tell_unset(f"{clock:%Y-%m-%d}", f"{now:%Y-%m-%d}")
+        _warn_of_unset_clock(f"{clock:%Y-%m-%d}", f"{now:%Y-%m-%d}")
     return now
 
 
 @functools.cache
-def _tell_unset(clock: str, now: str) -> None:
+def _warn_of_unset_clock(clock: str, now: str) -> None:
     log.warning(
         "this computer's clock says %s, which is before this program was made: certificates are "
-        "made and looked at as if it were %s",
+        "made and checked as if it were %s",
         clock,
         now,
     )

@@ -1,4 +1,4 @@
-"""By whom a client's certificate is: the chain from it up to an authority that is trusted."""
+"""Certificate chains: from a client's certificate up to an authority that is trusted."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from cryptography import x509
 
 from appliance.certs.files import issued_by
 
-#: Authorities between a client and a trusted one that are remembered, and how many may follow each
-#: other. Clients send them; each was verified, so a stranger adds none.
+#: Intermediate CAs that are cached, and the most in one chain. Clients send them, and each was
+#: verified, so that a stranger cannot fill the cache.
 KNOWN: Final = 256
 LONGEST: Final = 8
 
 
 class Chains:
-    """The chains of connections, also of those that resume a TLS session.
+    """Finds the chain of each connection, including those that resume a TLS session.
 
-    Such a session brings back the client's own certificate and nothing of what stands behind it,
-    and OpenSSL verifies nothing anew. But it was begun here, with these authorities: session
-    tickets do not outlive the context that has made them.
+    A resumed session has only the client's own certificate, without its chain, and OpenSSL verifies
+    nothing again. But the session began here, with these authorities: session tickets do not
+    outlive the context that has issued them.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Chains:
         certificate: x509.Certificate,
         authorities: Sequence[x509.Certificate],
     ) -> list[x509.Certificate]:
-        """The client's certificate, then who signed each; the certificate alone when that is not
+        """The client's certificate and the signer of each; the certificate alone when these are not
         known. The last one is trusted, or was when the connection was made."""
         verified = _verified(tls)
         if verified:
@@ -60,7 +60,7 @@ def is_anchored(chain: Sequence[x509.Certificate], authorities: Sequence[x509.Ce
 
 
 def _verified(tls: ssl.SSLObject) -> list[bytes]:
-    """What OpenSSL has verified, in DER, the client's own first; empty in a resumed session."""
+    """The chain that OpenSSL has verified, in DER; empty in a resumed session."""
     public: Any = getattr(tls, "get_verified_chain", None)  # from Python 3.13 on
     if public is not None:
         return list(public())
@@ -74,7 +74,7 @@ def _search(
     authorities: Sequence[x509.Certificate],
     left: int = LONGEST,
 ) -> list[x509.Certificate]:
-    """The chain by its signatures; the certificate alone when it leads nowhere."""
+    """The chain by signatures; the certificate alone when none leads to an authority."""
     if certificate in authorities or not left:
         return [certificate]
     for issuer in candidates:

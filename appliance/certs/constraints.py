@@ -1,12 +1,12 @@
-"""For which names and addresses our own authority may sign (RFC 5280, section 4.2.1.10).
+"""Name constraints: for which names and addresses our own CA may sign (RFC 5280, 4.2.1.10).
 
-People install it in their phones and browsers. Without constraints whoever gets hold of its key
-could pose as every site of the world; with them, as machines of private networks only, and under
-the names that this computer had when the authority was made.
+People install the CA in their phones and browsers. Without constraints, whoever steals its key
+could pose as every site of the world. With them, only as machines of private networks, and as the
+names that this computer had when the CA was made.
 
-The extension is not marked critical, as the standard wants it: stacks of microcontrollers (mbedTLS)
-do not know it and would refuse the certificate, while those that do know it (OpenSSL, GnuTLS, Go,
-Chromium, Firefox, Apple's) obey it all the same.
+The standard wants the extension marked critical. It is not, because TLS stacks of microcontrollers
+(mbedTLS) do not know it and would refuse the certificate. Those that know it (OpenSSL, GnuTLS, Go,
+Chromium, Firefox, Apple's) obey it in any case.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from cryptography import x509
 
 from appliance.certs.addresses import Address
 
-#: Names that are nobody's in the world's DNS: RFC 6761, 6762 and 8375, ICANN's decision of 2024;
-#: `lan` is what home routers call their network.
+#: Names that nobody owns in the public DNS: RFC 6761, 6762 and 8375, and ICANN's decision of 2024.
+#: `lan` is the name that home routers give to their network.
 PRIVATE_NAMES: Final = ("localhost", "local", "home.arpa", "internal", "lan")
 
 #: Loopback, link-local, private (RFC 1918, 4193) and shared addresses (RFC 6598: VPNs).
@@ -41,13 +41,13 @@ PRIVATE_NETWORKS: Final = tuple(
     )
 )
 
-# A subject of these characters with a dot in it is to OpenSSL a DNS name, when there is no other.
+# OpenSSL takes a common name like this for a DNS name when the certificate has no other name.
 _LIKE_DNS: Final = re.compile(r"[A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)+")
 
 
 def constraints(names: Iterable[str], addresses: Iterable[Address]) -> x509.NameConstraints:
-    """Private names and networks, these names and what is below them, and these addresses; of a
-    public IPv6 address its network of 64 bits, in which a computer has several."""
+    """Constraints that permit private names and networks, and these names, their subdomains and
+    these addresses. A public IPv6 address permits its /64, in which a computer has several."""
     dns = dict.fromkeys([*PRIVATE_NAMES, *(name.lower().rstrip(".") for name in names)])
     found: list[IPv4Network | IPv6Network] = list(PRIVATE_NETWORKS)
     for address in addresses:
@@ -60,7 +60,7 @@ def constraints(names: Iterable[str], addresses: Iterable[Address]) -> x509.Name
 
 
 def outside(authority: x509.Certificate, subjects: Sequence[str | Address]) -> list[str]:
-    """Those of the names and addresses for which the authority may not sign."""
+    """The names and addresses for which the authority may not sign."""
     try:
         found = authority.extensions.get_extension_for_class(x509.NameConstraints).value
     except x509.ExtensionNotFound:
@@ -83,5 +83,5 @@ def outside(authority: x509.Certificate, subjects: Sequence[str | Address]) -> l
 
 
 def misleading(authority: x509.Certificate, common_name: str) -> bool:
-    """Whether TLS stacks take a client's name for a DNS name that the authority may not sign."""
+    """Whether TLS stacks take a client's name for a DNS name for which the CA may not sign."""
     return bool(_LIKE_DNS.fullmatch(common_name) and outside(authority, [common_name]))

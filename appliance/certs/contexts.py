@@ -1,4 +1,4 @@
-"""TLS of the listeners, made of files, and replaceable while they listen."""
+"""The listeners' TLS contexts, made from files and replaced while the listeners are open."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ log = logging.getLogger("appliance.certs")
 ClientCertificates = Literal["off", "optional", "required"]
 TlsVersion = Literal["1.2", "1.3"]
 
-#: Before its end a certificate is told of, and ours renewed.
+#: How long before its expiry a certificate is warned of, and one of ours is renewed.
 EXPIRES_SOON: Final = timedelta(days=30)
 
 # Ephemeral keys and authenticated encryption only. TLS 1.3 has nothing else.
@@ -51,9 +51,9 @@ _VERSIONS: Final = {"1.2": ssl.TLSVersion.TLSv1_2, "1.3": ssl.TLSVersion.TLSv1_3
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """Where things are: `broker.tls` in appliance.yaml.
+    """The paths in `broker.tls` of appliance.yaml.
 
-    Without `crl` it is `ca.crl` beside `ca`, if there is one.
+    Without `crl` the revocation list is `ca.crl` beside `ca`, if that exists.
     """
 
     certificate: Path
@@ -63,16 +63,16 @@ class TlsFiles:
 
     @property
     def revocations(self) -> Path | None:
-        """The revocation list's file, which may not be there."""
+        """The file of the revocation list, which may not exist."""
         return self.crl or (self.ca and self.ca.with_name("ca.crl"))
 
 
 @dataclass(frozen=True, slots=True)
 class TlsPolicy:
-    """What one listener asks of a connection; `ciphers` of TLS 1.2, in OpenSSL's words.
+    """What one listener requires of a connection; `ciphers` are for TLS 1.2, as OpenSSL names them.
 
-    With `client_certificates` "optional" a client that shows a certificate is refused unless the
-    CA issued it, with "required" also one that shows none.
+    With `client_certificates` "optional" a client that sends a certificate is refused unless the CA
+    issued it; with "required" a client that sends none is refused as well.
     """
 
     client_certificates: ClientCertificates = "off"
@@ -82,7 +82,7 @@ class TlsPolicy:
 
 @dataclass(frozen=True)
 class LoadedTls:
-    """Everything as it was read, and fits together."""
+    """Everything that was read from the files, after all of it was found to be valid."""
 
     files: TlsFiles
     policies: Mapping[str, TlsPolicy]
@@ -92,42 +92,42 @@ class LoadedTls:
     authorities: list[x509.Certificate]
     revocations: Revocations
     contexts: Mapping[str, ssl.SSLContext]
-    #: The same for as long as the computer's clock is not set, or a revocation list is out of its
-    #: time: they do not look at times.
+    #: Contexts that do not check dates, for while the computer's clock is not set or a revocation
+    #: list is outdated.
     undated: Mapping[str, ssl.SSLContext]
-    #: Counts those that were in force one after the other.
+    #: Increases by one each time that the files are read anew.
     generation: int
 
     def warnings(self, now: datetime | None = None) -> list[str]:
-        """What has run out or does soon, each with what to do."""
+        """What has expired or will soon, each with what to do."""
         return list(_warnings(self, now or datetime.now(timezone.utc)))
 
-    def believable(self, now: datetime) -> datetime:
-        """That time, or the earliest that it can be: that of this program's release, and of the
-        making of the server's certificate."""
+    def plausible(self, now: datetime) -> datetime:
+        """The clock's time, or the earliest that it can be: this program was released and the
+        server's certificate was made before."""
         return max(now, RELEASED, self.chain[0].not_valid_before_utc)
 
     def context(self, listener: str, now: datetime) -> ssl.SSLContext:
-        """The settings of a listener for a connection that begins at that time."""
-        is_dated = self.believable(now) == now
-        if self.revocations.shown:
+        """The context of a listener for a connection that begins at that time."""
+        is_dated = self.plausible(now) == now
+        if self.revocations.for_openssl:
             is_dated = is_dated and self.revocations.is_fresh(now)
         return (self.contexts if is_dated else self.undated)[listener]
 
     def objection(self, chain: list[x509.Certificate], now: datetime) -> str:
-        """Why a client of that chain of certificates is not let in; empty when it is."""
+        """Why a client with that certificate chain is refused; empty when it is not."""
         client, *signers = chain
         who = f"its certificate {serial_text(client.serial_number)}"
         named = [(client, who), *((each, f"{who} is of {_name(each)}, which") for each in signers)]
-        believable = self.believable(now)
+        plausible = self.plausible(now)
         for certificate, what in named:
             date = self.revocations.date(certificate)
             start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
             if date is not None:
                 return f"{what} was revoked on {date:%Y-%m-%d}"
-            if believable > end:
+            if plausible > end:
                 return f"{what} expired on {end:%Y-%m-%d}"
-            if believable == now < start:
+            if plausible == now < start:
                 return f"{what} is not valid before {start:%Y-%m-%d %H:%M} UTC"
         if self.authorities and not is_anchored(chain, self.authorities):
             return f"{who} is of an authority that is trusted no longer"
@@ -135,10 +135,10 @@ class LoadedTls:
 
 
 class TlsContexts:
-    """TLS as the listeners use it now, by name of the listener.
+    """The TLS contexts that are in force now, by the name of the listener.
 
-    `prepare` may run in any thread, so that a long revocation list keeps nobody waiting; all else
-    is the event loop's.
+    `prepare` may run in any thread, so that a long revocation list does not block the event loop;
+    everything else runs on the event loop.
     """
 
     def __init__(
@@ -147,15 +147,16 @@ class TlsContexts:
         policies: Mapping[str, TlsPolicy],
         username_from: UsernameFrom = "none",
     ) -> None:
-        """Reads the files; CertificateError has all that is wrong with them.
+        """Read the files. CertificateError lists everything that is wrong with them.
 
-        A certificate that is out of its time is used all the same, see `warnings`: a robot whose
-        clock is not set yet, or whose certificate has run out, can still be reached by those who
-        do not look at that, and on its other listeners.
+        An expired certificate is used nevertheless, see `warnings`: a robot whose clock is not set
+        yet, or whose certificate has expired, can still be reached by clients that do not check
+        dates, and on its other listeners.
         """
         self._loaded = _load(files, policies, username_from, None)
         self._chains = Chains()
-        self._told: set[x509.Certificate] = set()
+        #: Authorities that the log has warned of.
+        self._logged: set[x509.Certificate] = set()
 
     def prepare(
         self,
@@ -163,50 +164,50 @@ class TlsContexts:
         policies: Mapping[str, TlsPolicy] | None = None,
         username_from: UsernameFrom | None = None,
     ) -> LoadedTls:
-        """Read the files as they are now, for `take`; changes nothing. What is not given stays.
+        """Read the files as they are now, for `take`, with the present settings unless given.
 
-        CertificateError has all that is wrong. So is a server's certificate that was put here out
-        of its time, and that a revocation list has gone.
+        CertificateError lists everything that is wrong, including a new server's certificate that
+        is not valid now, and a revocation list that was deleted.
         """
         now = self._loaded
         username_from = username_from or now.username_from
         return _load(files or now.files, policies or now.policies, username_from, now)
 
     def take(self, loaded: LoadedTls) -> bool:
-        """Let it hold for all connections to come; returns whether it is something new.
+        """Use it for all new connections; returns whether it differs from what was in force.
 
-        Those that are open are looked at with `refusal`. CertificateError when others were taken
-        after these were read: they may know of more revocations.
+        `refusal` decides on the open ones. CertificateError when others were taken since these were
+        read, as these may lack revocations.
         """
         if loaded is self._loaded:
             return False
         if loaded.generation != self._loaded.generation + 1:
-            raise CertificateError("certificates were replaced meanwhile; to be read once more")
+            raise CertificateError("certificates were replaced meanwhile; read them again")
         self._loaded = loaded
-        self._told.clear()
+        self._logged.clear()
         return True
 
     def reload(self) -> bool:
-        """Take over the files as they are now, all or nothing; see `prepare` and `take`."""
+        """Use the files as they are now, all of them or none; see `prepare` and `take`."""
         return self.take(self.prepare())
 
     def context(self, listener: str) -> ssl.SSLContext:
-        """The settings for a connection that begins now.
+        """The context for a connection that begins now.
 
-        While the computer's clock is not set yet, a client's certificate is not refused for not
-        being valid before some time, and one that has run out is found by `refusal`.
+        While the computer's clock is not set, no client's certificate is refused for not being
+        valid yet; `refusal` finds those that have expired.
         """
         return self._loaded.context(listener, datetime.now(timezone.utc))
 
     def source(self, listener: str) -> functools.partial[ssl.SSLContext]:
-        """`context` of this listener, to be asked at each connection."""
+        """A function that returns the `context` of this listener, for each connection."""
         return functools.partial(self.context, listener)
 
     def refusal(self, tls: ssl.SSLObject) -> str:
-        """Why the client is not, or no longer, let in with its certificate; empty when it is.
+        """Why the client is refused with its certificate; empty when it is not.
 
-        Asked at each login, as in a resumed session OpenSSL looks at nothing, and while the client
-        is connected.
+        To be called at each login, because OpenSSL verifies nothing in a resumed session, and again
+        while the client is connected.
         """
         der = tls.getpeercert(binary_form=True)
         if not der:
@@ -219,17 +220,17 @@ class TlsContexts:
         except MALFORMED as error:
             return f"its certificate cannot be read: {error}"
         if not reason and loaded.revocations.dates:
-            self._tell_unlisted(chain[1:])
+            self._warn_of_unlisted(chain[1:])
         return reason
 
-    def _tell_unlisted(self, signers: list[x509.Certificate]) -> None:
-        """Tell, once, of authorities that clients have brought and nobody can revoke from."""
+    def _warn_of_unlisted(self, signers: list[x509.Certificate]) -> None:
+        """Warn once of each intermediate CA that a client has sent and that has no list."""
         loaded = self._loaded
         for signer in signers:
-            if signer in self._told or signer in loaded.authorities:
+            if signer in self._logged or signer in loaded.authorities:
                 continue
-            self._told.add(signer)
-            if len(self._told) <= KNOWN and not loaded.revocations.lists(signer):
+            self._logged.add(signer)
+            if len(self._logged) <= KNOWN and not loaded.revocations.lists(signer):
                 log.warning(
                     "a client's certificate is of %s, and there is no revocation list of it: whom "
                     "it revoked is not known; put its certificate into %s and its list into %s",
@@ -239,7 +240,7 @@ class TlsContexts:
                 )
 
     def username(self, tls: ssl.SSLObject) -> str | None:
-        """The user that the client's certificate names; None when that is not asked for.
+        """The user that the client's certificate names; None when certificates name no users.
 
         Raises:
             ValueError: it names none.
@@ -256,7 +257,7 @@ class TlsContexts:
             raise ValueError(str(error)) from None
 
     def warnings(self, now: datetime | None = None) -> list[str]:
-        """What has run out or does soon, each with what to do."""
+        """What has expired or will soon, each with what to do."""
         return self._loaded.warnings(now)
 
     @property
@@ -271,13 +272,13 @@ def server_context(
     ca: Path | None = None,
     client_certificates: ClientCertificates = "off",
 ) -> ssl.SSLContext:
-    """The TLS settings of one listener; CertificateError also when a certificate has expired."""
+    """The TLS context of one listener; CertificateError also when a certificate has expired."""
     loaded = load_tls(TlsFiles(certificate, key, ca), {"listener": TlsPolicy(client_certificates)})
     return loaded.contexts["listener"]
 
 
 def load_tls(files: TlsFiles, policies: Mapping[str, TlsPolicy]) -> LoadedTls:
-    """Read everything and look at it strictly; CertificateError has all that is wrong."""
+    """Read and check everything, including dates; CertificateError lists all that is wrong."""
     loaded = _load(files, policies, "none", None)
     problems = list(_out_of_time(loaded, usable_time()))
     if problems:
@@ -291,7 +292,7 @@ def _load(
     username_from: UsernameFrom,
     before: LoadedTls | None,
 ) -> LoadedTls:
-    """What is in the files; `before` itself when it is the same."""
+    """What is in the files; `before` itself when that has not changed."""
     problems: list[str] = []
     hashed = hashlib.sha256()
     chain: list[x509.Certificate] = []
@@ -320,8 +321,8 @@ def _load(
                 undated.verify_flags = ssl.VerifyFlags(undated.verify_flags | _NO_CHECK_TIME)
                 for context in (dated, undated) if readable else ():
                     _add_certificates(context, files, policy, authorities)
-                    if policy.client_certificates != "off" and revocations.shown:
-                        _show_lists(context, revocations.shown)
+                    if policy.client_certificates != "off" and revocations.for_openssl:
+                        _load_lists(context, revocations.for_openssl)
     if problems:
         raise CertificateError(*problems)
     contexts = {name: made[policy][0] for name, policy in policies.items()}
@@ -409,7 +410,7 @@ def _add_certificates(
     except ssl.SSLError as error:
         raise CertificateError(f"{files.certificate} cannot be used: {error.reason}") from error
     if policy.client_certificates != "off":
-        # A company's CA for clients may well be one below its root.
+        # A company's CA for clients is often an intermediate one.
         context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
         pem = b"".join(authority.public_bytes(Encoding.PEM) for authority in authorities)
         context.load_verify_locations(cadata=pem.decode())
@@ -417,9 +418,9 @@ def _add_certificates(
         context.verify_mode = ssl.CERT_REQUIRED if required else ssl.CERT_OPTIONAL
 
 
-def _show_lists(context: ssl.SSLContext, lists: bytes) -> None:
-    """Let OpenSSL refuse who was revoked, with the alert that says so (RFC 8446, section 6.2)."""
-    with tempfile.NamedTemporaryFile() as file:  # Python hands on lists in files only
+def _load_lists(context: ssl.SSLContext, lists: bytes) -> None:
+    """Let OpenSSL refuse revoked clients with the alert that says so (RFC 8446, section 6.2)."""
+    with tempfile.NamedTemporaryFile() as file:  # Python loads lists from files only
         file.write(lists)
         file.flush()
         context.load_verify_locations(cafile=file.name)

@@ -1,4 +1,4 @@
-"""A client's key and certificate in the forms that devices take."""
+"""Exports a client's key and certificate in the forms that devices import."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _ROUNDS: Final = 100_000
 
 
 def check_password(password: str) -> None:
-    """CertificateError when the password is none for a file that gets around."""
+    """CertificateError when the password is too short for a file that is copied around."""
     if len(password) < SHORTEST_PASSWORD:
         raise CertificateError(
-            f"a password of less than {SHORTEST_PASSWORD} characters is found by trying"
+            f"a password of less than {SHORTEST_PASSWORD} characters can be guessed"
         )
 
 
 def write_pkcs12(directory: Path, name: str, password: str) -> Path:
-    """Writes `clients/NAME.p12`: key, certificate and `ca.crt` (RFC 7292). Returns its path.
+    """Write `clients/NAME.p12`: key, certificate and `ca.crt` (RFC 7292). Returns its path.
 
     CertificateError when one of them is missing or unfit, or the password too short.
     """
     check_password(password)
     path, key = _key_of(directory, name)
     certificate = load_certificates(path.with_name(f"{name}.crt"))[0]
-    # Not AES, which is newer than many phones: iOS before 16, Android before 13 and Windows 10
-    # refuse it as a wrong password. The rounds make up for it, and the password.
+    # Not AES, which iOS before 16, Android before 13 and Windows 10 refuse as a wrong password. The
+    # number of rounds and the password's length make up for it.
     encryption = (
         PrivateFormat.PKCS12.encryption_builder()
         .kdf_rounds(_ROUNDS)
@@ -53,7 +53,7 @@ def write_pkcs12(directory: Path, name: str, password: str) -> Path:
 
 
 def write_bundle(directory: Path, name: str) -> Path:
-    """Writes `clients/NAME.pem`: key, certificate and `ca.crt` in one. Returns its path."""
+    """Write `clients/NAME.pem`: key, certificate and `ca.crt` in one. Returns its path."""
     path, key = _key_of(directory, name)
     files = (path.with_name(f"{name}.crt"), directory / "ca.crt")
     certificates = [certificate for file in files for certificate in load_certificates(file)]

@@ -24,8 +24,8 @@ from cryptography.hazmat.primitives.serialization import (
 
 from appliance.host.clock import RELEASED
 
-#: What the library raises over a certificate, a request or a list that is not as it should be; some
-#: of it only when a part of it is looked at.
+#: What the library raises for a malformed certificate, request or list, sometimes only when a part
+#: of it is accessed.
 MALFORMED: Final = (
     ValueError,
     TypeError,
@@ -42,7 +42,7 @@ KEY_SIZE: Final = 64 << 10
 
 
 class CertificateError(ValueError):
-    """Certificates or keys cannot be made or used; `problems` has all that is wrong.
+    """Certificates or keys cannot be made or used; `problems` lists all reasons.
 
     Each says where, why and what to do.
     """
@@ -76,7 +76,7 @@ def read(path: Path, limit: int = CERTIFICATES_SIZE, *, private: bool = False) -
 
 
 def unreadable(path: Path, error: OSError) -> CertificateError:
-    """What to say when a file cannot be read."""
+    """The error for a file that cannot be read."""
     if isinstance(error, FileNotFoundError):
         return CertificateError(f"there is no file {path}; `appliance init` makes what is missing")
     return CertificateError(
@@ -90,7 +90,7 @@ def load_certificates(path: Path) -> list[x509.Certificate]:
 
 
 def parse_certificates(path: Path, data: bytes) -> list[x509.Certificate]:
-    """The same of what was read from there."""
+    """All certificates in `data`, which was read from `path`; see `load_certificates`."""
     try:
         certificates = x509.load_pem_x509_certificates(data)
         for certificate in certificates:
@@ -126,8 +126,8 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
 def usable_time() -> datetime:
     """Now, or the time of this program's release while the computer's clock says less.
 
-    A computer without a battery for its clock starts in 1970, or with the age of its image. By that
-    clock it would make certificates that have run out when it is set.
+    A computer without a battery for its clock starts in 1970, or at the time of its image, and
+    would make certificates that have expired as soon as the clock is set.
     """
     return max(datetime.now(timezone.utc), RELEASED)
 
@@ -145,7 +145,7 @@ def out_of_time(path: Path, certificate: x509.Certificate, now: datetime) -> str
 
 
 def make_directory(directory: Path) -> None:
-    """Open to others, who need `ca.crt`; the keys in it are not."""
+    """Make the directory readable by others, who need `ca.crt`; the keys in it are not."""
     if directory.is_dir():
         return
     directory.mkdir(mode=0o755, parents=True, exist_ok=True)
@@ -162,12 +162,12 @@ def write_key(path: Path, key: ec.EllipticCurvePrivateKey, *, replace: bool = Fa
 
 
 def key_pem(key: PrivateKeyTypes) -> bytes:
-    """The key as it stands in its file."""
+    """The key in the form of its file."""
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def write_certificate(path: Path, certificate: x509.Certificate) -> None:
-    """Write a certificate, in place of the one that is there."""
+    """Write a certificate, replacing the one before."""
     write(path, certificate.public_bytes(Encoding.PEM), 0o644)
 
 
@@ -192,9 +192,9 @@ def write(path: Path, data: bytes, mode: int, *, replace: bool = True) -> None:
 
 
 def _hand_over(descriptor: int) -> None:
-    """What root makes belongs to whom the folder does: the service must read what is in its own."""
+    """Give what root makes to the folder's owner, so that the service can read it."""
     if os.geteuid() == 0:
-        # Not of the path that was asked for, which may have become a link to elsewhere meanwhile.
+        # The path may have become a link to elsewhere meanwhile, so ask the descriptor.
         with contextlib.suppress(FileNotFoundError):  # an image without /proc has no service yet
             folder = Path(f"/proc/self/fd/{descriptor}").readlink().parent.stat()
             os.fchown(descriptor, folder.st_uid, folder.st_gid)
@@ -211,7 +211,7 @@ def _sync_directory(directory: Path) -> None:
 
 @contextlib.contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Let nobody else who asks for this change the directory meanwhile: commands, and `run`."""
+    """Lock the directory against other commands, and the appliance itself, that change it."""
     try:
         descriptor = os.open(directory, os.O_RDONLY)
     except OSError as error:

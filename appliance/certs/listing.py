@@ -1,4 +1,4 @@
-"""What there is, for people who look at it."""
+"""Lists of certificates and of their expiry, for people."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _RANK: Final = {"authority": 0, "server": 1, "client": 2}
 
 @dataclass(frozen=True, slots=True)
 class ListedCertificate:
-    """One certificate; `replaced` is valid too, but there is a newer one of the same name.
+    """One certificate; one that was replaced is valid too, but there is a newer one of its name.
 
-    `file` is None when it is not here, or not the newest.
+    `file` is None when the certificate's file is not here, or has a newer certificate.
     """
 
     name: str
@@ -36,12 +36,12 @@ class ListedCertificate:
 
     @property
     def usable(self) -> bool:
-        """Whether it is the one to be used under its name."""
+        """Whether it is valid, and the newest of its name."""
         return self.state == "valid"
 
     @property
     def ends_soon(self) -> bool:
-        """Whether it is time to think of the next one."""
+        """Whether it expires within `EXPIRES_SOON`."""
         return self.usable and self.days < EXPIRES_SOON.days
 
     @property
@@ -50,7 +50,7 @@ class ListedCertificate:
         return serial_text(self.serial)
 
     def as_json(self) -> dict[str, object]:
-        """The same as plain values."""
+        """The certificate as plain values for JSON."""
         return {
             "name": self.name,
             "for": self.purpose,
@@ -64,8 +64,8 @@ class ListedCertificate:
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
-    """How long something of the listeners' TLS is good for, `days` less than 0 when it is not."""
+class Expiry:
+    """When something of the listeners' TLS expires; `days` is negative when it has."""
 
     what: Literal["server", "ca", "crl"]
     file: Path
@@ -74,13 +74,14 @@ class Ending:
 
     @property
     def is_soon(self) -> bool:
-        """Whether it is time to think of the next one."""
+        """Whether it expires within `EXPIRES_SOON`."""
         return self.days < EXPIRES_SOON.days
 
 
-def endings(files: TlsFiles) -> list[Ending]:
-    """When the server's certificate, the CA's and the revocation list run out, as far as they are
-    there. CertificateError when one cannot be read.
+def expiries(files: TlsFiles) -> list[Expiry]:
+    """When the server's certificate, the CA's and the revocation list expire, if they exist.
+
+    CertificateError when one cannot be read.
     """
     now = usable_time()
     found: list[tuple[Literal["server", "ca", "crl"], Path, datetime]] = []
@@ -93,10 +94,10 @@ def endings(files: TlsFiles) -> list[Ending]:
         if crl is not None and crl.exists():
             revocations = load_revocations(crl, read(crl, CRL_SIZE), authorities)
             found += (("crl", crl, end) for _, end in revocations.ends)
-    return [Ending(what, file, end, (end - now).days) for what, file, end in found]
+    return [Expiry(what, file, end, (end - now).days) for what, file, end in found]
 
 
-def listed(directory: Path) -> list[ListedCertificate]:
+def list_certificates(directory: Path) -> list[ListedCertificate]:
     """The authority, the server's certificates and the clients', by name, the newest first."""
     now = datetime.now(timezone.utc)
     path = directory / "ca.crt"

@@ -1,7 +1,7 @@
-"""What the appliance's authority has issued: `issued.jsonl`, an object a line.
+"""The register of issued certificates: `issued.jsonl`, one JSON object on each line.
 
-It outlives the files of a client, so that the certificate of a device that is lost can be revoked
-by its name, and knows the keys that must not be certified again.
+It outlives the files of a client, so that the certificate of a lost device can be revoked by its
+name. It also has the keys that must not be certified again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The server's own certificate, kept valid for this computer as it is."""
+"""Renews the server's certificate, so that it is valid for this computer's names and addresses."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from appliance.host.clock import is_unset
 
 log = logging.getLogger("appliance.certs")
 
-#: Names, and addresses, in one certificate. Those of before stay, as long as there is room: an
-#: interface that is down now comes up again.
+#: The most names, and the most addresses, in one certificate. Those of the certificate before stay
+#: while there is room, because an interface that is down now comes up again.
 _MOST: Final = 64
 
 
 def keep_server_certificate(files: TlsFiles) -> str:
-    """Renews the server's certificate if that is due; returns why it was, or nothing.
+    """Renew the server's certificate if that is due; returns the reason, or nothing.
 
-    It is 30 days before its end, when this computer has a name or an address that is not in it,
-    when it was made by a clock that was ahead, and, with a new key, when it was revoked. Only for
-    certificates that `appliance init` makes; another CA's are used as they are. May wait for the
-    resolver, see `local_names`.
+    It is due 30 days before its expiry, when this computer has a name or an address that is not in
+    it, when it was made while the clock was ahead, and, with a new key, when it was revoked. Only
+    certificates that `appliance init` makes are renewed; those of another CA are used as they are.
+    This may wait for the resolver, see `local_names`.
 
     Raises:
         CertificateError: it is due and cannot be done, or a file cannot be used.
@@ -46,7 +46,7 @@ def keep_server_certificate(files: TlsFiles) -> str:
     names, addresses = names[:_MOST], addresses[:_MOST]
     refused = outside(authority, [*names, *addresses])
     if refused:
-        _tell_outside(may_not_sign(directory, refused))
+        _warn_of_names_outside(may_not_sign(directory, refused))
         names = [name for name in names if name not in refused]
         addresses = [address for address in addresses if str(address) not in refused]
     old_names, old_addresses = _subjects(certificate)
@@ -71,7 +71,7 @@ def keep_server_certificate(files: TlsFiles) -> str:
 
 
 def server_outside(files: TlsFiles) -> str:
-    """What to say when the authority may not sign for all that this computer is called."""
+    """An error text if the CA may not sign for all names and addresses of this computer."""
     directory = files.certificate.parent
     if not _is_ours(files, directory):
         return ""
@@ -81,7 +81,7 @@ def server_outside(files: TlsFiles) -> str:
 
 
 def server_revoked(files: TlsFiles) -> str:
-    """What to say when the server's certificate, one of ours, was revoked; else empty."""
+    """An error text if the server's certificate is one of ours and was revoked; otherwise empty."""
     directory = files.certificate.parent
     if not _is_ours(files, directory):
         return ""
@@ -96,7 +96,7 @@ def server_revoked(files: TlsFiles) -> str:
 
 
 @functools.cache
-def _tell_outside(text: str) -> None:
+def _warn_of_names_outside(text: str) -> None:
     log.warning("%s", text)
 
 
@@ -112,13 +112,13 @@ def _is_ours(files: TlsFiles, directory: Path) -> bool:
 
 def _ends_soon(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     end = certificate.not_valid_after_utc
-    # One that ends with its authority would not last longer for being new.
+    # A certificate that expires with its CA would not be valid for longer if it were renewed.
     return end - usable_time() < EXPIRES_SOON and end < authority.not_valid_after_utc
 
 
 def _begins_later(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     now = datetime.now(timezone.utc)
-    # A clock that is behind the authority's making is what is wrong, not the certificate.
+    # If the clock is before the CA was made, the clock is wrong and not the certificate.
     is_right = not is_unset(now) and now >= authority.not_valid_before_utc
     return is_right and now < certificate.not_valid_before_utc
 

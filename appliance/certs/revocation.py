@@ -1,9 +1,9 @@
 """Revocation lists (RFC 5280, section 5) of our own authority or a company's.
 
-They are looked through here. For OpenSSL a list whose time is over, or that is missing for one
-authority of several, means that nobody comes in any more: a robot whose network is gone for a week
-would lock its people out. Here what a list says stays said, however old it is. OpenSSL gets to see
-those by which it comes to the same answer, since it alone can tell a client in a TLS alert.
+They are evaluated here. OpenSSL refuses every client when a list is outdated, or is missing for one
+of several authorities: a robot that is without a network for a week would lock its people out. Here
+an outdated list stays in force. OpenSSL is given the lists with which it decides in the same way,
+because only OpenSSL can send a client the TLS alert.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ CRL_SIZE: Final = 16 << 20
 
 _PLAIN: Final = (x509.AuthorityKeyIdentifier, x509.CRLNumber)
 
-#: Entries of all lists that OpenSSL gets to see, in each listener's settings.
-SHOWN: Final = 10_000
+#: The most entries of all lists that OpenSSL is given, in each listener's context.
+OPENSSL_ENTRIES: Final = 10_000
 
 _PEM: Final = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
 
@@ -35,25 +35,25 @@ _PEM: Final = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", 
 class Revocations:
     """What was revoked and when, by issuer and serial number.
 
-    `ends` says of each list by whom it is and when it is outdated. `shown` are the lists in PEM
-    form if OpenSSL comes to the same answer by them as long as they are fresh, else nothing.
+    `ends` has the issuer of each list, and when it is outdated. `for_openssl` are the lists in PEM
+    form if OpenSSL decides in the same way while they are fresh, otherwise empty.
     """
 
     dates: Mapping[x509.Name, Mapping[int, datetime]]
     ends: Sequence[tuple[str, datetime]]
     begins: Sequence[datetime] = ()
-    shown: bytes = b""
+    for_openssl: bytes = b""
 
     def date(self, certificate: x509.Certificate) -> datetime | None:
         """When the certificate was revoked; None when it was not."""
         return self.dates.get(certificate.issuer, {}).get(certificate.serial_number)
 
     def lists(self, authority: x509.Certificate) -> bool:
-        """Whether there is a list by that authority, be it an empty one."""
+        """Whether there is a list of that authority, even an empty one."""
         return authority.subject in self.dates
 
     def is_fresh(self, now: datetime) -> bool:
-        """Whether no list is outdated at that time, nor made later."""
+        """Whether at that time no list is outdated or from the future."""
         return all(begin <= now for begin in self.begins) and all(
             now <= end for _, end in self.ends
         )
@@ -68,7 +68,7 @@ NOTHING_REVOKED: Final = Revocations({}, ())
 def load_revocations(
     path: Path, data: bytes, authorities: Sequence[x509.Certificate]
 ) -> Revocations:
-    """All lists of a file; CertificateError when one is not whole or not of these authorities."""
+    """All lists of a file; CertificateError when one is malformed or not of these authorities."""
     dates: dict[x509.Name, dict[int, datetime]] = {}
     ends: list[tuple[str, datetime]] = []
     crls = parse_crls(path, data, authorities)
@@ -79,18 +79,18 @@ def load_revocations(
         if crl.next_update_utc is not None:
             ends.append((crl.issuer.rfc4514_string(), crl.next_update_utc))
     begins = [crl.last_update_utc for crl in crls]
-    return Revocations(dates, ends, begins, _shown(crls, authorities))
+    return Revocations(dates, ends, begins, _for_openssl(crls, authorities))
 
 
-def _shown(
+def _for_openssl(
     crls: Sequence[x509.CertificateRevocationList], authorities: Sequence[x509.Certificate]
 ) -> bytes:
-    """All lists, if by them OpenSSL answers as we do, else nothing.
+    """All lists in PEM form if OpenSSL decides with them as we do, otherwise nothing.
 
-    It wants a list of whoever signed a client's certificate: so none may come from an authority
-    that is not in our file. And it reads more out of extensions than we do.
+    OpenSSL requires a list of every authority that has signed a client's certificate, so no client
+    may have a CA that is not in our file. And it obeys extensions that we ignore.
     """
-    if not crls or sum(map(len, crls)) > SHOWN:
+    if not crls or sum(map(len, crls)) > OPENSSL_ENTRIES:
         return b""
     for authority in authorities:
         lists = [crl for crl in crls if crl.issuer == authority.subject]

@@ -1,4 +1,4 @@
-"""`broker.tls` of appliance.yaml, and what single listeners say otherwise."""
+"""`broker.tls` of appliance.yaml, and what single listeners override."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from appliance.config import BrokerSection
 
 
 def listener_name(index: int) -> str:
-    """The listener of that number, as it is called in errors and asked for its context."""
+    """The name of the listener with that number, in errors and for its context."""
     return f"broker.listeners[{index}]"
 
 
@@ -18,7 +18,7 @@ def tls_files(broker: BrokerSection) -> TlsFiles:
 
 
 def tls_policies(broker: BrokerSection) -> dict[str, TlsPolicy]:
-    """What each listener with TLS asks of its connections; empty when none has TLS."""
+    """The policy of each listener with TLS; empty when none has TLS."""
     return {
         listener_name(index): TlsPolicy(
             broker.client_certificates(listener),

@@ -52,7 +52,7 @@ def cert_issue(
         from appliance import certs
 
         certificate = directory / "clients" / f"{name}.crt"
-        there = certificate in {e.file for e in certs.listed(directory) if e.usable}
+        there = certificate in {e.file for e in certs.list_certificates(directory) if e.usable}
         if there and not (pkcs12 or bundle):
             raise CommandError(
                 f"{name} has a certificate, {shown(certificate)}; `appliance cert renew {name}` "
@@ -115,7 +115,7 @@ def cert_revoke(
     with _directory(config) as directory:
         from appliance import certs
 
-        servers = [each for each in certs.listed(directory) if each.purpose == "server"]
+        servers = [each for each in certs.list_certificates(directory) if each.purpose == "server"]
         if not yes and any(what in (e.name, e.serial_text, str(e.file)) for e in servers):
             _ask_about_the_server()
         for entry in certs.revoke(directory, what, ca_key):
@@ -149,7 +149,7 @@ def cert_renew(
 
         names = [what]
         if what == "all":
-            entries = certs.listed(directory)
+            entries = certs.list_certificates(directory)
             names = [e.name for e in entries if e.purpose != "authority" and e.usable and e.file]
         for name in names:
             certs.renew(directory, name, ca_key)
@@ -171,7 +171,9 @@ def cert_list(
         from appliance import certs
 
         shown_states = ("valid", "revoked")
-        entries = [e for e in certs.listed(directory) if every or e.state in shown_states]
+        entries = [
+            e for e in certs.list_certificates(directory) if every or e.state in shown_states
+        ]
     if as_json:
         for entry in entries:
             typer.echo(json.dumps(entry.as_json()))

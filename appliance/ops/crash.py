@@ -1,9 +1,9 @@
-"""A report of each crash, in files beside the state.
+"""Crash reports, in files beside the state.
 
-The file `running` is there while the appliance runs. Python's fault handler writes all threads'
-tracebacks into it when a signal ends the process (SIGSEGV, and the SIGABRT that systemd sends to a
-service that hangs); the next start finds it, and makes a report of it. An exception that nothing
-caught is reported at once, with the last lines of the log.
+The file `running` exists while the appliance runs. Python's fault handler writes the tracebacks of
+all threads into it when a signal ends the process (SIGSEGV, and the SIGABRT that systemd sends to a
+service that hangs). The next start finds the file and turns it into a report. An exception that
+nothing caught is reported at once, with the last lines of the log.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from appliance.ops import logs
 
 log = logging.getLogger(__name__)
 
-#: Reports that stay; reports of one process; and bytes of one, of which tracebacks are the end.
+#: Reports of a kind that are kept, and reports of a kind that one process writes.
 KEPT = 5
 OF_ONE_RUN = 3
+
+#: Bytes of a report, half of which a traceback may take.
 LARGEST = 256 * 1024
 
-#: A secret of fewer characters is not looked for in a report: it is in many words.
+#: Shorter secrets are not masked in a report, because they are part of many words.
 SHORTEST_SECRET = 6
 
 _enable = faulthandler.enable
@@ -49,10 +51,10 @@ _END_OF_HEAD = "-- what it ended with --\n"
 
 
 class CrashReports:
-    """Writes reports into `folder`, none where that is None.
+    """Writes reports into `folder`; with None there are no reports.
 
-    `previous` is the report of the last run, None when that did not crash.
-    Reports never keep the appliance from running: where they cannot be written, the log says so.
+    `previous` is the report of the last run, None if that did not crash. When reports cannot be
+    written, the log says so and the appliance runs without them.
     """
 
     def __init__(self, folder: Path | None, settings: Settings) -> None:
@@ -66,14 +68,14 @@ class CrashReports:
         self._secrets = [secret for secret in secrets if len(secret) >= SHORTEST_SECRET]
 
     def start(self) -> None:
-        """Find out how the last run ended, and be ready for the end of this one."""
+        """Report how the last run ended if it crashed, and prepare to report this one."""
         if not self._wanted:
             return
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             flags = os.O_CREAT | os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
             self._running = os.open(self._folder / _RUNNING, flags, 0o600)
-            # Another appliance with the same folder keeps it, and this one reports nothing.
+            # If another appliance uses the folder, this one reports nothing.
             fcntl.flock(self._running, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.previous = self._find_previous()
             os.ftruncate(self._running, 0)
@@ -85,30 +87,30 @@ class CrashReports:
             log.warning("crashes are not reported (crash_reports): %s: %s", self._folder, why)
             return
         _enable(self._running, all_threads=True)
-        # rclpy's EventsExecutor would have it write to standard error, as soon as it is imported.
+        # rclpy's EventsExecutor redirects the handler to standard error as soon as it is imported.
         faulthandler.enable = lambda *_, **__: None
         threading.excepthook = self._on_thread
 
     def stop(self) -> None:
-        """The run ends well; may be called twice."""
+        """End a run that did not crash; may be called twice."""
         if self._running is not None:
             (self._folder / _RUNNING).unlink(missing_ok=True)
             self._close()
 
     def crash(self, error: BaseException) -> None:
-        """The run ends with an exception that nothing caught."""
+        """Report the exception that ends the run."""
         path = self.report(error, "the appliance crashed")
         if self._running is not None and path is not None:
-            with suppress(OSError):  # the disk is full: the next start takes it for a power cut
+            with suppress(OSError):  # on a full disk the next start assumes a power cut
                 _write(self._running, f"{_REPORTED}{path.name}\n")
             self._close()
 
     def watch(self, loop: asyncio.AbstractEventLoop, faults: Faults) -> None:
-        """Count, as a fault, what callbacks and tasks fail with that are no entry of ours."""
+        """Count what escapes from callbacks and tasks of libraries as faults."""
 
         def on_loop(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
             error = context.get("exception")
-            if error is None or isinstance(error, OSError):  # those are the network's
+            if error is None or isinstance(error, OSError):  # the network's, not a fault
                 loop.default_exception_handler(context)
             else:
                 faults.caught("loop", error, context.get("message", ""))
@@ -116,14 +118,14 @@ class CrashReports:
         loop.set_exception_handler(on_loop)
 
     def fault(self, error: BaseException, what: str) -> Path | None:
-        """Report one that was contained: the run goes on, and keeps its reports of crashes."""
+        """Report a contained fault; the run continues, and may report as many crashes as before."""
         if self._faults >= OF_ONE_RUN:
             return None
         self._faults += 1
         return self._write(error, what, "fault")
 
     def report(self, error: BaseException, what: str) -> Path | None:
-        """Write a report of an exception; the log says where it is, and so does what returns."""
+        """Write a report of an exception, log its path and return it."""
         if self._reported >= OF_ONE_RUN:
             return None
         self._reported += 1
@@ -138,9 +140,9 @@ class CrashReports:
             return None
         lines = "".join(traceback.format_exception(error))[-LARGEST // 2 :]
         text = "\n".join(logs.recent)[-LARGEST // 4 :]
-        told = f"{what}\n{lines}\n-- the last lines of the log --\n{text}\n"
+        report = f"{what}\n{lines}\n-- the last lines of the log --\n{text}\n"
         try:
-            return self._save(_encoded(f"{self._head()}{redacted(told, self._secrets)}"), kind)
+            return self._save(_encoded(f"{self._head()}{redacted(report, self._secrets)}"), kind)
         except OSError as failure:
             log.error("%s, and no report can be written: %s", what, failure)
             return None
@@ -186,12 +188,12 @@ class CrashReports:
         try:
             _write(descriptor, data[:LARGEST])
             os.fsync(descriptor)
-        except OSError:  # half a report would take the place of a whole one
+        except OSError:  # half a report would replace an older, whole one
             path.unlink(missing_ok=True)
             raise
         finally:
             os.close(descriptor)
-        # By when they were written: a clock that was set back must not delete the newest.
+        # By the time of writing: if the clock was set back, the newest has not the last name.
         reports = sorted(self._folder.glob(f"{kind}-*.txt"), key=lambda p: p.stat().st_ctime_ns)
         for old in reports[:-KEPT]:
             old.unlink(missing_ok=True)
@@ -219,5 +221,5 @@ def _write(descriptor: int, data: bytes | str) -> None:
 
 
 def _encoded(text: str) -> bytes:
-    """UTF-8, also of what is none: a file's name with other bytes may be in any error."""
+    """Encode as UTF-8, with escapes for bytes of file names that are not UTF-8."""
     return text.encode(errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""Logging: one line an event for people, or one JSON object an event for machines."""
+"""Logging: each event is one line for people, or one JSON object for machines."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from appliance.config import Level
 _COLOURS = {"DEBUG": "\x1b[2m", "WARNING": "\x1b[33m", "ERROR": "\x1b[31m", "CRITICAL": "\x1b[31m"}
 _RESET = "\x1b[0m"
 
-# Client ids, user names and topics come from strangers and end up in log lines: without this they
-# could forge lines, send commands to the terminal that shows them, or turn the order of what it
-# shows. C0, DEL and C1; ends of lines and the bidirectional controls of Unicode (UAX 9).
+# Client ids, user names and topics come from strangers and are logged. Unescaped they could forge
+# log lines, send commands to the terminal that shows them, or reorder what it shows. Escaped are
+# C0, DEL and C1, and Unicode's line separators and bidirectional controls (UAX 9).
 _BIDIRECTIONAL = (0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
 VISIBLE = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
 VISIBLE |= {code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *_BIDIRECTIONAL)}
-#: The same of texts that have several lines.
+#: The same for texts of several lines.
 VISIBLE_IN_LINES = {code: text for code, text in VISIBLE.items() if code not in (0x09, 0x0A)}
-# JSON escapes the first of them itself.
+# json.dumps escapes C0 itself.
 _VISIBLE_IN_JSON = {code: f"\\u{code:04x}" for code in VISIBLE if code >= 0x7F}
 
-#: The last lines that were logged, for a crash's report.
+#: The last lines that were logged, for crash reports.
 recent: deque[str] = deque(maxlen=100)
 _LONGEST_RECENT = 2000
 
@@ -39,10 +39,10 @@ def setup(
     form: Literal["human", "json"] = "human",
     stream: TextIO | None = None,
 ) -> None:
-    """Sends all logging to `stream` (standard error), in place of what was set up before.
+    """Send all logging to `stream` (standard error), replacing the previous set-up.
 
-    `level` is this project's own; other packages' loggers speak from warning on. `levels` sets
-    single loggers, whoever's they are: `{"appliance.ros": "debug", "amqtt": "info"}`.
+    `level` is that of the project's own loggers; those of other packages log warnings and errors.
+    `levels` sets single loggers of any package: `{"appliance.ros": "debug", "amqtt": "info"}`.
     """
     stream = stream or sys.stderr
     handler = _Handler(stream)
@@ -63,7 +63,7 @@ class _Handler(logging.StreamHandler[TextIO]):
 
 
 class HumanFormatter(logging.Formatter):
-    """`2026-01-31 12:34:56.789 INFO    listeners: …`, local time; colour when asked for."""
+    """`2026-01-31 12:34:56.789 INFO    listeners: …`, in local time, with or without colour."""
 
     def __init__(self, *, colour: bool = False) -> None:
         super().__init__()
@@ -78,12 +78,12 @@ class HumanFormatter(logging.Formatter):
             line = f"{_COLOURS[record.levelname]}{line}{_RESET}"
         if record.exc_info:
             traceback = self.formatException(record.exc_info).translate(VISIBLE_IN_LINES)
-            line += "\n" + traceback.replace("\n", "\n  ")  # an exception's text forges no line
+            line += "\n" + traceback.replace("\n", "\n  ")  # indented, so it forges no line
         return line
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time (UTC, ISO 8601), level, logger, message, exception if any."""
+    """One JSON object on each line: time (UTC, ISO 8601), level, logger, message, exception."""
 
     def format(self, record: logging.LogRecord) -> str:
         moment = datetime.fromtimestamp(record.created, timezone.utc)
@@ -99,6 +99,6 @@ class JsonFormatter(logging.Formatter):
 
 
 def json_text(value: object, indent: int | None = None) -> str:
-    """JSON for people and machines: what would act on a terminal is escaped, and only that."""
+    """JSON for people and machines: only characters that would control a terminal are escaped."""
     text = json.dumps(value, ensure_ascii=False, indent=indent)
     return text.translate(_VISIBLE_IN_JSON)

@@ -217,7 +217,7 @@ def test_a_clock_that_was_never_set(
 
     for module in (authority, files):
         monkeypatch.setattr(module, "datetime", Clock)
-    authority._tell_unset.cache_clear()
+    authority._warn_of_unset_clock.cache_clear()
     certs.create_authority(tmp_path, None, NAMES)
     certs.issue_server(tmp_path, NAMES, ADDRESSES)
     monkeypatch.undo()

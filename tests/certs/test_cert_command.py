@@ -313,7 +313,12 @@ def test_a_key_that_was_revoked_is_not_certified_again(here: Path, capsys) -> No
     assert run("cert", "issue", "tablet") == 0
     assert (here / "clients/tablet.key").read_bytes() != key
     certs.sign(here, request_of(ec.generate_private_key(ec.SECP256R1())))  # esp, with a new key
-    assert [e.name for e in certs.listed(here) if e.usable] == ["ca", "server", "esp", "tablet"]
+    assert [e.name for e in certs.list_certificates(here) if e.usable] == [
+        "ca",
+        "server",
+        "esp",
+        "tablet",
+    ]
 
 
 # renew and list
@@ -421,7 +426,9 @@ def test_nothing_secret_in_ps(here: Path) -> None:
 
 def test_the_servers_own_is_not_revoked_without_a_question(here: Path, capsys) -> None:
     before = everything(here)
-    [serial] = [each.serial_text for each in certs.listed(here) if each.purpose == "server"]
+    [serial] = [
+        each.serial_text for each in certs.list_certificates(here) if each.purpose == "server"
+    ]
     for what in ("server", serial, str(here / "server.crt")):
         assert run("cert", "revoke", what) == 1
         assert "cert renew server" in (said := capsys.readouterr().err) and "--yes" in said

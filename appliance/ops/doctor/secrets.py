@@ -58,7 +58,7 @@ def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator
         yield Finding("error", str(files.certificate), "it is not there", advice)
         return
     try:
-        found = certs.endings(files)
+        found = certs.expiries(files)
     except certs.CertificateError as error:
         yield Finding("error", "certificates", str(error))
         return
@@ -74,7 +74,7 @@ def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator
         yield from _clients(directory)
 
 
-def _ending(each: certs.Ending, is_ours: bool) -> Finding:
+def _ending(each: certs.Expiry, is_ours: bool) -> Finding:
     subject = _WHAT[each.what]
     text = f"{each.days} days left, until {each.ends:%Y-%m-%d} ({each.file})"
     if each.days < 0:
@@ -95,7 +95,7 @@ def _ending(each: certs.Ending, is_ours: bool) -> Finding:
 
 def _clients(directory: Path) -> Iterator[Finding]:
     try:
-        listed = certs.listed(directory)
+        listed = certs.list_certificates(directory)
     except certs.CertificateError as error:
         yield Finding("error", "clients' certificates", str(error))
         return
