@@ -417,12 +417,11 @@ async def test_a_directory_that_hangs_does_not_stop_the_loop(directory: Director
         asks = asyncio.gather(
             *(rig.login.authenticate(bob(f"c{number}"), HOST) for number in range(10))
         )
-        longest, last = 0.0, time.monotonic()
+        rounds = 0  # of the loop, which goes on while the directory does not
         while not asks.done():
             await asyncio.sleep(0.005)
-            now = time.monotonic()
-            longest, last = max(longest, now - last), now
-        assert longest < 0.2
+            rounds += 1
+        assert rounds > 3
         assert {code_of(answer) for answer in await asks} == {ReasonCode.SERVER_UNAVAILABLE}
         assert directory.searches == 1
         directory.gate.set()
