@@ -159,7 +159,7 @@ class ClientHandler:
         self._behind_size = 0  # bytes
         self._awaited: Sequence[Congestion] = ()
         self._waits_since = 0.0
-        self._dawdled = 0.0  # the sum over the awaited congestions at that time
+        self._reader_time = 0.0  # the sum over the awaited congestions at that time
         #: The latest possible arrival time of the delayed packet being processed; 0 if not delayed.
         self._arrived_at = 0.0
         #: Since when input waits for a pending decision; 0 when none does.
@@ -479,7 +479,7 @@ class ClientHandler:
             if congestion not in congestions:
                 congestion.forget(self)
         self._awaited = congestions
-        self._dawdled = sum(congestion.dawdled() for congestion in congestions)
+        self._reader_time = sum(congestion.reader_time() for congestion in congestions)
         seconds = allowance.left
         for congestion in congestions:
             congestion.wait(self)
@@ -555,12 +555,12 @@ class ClientHandler:
             return
         limit = self._counters.cost + COST_PER_TURN
         if self._awaited:
-            dawdled = sum(congestion.dawdled() for congestion in self._awaited)
+            reader_time = sum(congestion.reader_time() for congestion in self._awaited)
             waited = self._accounting.now - self._waits_since
             # The congestions overlap: together they count no more than the time that it waited.
-            counted = min(max(dawdled - self._dawdled, waited * LEAST_COUNTED), waited)
+            counted = min(max(reader_time - self._reader_time, waited * LEAST_COUNTED), waited)
             self._allowance.change(-counted)
-            self._waits_since, self._dawdled = self._accounting.now, dawdled
+            self._waits_since, self._reader_time = self._accounting.now, reader_time
         try:
             while behind and self._work is None:
                 if self._counters.cost > limit:

@@ -1,55 +1,56 @@
-"""How what a client sends comes in: in one go, or with pauses; and what it waits for in here.
+"""The age of received messages, estimated from the pauses in a client's input.
 
-What a client has queued comes without a pause. Who says something now and then has pauses between,
-in which all that it had to say is there, whole. So the end of such a pause is when what has come
-since was said at the earliest; unless it had come before and was not read.
+MQTT messages have no timestamp, but a robot must not carry out commands that were queued somewhere
+for seconds. A client with a queue sends it without a pause. A client that sends now and then pauses
+in between, when everything it sent has arrived completely. So messages were sent no earlier than
+the end of the last pause, unless they had arrived before it and were not read.
 
-While a client is not read, what it says fills what the system keeps for it, and then it keeps the
-rest back itself. That comes a round trip after it is read again, as fast as the network takes it.
-So who had to keep something back has caught up when little has come for longer than that, and
-nothing that came is left unread. Little is also what is far less than came in such a time before:
-who streams has a pace of its own, and catches up at that of the network. Where the two are nearly
-the same nothing shows the end; then it has had the time that catching up takes.
+While a connection is not read, its input first fills the system's buffer, then the client itself
+holds the rest back. That arrives one round trip after reading resumes, at the speed of the network.
+So a client that may have held input back has caught up when, for longer than a round trip, little
+has arrived and nothing is left unread. "Little" also means far less than in an equal time before:
+a streaming client has its own rate, and catches up at the rate of the network. Where the two rates
+are nearly equal, the end cannot be detected; then the longest time that catching up takes applies.
 """
 
 from __future__ import annotations
 
 import math
 
-#: Seconds without a byte that are a pause, beside the time that a slow network takes for those that
-#: come next: seconds a byte, of 10 Mbit/s.
+#: The shortest pause, in seconds; to this is added the time in which a slow network, of 10 Mbit/s,
+#: transfers the next chunk: A_BYTE seconds per byte.
 PAUSE = 0.004
 A_BYTE = 0.8e-6
 
-#: The same behind a time, longer than this, in which it was not read: what came then has its turn
-#: soon.
+#: The shortest pause after the connection was not read for longer than this: buffered input then
+#: arrives soon.
 PAUSE_BEHIND = 0.02
 
-#: Bytes that are little, in two round trips and that pause: who has something to catch up with
-#: sends several full packets of the network in one.
+#: At most so many bytes in two round trips and PAUSE_BEHIND are "little": a client that catches up
+#: sends several full network packets in that time.
 LITTLE = 4096
 
-#: The same as a part of the most that came in such a time since it was read again.
+#: "Little" as a fraction of the highest rate since reading resumed.
 FAR_LESS = 1 / 4
 
-#: Seconds in which a client makes up for one in which it was not read, at the most: its network
-#: takes at least 1.2 times what it has to say.
+#: The longest time, in seconds, to catch up with one second in which the connection was not read:
+#: the network is assumed to have at least 1.2 times the client's rate.
 CATCHING_UP = 5.0
 
-#: Beside this, so many times the two round trips and that pause: TCP begins slowly.
+#: To this is added so many times two round trips and PAUSE_BEHIND: TCP starts slowly.
 FLIGHTS = 10
 
-#: Seconds from one look to the next, at the most.
+#: The longest interval between two calls of `look`, in seconds.
 RARELY = 1.0
 
-#: The smallest PUBLISH has so many bytes.
+#: The size of the smallest PUBLISH, in bytes.
 SHORTEST = 5
 
 
 class Inflow:
-    """What comes of PUBLISH and the like from one client; times in seconds of the broker's clock.
+    """Tracks the input of one client; times are in seconds of the broker's clock.
 
-    Acknowledgements and pings are not meant: they say nothing about what it has queued.
+    Acknowledgements and pings are ignored: they tell nothing about a queue of the client.
     """
 
     __slots__ = (
@@ -72,39 +73,39 @@ class Inflow:
     )
 
     def __init__(self) -> None:
-        #: Whether somebody has asked for how long it has come without a pause: it costs a little.
+        #: Whether `flowing` was called, so that pauses are tracked, which costs a little.
         self.is_watched = False
-        #: Since when it has come without a pause, and when the last of it came.
+        #: Since when input has arrived without a pause, and when the last of it arrived.
         self.began = 0.0
         self.last = 0.0
-        #: When the packet that is not whole began to come; 0 when there is none.
+        #: When the first bytes of the partial packet arrived; 0 when there is none.
         self.unfinished = 0.0
-        #: Seconds that it was not read since it had last been read to the end; and since when it is
-        #: not, 0 while it is.
+        #: Seconds without reading since the client last had caught up; and since when the
+        #: connection is not read, 0 while it is.
         self._held = 0.0
         self._held_since = 0.0
         self._resumed = -math.inf
         self._caught_up = 0.0
-        #: Whether it may have kept something back, and when it has caught up at the latest.
+        #: Whether the client may have held input back, and when it has caught up at the latest.
         self._is_kept_back = False
         self._caught_up_by = 0.0
-        #: Since when it is measured how much comes, 0 for not; the bytes that had come until then;
-        #: whether it may have kept something back since; and the most that came, in bytes a second.
+        #: The rate measurement: its start, 0 for none; the bytes received until then; whether the
+        #: client may have held input back since; and the highest rate, in bytes a second.
         self._measured_since = 0.0
         self._received = 0
         self._was_full = False
         self._most = 0.0
-        #: Of the last look, the bytes that had come; and the seconds to the next one, at least.
+        #: The bytes received until the last `look`, and the shortest time until the next in seconds.
         self._seen = 0
         self._interval = PAUSE_BEHIND
 
     def came(self, data: bytes, now: float) -> None:
-        """A chunk has come."""
-        # Acknowledgements and pings; and nothing, when what came before is gone on with.
+        """A chunk has arrived."""
+        # Ignore acknowledgements, pings, and the empty chunk that continues with buffered input.
         if len(data) < SHORTEST or (not self.unfinished and _acknowledges(data)):
             return
         gap = now - max(self.last, self._resumed)
-        is_held = self._held_since and now - self._held_since > PAUSE  # and not since it came
+        is_held = self._held_since and now - self._held_since > PAUSE  # not since this chunk
         is_behind = self._resumed > self.last and self._held > PAUSE_BEHIND
         pause = PAUSE_BEHIND if is_behind else PAUSE
         if gap > pause + len(data) * A_BYTE and not self.unfinished and not is_held:
@@ -112,7 +113,7 @@ class Inflow:
         self.last = now
 
     def not_read(self, now: float) -> None:
-        """It is not read from now on."""
+        """The connection is not read from now on."""
         if not self._held_since:
             self._held_since = now
             if self._caught_up and now > self._caught_up:
@@ -120,24 +121,24 @@ class Inflow:
             self._caught_up = 0.0
 
     def read(self, now: float) -> None:
-        """It is read again."""
+        """The connection is read again."""
         if self._held_since:
             pause = now - self._held_since
             self._held += pause
             self._held_since = 0.0
             self._resumed = now
             self._caught_up_by = max(self._caught_up_by, now) + CATCHING_UP * pause
-            if pause > PAUSE_BEHIND:  # what comes now is not the pace of either
+            if pause > PAUSE_BEHIND:  # the rate now is neither the client's nor the network's
                 self._measured_since = 0.0
                 self._interval = PAUSE_BEHIND
 
     def look(
         self, now: float, *, unread: bool, full: bool, received: int, round_trip: float
     ) -> float:
-        """See whether it has caught up; returns after how many seconds to look again, 0 for not.
+        """Check whether the client has caught up; returns seconds until the next check, or 0.
 
-        `unread`: something that has come is not read; `full`: so much that it may keep the rest
-        back. `received`: the bytes that have come, in all.
+        `unread`: the system has unread input; `full`: so much that the client may hold input back.
+        `received`: the bytes received in all.
         """
         if self._held_since or not self._held:
             return 0.0
@@ -161,13 +162,13 @@ class Inflow:
             self._interval = PAUSE_BEHIND
             self._seen = received
             return seconds
-        # Nobody has asked; or nothing comes: it has said a part of something, and not the rest.
+        # `flowing` is not used, or nothing arrives: a part of a packet is there, and not the rest.
         seconds = max(seconds, self._interval)
         self._interval = min(2 * self._interval, RARELY)
         return seconds
 
     def _measure(self, now: float, received: int) -> bool:
-        """Whether little has come since the last time, and it could send all that it had to say."""
+        """Whether little has arrived since the last call although the client could send freely."""
         came = received - self._received
         pace = came / (now - self._measured_since)
         is_little = not self._was_full and (came <= LITTLE or pace <= FAR_LESS * self._most)
@@ -176,30 +177,30 @@ class Inflow:
         return is_little
 
     def _has_caught_up(self) -> None:
-        """Nothing that it had to say before is left to be read."""
+        """All input that the client had held back has been read."""
         self._held = self._caught_up = self._caught_up_by = self._measured_since = self._most = 0.0
         self._is_kept_back = self._was_full = False
         self._interval = PAUSE_BEHIND
 
     @property
     def is_behind(self) -> bool:
-        """Whether it was not read for long enough to matter."""
+        """Whether the connection was not read for a relevant time."""
         return self._held > PAUSE
 
     def held(self, now: float, *, has_unread: bool) -> float:
-        """Seconds that what comes now may have waited in here, at the most."""
+        """The longest time, in seconds, that input arriving now may have waited unread."""
         if self._held_since:
             return self._held + now - self._held_since
         if self._caught_up and now > self._caught_up:
             self._has_caught_up()
         if self._held and not (has_unread or self._is_kept_back or self._caught_up):
-            self._caught_up = now  # with what has come until now
+            self._caught_up = now  # with the input received until now
         return self._held
 
     def flowing(self, now: float) -> float:
-        """For how many seconds it has come without a pause; 0 when there is one.
+        """Seconds for which input has arrived without a pause; 0 during a pause.
 
-        It is known since this was asked for the first time.
+        It is tracked from the first call on.
         """
         if not self.is_watched:
             self.is_watched = True
@@ -210,7 +211,7 @@ class Inflow:
 
 
 def _acknowledges(data: bytes) -> bool:
-    """Whether it is nothing but acknowledgements without reason codes."""
+    """Whether `data` consists of acknowledgements without reason codes."""
     return (
         data[0] & 0xC0 == 0x40  # PUBACK, PUBREC, PUBREL, PUBCOMP
         and not len(data) & 3
