@@ -1,7 +1,7 @@
-"""What each user holds of what all clients share, and how much that may be.
+"""Accounts: what each user holds of the shared resources, and the user's quotas.
 
-All anonymous clients are one user. What the appliance itself holds is in an account of its own,
-which has no limits and takes nothing from those of the users.
+All anonymous clients are one user. The appliance itself has an account of its own, which has no
+limits and does not reduce those of the users.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from appliance.mqtt.codec import quote
 if TYPE_CHECKING:
     from appliance.broker.session import Session
 
-#: Accounts that there are before those are looked for that hold nothing any more.
+#: Empty accounts are removed when the number of accounts exceeds this.
 ACCOUNTS = 64
 
 
@@ -39,17 +39,17 @@ class Account:
     def __init__(self, username: str | None, *, is_inside: bool = False) -> None:
         self.username = username
         self.is_inside = is_inside
-        #: Its sessions whose clients are connected, in the order of their coming.
+        #: Its sessions whose clients are connected, in the order of connecting.
         self.present: dict[Session, None] = {}
-        #: And those whose clients are not, in the order of their leaving.
+        #: Its sessions whose clients are absent, in the order of leaving.
         self.absent: dict[Session, None] = {}
-        #: Its part of `Accounting.queued_bytes`, and of that what waits in the network.
+        #: Its share of `Accounting.queued_bytes`, and the part of that in output buffers.
         self.bytes = 0
         self.output = 0
         #: Retained messages that it was the last to publish, and their bytes.
         self.retained = 0
         self.retained_bytes = 0
-        #: Bytes in the store, once for each session that a message is owed to.
+        #: Bytes in the store, counted for each session that a message is stored for.
         self.stored = 0
 
     def __str__(self) -> str:
@@ -75,10 +75,10 @@ class Account:
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """How much one user may hold of the `whole`.
+    """How much one user may hold of a resource with the limit `whole`.
 
-    It may hold what is `sure`, and more up to `most` as long as all together hold no more than is
-    `lent`.
+    A user may hold `sure` in any case, and more, up to `most`, as long as all users together hold
+    no more than `lent`.
     """
 
     whole: int
@@ -88,10 +88,10 @@ class Quota:
 
     @staticmethod
     def of(whole: int, own: int | None) -> Quota:
-        """`own` is what the configuration says of a user.
+        """`own` is the configured limit of a user.
 
-        None: a quarter is sure, and while half of the whole is free a user may have more, so that
-        a robot with a single user does without three quarters of nothing.
+        If it is None, a quarter is sure, and a user may hold more while half of the whole is free,
+        so that a robot with a single user can use more than that quarter.
         """
         if own is None:
             return Quota(whole, -(-whole // 4), whole, whole // 2)
@@ -99,11 +99,11 @@ class Quota:
 
     @property
     def own(self) -> int:
-        """What a user may hold when it is alone."""
+        """What a user may hold if it is the only one."""
         return max(self.sure, min(self.most, self.lent))
 
     def allows(self, held: int, total: int, size: int) -> bool:
-        """Whether who holds so much of the total may have `size` more."""
+        """Whether a user that holds `held` of `total` may take `size` more."""
         held += size
         total += size
         if total > self.whole:
@@ -111,23 +111,23 @@ class Quota:
         return held <= self.sure or (held <= self.most and total <= self.lent)
 
     def shortage(self, total: int, size: int, what: str, key: str, user_key: str) -> str:
-        """Why `allows` says no to `size` more, in words: the keys say how much there is of it."""
+        """Why `allows` returned False, as a text with the configuration key of the limit."""
         if total + size > self.whole:
             return f"there is no {what} left (broker.{key})"
         return f"its user's share of the {what} is full (broker.limits.user.{user_key})"
 
     def must_yield(self, most: int, held: int) -> bool:
-        """Whether who holds `most` of what can be taken back gives one to who holds so many."""
+        """Whether the largest holder loses a connection or session to a user that holds `held`."""
         return most > self.sure > held
 
 
 class Accounts:
-    """The accounts of all users that hold anything, of those before their login, and our own."""
+    """The accounts of users, of clients before their login, and of the appliance itself."""
 
     def __init__(self) -> None:
-        #: What parts of the appliance hold, plugins among them.
+        #: The account of the appliance's own sessions, plugins included.
         self.inside = Account(None, is_inside=True)
-        #: Clients that have not logged in: nobody knows yet whose they are.
+        #: The account of clients that have not logged in.
         self.strangers = Account("(before the login)")
         #: Of all users.
         self.connections = 0
@@ -141,7 +141,7 @@ class Accounts:
         return len(self._users)
 
     def of(self, identity: Identity | None) -> Account:
-        """The account of who this is; None, and who nobody has logged in as yet, is inside."""
+        """The account of an identity; None, and a plugin's placeholder, belong to `inside`."""
         if identity is None or type(identity) is not Identity:
             return self.inside
         return self.of_user(identity.username)
@@ -154,17 +154,17 @@ class Accounts:
                 self._users = {
                     name: each for name, each in self._users.items() if not each.is_empty
                 }
-                # Each is looked at once for every two that come: the work stays in proportion.
+                # The threshold doubles, so that the work per new account is constant on average.
                 self._many = max(ACCOUNTS, 2 * len(self._users))
             account = self._users[username] = Account(username)
         return account
 
     def largest(self, held: Callable[[Account], int]) -> Account:
-        """The user who holds most of something; there is at least one user."""
+        """The user that holds the most; there must be at least one user."""
         return max(self._users.values(), key=held)
 
     def holders(self, held: Callable[[Account], int], count: int) -> list[tuple[str, int]]:
-        """The `count` users who hold most of something, and how much that is; no zeros."""
+        """The `count` users that hold the most, with the amounts; without zeros."""
         found = nlargest(count, self._users.values(), held)
         return [(str(account), held(account)) for account in found if held(account)]
 
@@ -183,7 +183,7 @@ class Accounts:
             self.sessions += is_new
 
     def left(self, session: Session) -> None:
-        """A session's client is gone, or has not come since the last run."""
+        """A session's client has disconnected, or was absent since the last run."""
         account = session.account
         is_new = session not in account.present
         if not is_new:
@@ -194,7 +194,7 @@ class Accounts:
             self.sessions += is_new
 
     def ended(self, session: Session) -> None:
-        """A session is over."""
+        """A session ended."""
         account = session.account
         was_present, was_absent = session in account.present, session in account.absent
         account.present.pop(session, None)
@@ -204,7 +204,7 @@ class Accounts:
             self.sessions -= was_present or was_absent
 
     def move(self, session: Session, account: Account) -> None:
-        """A session has found its user."""
+        """Move a session to the account of its user."""
         was_present = session in session.account.present
         self.ended(session)
         session.account.bytes -= session.bytes
@@ -218,7 +218,7 @@ class Accounts:
     # --- retained messages ---------------------------------------------------------------------
 
     def retain(self, account: Account, messages: int, size: int) -> None:
-        """So many retained messages and bytes more, or less, are the account's."""
+        """Count more retained messages and bytes for the account; negative: fewer."""
         account.retained += messages
         account.retained_bytes += size
         if not account.is_inside:
@@ -227,13 +227,16 @@ class Accounts:
 
 
 class Quotas:
-    """What a user may hold, out of the limits in force: of what cannot be taken back no more than
-    this, and of connections and sessions that much at any rate."""
+    """The quotas of a user under the limits in force.
+
+    Memory, retained messages and the store cannot be taken back from a user: their quotas are upper
+    limits. Connections and sessions can: their quotas are what each user is guaranteed.
+    """
 
     __slots__ = ("connections", "memory", "retained", "retained_bytes", "sessions", "stored")
 
     def __init__(self, limits: Limits, memory: int, stored: int) -> None:
-        """`memory` and `stored` are what users may use of those in all, in bytes."""
+        """`memory` and `stored` are what all users together may use of these, in bytes."""
         user = limits.user
         self.connections = Quota.of(limits.connections, user.connections)
         self.sessions = Quota.of(limits.sessions, user.sessions)

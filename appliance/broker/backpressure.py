@@ -13,8 +13,8 @@ wait is limited by these rules; after it `queue_full` decides.
   holds them for little longer.
 * All readers together hold a publisher for at most PUBLISHER_PATIENCE at a time, and in the long
   run for MESSAGE_PATIENCE per message: colluding readers can slow it to 100 messages a second, but
-  no further. Time in which it waited for the disk or the computer, and not for a reader, counts by the
-  factor LEAST_COUNTED: such waits are at most four times as long, down to 25 messages a second.
+  no further. Time in which it waited for the disk or the computer, and not for a reader, counts by
+  the factor LEAST_COUNTED: such waits are at most four times as long, down to 25 messages a second.
 * Nothing else waits: neither other publishers, nor the publisher's earlier QoS 0 messages, nor its
   acknowledgements, so that two clients that publish to each other drain each other's queues.
 
@@ -52,7 +52,7 @@ class Waiting(Protocol):
 class Allowance:
     """Seconds that may be spent waiting; progress earns more.
 
-    Once used up it is usable again when it is half full: otherwise each message would wait a little.
+    Once used up it is usable again when it is half full, or each message would wait a little.
     """
 
     __slots__ = ("_most", "left", "used_up")

@@ -1,10 +1,10 @@
-"""Faults of our own: whatever escapes while one client, call, will, route or timer is served.
+"""Containment of internal errors: an exception ends what it occurred in, and nothing else.
 
-Each place where work comes in from outside is an *entry* and has a name: a received chunk, a turn,
-a timer, a commit, a batch from ROS, a command. It catches what escapes, ends the one thing that was
-being served, hands the exception to `Faults.caught`, and sets up what comes next either way. What
-the event loop calls back is contained by `appliance.net.callbacks`, the rest by `Faults.run`, or by
-a `try` of its own where a call more would cost too much.
+Each point where work enters from outside is an *entry* and has a name: a received chunk, a turn, a
+timer, a commit, a batch from ROS, a command. It catches the exception, ends the one client, call,
+will, route or timer that was served, passes the exception to `Faults.caught`, and in any case
+schedules the next work. Callbacks of the event loop are contained by `appliance.net.callbacks`,
+others by `Faults.run`, or by their own `try` where another call would cost too much.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Places that are told apart; faults in further ones are counted, and told as a flood is.
+#: Places in the code whose first error is logged in full; further places are rate limited.
 PLACES = 64
 
-#: Characters that are told of what was served, and of what went wrong: both may be a stranger's.
+#: The limit of characters that are logged of the served object and of the error: both may contain
+#: a client's text.
 LONGEST = 200
 
 
 class Faults:
-    """Counts what was caught, tells the log without a flood, and has reports written.
+    """Counts caught exceptions, logs them with a rate limit, and has crash reports written.
 
-    `report` writes one and returns where it is, None when there is none; it is asked once for each
-    place in the code, and it is its own affair how many there may be in all.
+    `report` writes a report and returns its path, or None; it is called once for each place in the
+    code, and may limit the number of reports itself.
     """
 
     def __init__(self, rate_limited_log: RateLimitedLog | None = None) -> None:
         #: Seconds of the broker's clock.
         self.now = 0.0
-        #: How many there were since the start; in all, and by entry.
+        #: The number of exceptions since the start: in all, and by entry.
         self.count = 0
         self.by_entry: dict[str, int] = {}
-        #: The last one, in words: empty while there was none.
+        #: The last exception, as a text; empty while there was none.
         self.last = ""
         #: The last report that was written.
         self.reported = ""
@@ -48,7 +49,7 @@ class Faults:
         self._places: set[str] = set()
 
     def caught(self, entry: str, error: BaseException, served: object = "") -> None:
-        """Count and tell what escaped at the entry, while `served` was; never raises."""
+        """Count and log an exception at an entry, which occurred for `served`; never raises."""
         self.count += 1
         self.by_entry[entry] = self.by_entry.get(entry, 0) + 1
         what = f"a fault in the appliance ({entry})"
@@ -57,8 +58,8 @@ class Faults:
             what += f" while it served {name}" if name else ""
             self.last = f"{what}: {_words(error)}"
             self._log(entry, error, what)
-        except Exception:  # to tell of a fault must not become one
-            log.exception("%s, and it could not be told", what)
+        except Exception:  # an error in logging must not escape
+            log.exception("%s, and it could not be logged", what)
 
     def _log(self, entry: str, error: BaseException, what: str) -> None:
         place = f"{entry} {type(error).__name__} {_place(error)}"
@@ -75,7 +76,7 @@ class Faults:
             log.error("%s; %s", self.last, ended, exc_info=error)
 
     def run(self, entry: str, work: Callable[..., T], *args: object, otherwise: T) -> T:
-        """What `work` returns; `otherwise` when it fails, which is caught."""
+        """Return the result of `work`; if it raises, catch that and return `otherwise`."""
         try:
             return work(*args)
         except Exception as error:
@@ -92,7 +93,7 @@ def _words(error: BaseException) -> str:
 
 
 def _place(error: BaseException) -> str:
-    """Where in the code it was raised."""
+    """The file and line where it was raised."""
     trace = error.__traceback__
     if trace is None:
         return ""

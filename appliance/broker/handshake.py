@@ -1,4 +1,4 @@
-"""What a CONNECT asks for, what it gets of that, and how CONNACK says so."""
+"""Negotiation of a connection: what a CONNECT requests, what is granted, and the CONNACK."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
-#: Bytes of a string, at most (5.0 section 1.5.4).
+#: The longest string, in bytes (5.0 section 1.5.4).
 LONGEST_STRING = 0xFFFF
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What holds for one connection; times in seconds, 0 for none."""
+    """The values granted to one connection; times in seconds, 0 for none."""
 
     keep_alive: int
     expiry: int
-    #: QoS 1 and 2 messages that may be on their way to the client.
+    #: QoS 1 and 2 messages that may be in flight to the client.
     window: int
-    #: Topic names that may be shortened to a number on the way to the client.
+    #: Topic aliases that may be used towards the client.
     aliases: int
-    #: Whether it may be told more than a reason code (Request Problem Information).
+    #: Whether it accepts reason strings (Request Problem Information).
     explain: bool
 
 
 def agree(connect: Connect, limits: Limits) -> Agreement:
-    """What the client asked for, as far as the limits allow.
+    """Grant what the client requests, as far as the limits allow.
 
     Raises:
-        ProtocolError: 0x85, a 3.1.1 client cannot be told that its keep alive is too long.
+        ProtocolError: 0x85, the keep alive of a 3.1.1 client is too long, which CONNACK cannot say.
     """
     expiry = _number(connect, Property.SESSION_EXPIRY_INTERVAL, 0)
     if connect.version != 5:
@@ -48,12 +48,12 @@ def agree(connect: Connect, limits: Limits) -> Agreement:
 
 
 def maximum_packet_size(connect: Connect) -> int:
-    """The largest packet that the client takes, in bytes, from the first answer on; 0 for any."""
+    """The largest packet that the client accepts, in bytes, CONNACK included; 0 for any."""
     return _number(connect, Property.MAXIMUM_PACKET_SIZE, 0)
 
 
 def _keep_alive(connect: Connect, limit: int) -> int:
-    """Only a limit below the protocol's own caps what was asked for."""
+    """The keep alive; only a limit below the protocol's maximum reduces it."""
     asked = connect.keep_alive
     if limit == 0xFFFF or 0 < asked <= limit:
         return asked
@@ -73,10 +73,10 @@ def connack_properties(
     features: Features,
     authentication: Properties,
 ) -> Properties | None:
-    """What the client must know to keep within the limits, in mosquitto's order.
+    """The properties of CONNACK, in mosquitto's order: the limits that the client must observe.
 
-    Whatever is as the client asked, or as the standard says without it, is left out.
-    `authentication` is what ends an enhanced authentication.
+    Values that are as requested, or the standard's default, are left out. `authentication` are the
+    last properties of an enhanced authentication.
     """
     if connect.version != 5:
         return None
@@ -119,7 +119,7 @@ def pending_will(connect: Connect) -> PendingWill | None:
 
 
 def is_text(payload: bytes, properties: Properties | None) -> bool:
-    """Whether a payload that says it is UTF-8 text is that (Payload Format Indicator)."""
+    """Whether the payload is UTF-8 text, if the Payload Format Indicator says so."""
     if not properties or not properties.get(Property.PAYLOAD_FORMAT_INDICATOR):
         return True
     try:

@@ -95,7 +95,7 @@ class Inflow:
         self._received = 0
         self._was_full = False
         self._most = 0.0
-        #: The bytes received until the last `look`, and the shortest time until the next in seconds.
+        #: The bytes received until the last `look`, and the least seconds until the next.
         self._seen = 0
         self._interval = PAUSE_BEHIND
 

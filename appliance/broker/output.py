@@ -1,4 +1,4 @@
-"""What one network client is sent: encoded for it, and written once what it depends on is kept."""
+"""The output of one network client: packets are encoded, and written once the store allows."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Disconnect, Packet, Puback, Pubrec, Suback
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
-#: Bytes that a client is sent before the next flush. What waits in its session waits on, until the
-#: network has taken these: it is the network that says how fast a client is.
+#: The limit of PUBLISH bytes between two flushes. Further messages stay in the session's queue
+#: until the network has taken these, so that the network determines the client's rate.
 OUTPUT_LIMIT = 1024 * 1024
 
-#: The longest topic, in bytes, that is given a number: the names are kept for each client.
+#: The longest topic, in bytes, that gets a topic alias: the topics are stored for each client.
 LONGEST_ALIASED = 512
 
-#: What a refusal is sent as when it has a reason string, by its first byte.
+#: The packet classes of refusals with a reason string, by first byte.
 _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
 #: Why a message is refused while the store cannot take it.
@@ -32,58 +32,58 @@ LONGEST_REASON = 256
 
 
 def in_words(reason: str) -> Properties:
-    """The reason string of an answer; what no string of MQTT may have in it is left out."""
+    """The reason string as properties; characters that MQTT strings may not contain are removed."""
     text = reason if len(reason) <= LONGEST_REASON else reason[: LONGEST_REASON - 1] + "…"
     return {Property.REASON_STRING: text.encode(errors="replace").decode().replace("\0", "")}
 
 
 class OutputOwner(Protocol):
-    """The conversation that the output is one side of."""
+    """The owner of an output: the handler of its client."""
 
     def later(self) -> None:
-        """Let the other clients have their turn, then go on."""
+        """Continue after the turns of the other clients."""
 
     def close(self, reason: ReasonCode, message: str) -> None:
-        """Tell the client why, and end the connection."""
+        """Send the reason to the client, and close the connection."""
 
     def lost(self) -> None:
         """The connection ended without a DISCONNECT."""
 
 
 class Output:
-    """The way to one network client; the `Link` of its session once it has logged in.
+    """Encodes packets for one network client; the `Link` of its session after the login.
 
-    What it is sent is collected, and goes to the `Transport` at the flush.
+    Packets are buffered, and passed to the `Transport` at the flush.
     """
 
     def __init__(self, broker: Broker, transport: Transport, client: OutputOwner) -> None:
         self.transport = transport
         self.writable = True
         self.session: Session | None = None
-        #: That of the client's CONNECT, and what else was agreed with it.
+        #: The protocol version and the Maximum Packet Size (0: no limit) of the client's CONNECT.
         self.version = 0
         self.maximum_packet_size = 0
-        #: Whether what is published has to be looked at: for its size, or for what it passes.
-        self._looks = False
-        #: Whether it wants to be told why; and whether it is, of what rules and limits decide.
+        #: Whether each PUBLISH is checked for its size, and for older messages that it overtakes.
+        self._checks_each = False
+        #: Whether the client accepts reason strings, and whether it gets those of rules and limits.
         self.may_explain = False
         self.explains = False
-        #: The batch of the store that what it is answered depends on, and what waits for which.
+        #: The batch of the store that the answers depend on, and the packets that wait, by batch.
         self.batch = 0
         self._waiting: deque[tuple[int, list[bytes]]] = deque()
         self._broker = broker
         self._accounting = broker.accounting
         self._counters = broker.counters
         self._header_cache = broker.header_cache
-        #: None at the end: the two know each other, and nobody looks for such circles.
+        #: Set to None at the end to break the reference cycle.
         self._client: OutputOwner | None = client
         self._out: list[bytes] = []
-        self._out_size = 0  # of the PUBLISH packets in there, from their sessions
-        self._full = False  # not writable until the flush, for OUTPUT_LIMIT
-        #: Numbers of the topic names that the client was sent; None when it takes none.
+        self._out_size = 0  # bytes of the PUBLISH packets in it
+        self._full = False  # not writable until the flush, because of OUTPUT_LIMIT
+        #: The topic aliases of the client; None when it accepts none.
         self._aliases: dict[str, int] | None = None
         self._alias_maximum = 0
-        #: Whether a packet may go out as it came in from another client.
+        #: Whether a packet from another client may be forwarded unchanged.
         self._mirrors = True
         self._closed = False
 
@@ -91,17 +91,17 @@ class Output:
         return str(self._client or self.session or "a client")
 
     def open(self, session: Session, aliases: int, *, explains: bool) -> None:
-        """The client has logged in: send it what its session has, with so many topic aliases."""
+        """The client has logged in: send the session's messages, with so many topic aliases."""
         self.session = session
         self._alias_maximum = aliases
         self._aliases = {} if aliases else None
         self.explains = explains
-        self._look_at_all(False)
+        self._set_checks(False)
 
-    def _look_at_all(self, has_waiting: bool) -> None:
-        """`has_waiting`: large messages wait, and newer ones are not to pass them unseen."""
-        self._looks = has_waiting or bool(self.maximum_packet_size)
-        self._mirrors = not (self._looks or self._alias_maximum)
+    def _set_checks(self, has_waiting: bool) -> None:
+        """With `has_waiting`, check for each PUBLISH whether it overtakes a large message."""
+        self._checks_each = has_waiting or bool(self.maximum_packet_size)
+        self._mirrors = not (self._checks_each or self._alias_maximum)
 
     # --- the Link of the session ---------------------------------------------------------------
 
@@ -114,14 +114,14 @@ class Output:
         retain: bool,
         subscription_ids: list[int] | None,
     ) -> None:
-        """Send a PUBLISH; its head, packet id and payload are joined only at the flush."""
+        """Send a PUBLISH; its header, packet id and payload are joined only at the flush."""
         first = 0x30 | qos << 1 | retain
         if dup:
             first |= 8
         version = self.version
-        if self._looks and self._is_refused(first, message, subscription_ids):
+        if self._checks_each and self._is_refused(first, message, subscription_ids):
             self._counters.publish_dropped += 1
-            if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were sent and done
+            if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were acknowledged
                 self.session.give_up(packet_id)
             return
         out = self._out
@@ -156,30 +156,30 @@ class Output:
         counters.publish_bytes_sent += len(message.payload)
 
     def is_behind(self) -> bool:
-        """Whether the network has yet to take what it was given, or will be at the flush."""
+        """Whether the network has not yet taken earlier output, or will not at the flush."""
         if self._out_size > LARGE_MESSAGE:
             self._full = True
         elif not self.transport.is_behind():
             return False
-        self._look_at_all(True)
+        self._set_checks(True)
         return True
 
     def _wait_for_its_turn(
         self, message: Message, first: int, subscription_ids: list[int] | None
     ) -> bool:
-        """Give a large message of QoS 0 back to the session when the client is behind.
+        """Return a large QoS 0 message to the session's queue when the client is behind.
 
-        What comes then, and is newer or smaller, is not behind it.
+        Newer and smaller messages may then overtake it.
         """
         session = self.session
-        # With `keep` there is a queue, which nothing may pass.
+        # With `keep` the order of the queue is preserved.
         if first & 0x06 or session is None or self._accounting.limits.keep or not self.is_behind():
             return False
         session.keep_latest(cast(Delivery, (message, 0, bool(first & 1), subscription_ids, None)))
         return True
 
     def mirror(self, packet: bytes, version: int, payload_size: int) -> bool:
-        """Send a PUBLISH of QoS 0 as it came in, unless something stands against it."""
+        """Forward a QoS 0 PUBLISH unchanged, if this client can take it so."""
         if version != self.version or not self.writable or not self._mirrors:
             return False
         out = self._out
@@ -194,7 +194,7 @@ class Output:
     def _encode(
         self, first: int, packet_id: int, message: Message, subscription_ids: list[int] | None
     ) -> bytes:
-        """An MQTT 5 packet with what is this client's own: the slow way."""
+        """Encode an MQTT 5 packet with this client's own properties: the slow path."""
         alias, named = 0, True
         aliases = self._aliases
         if aliases is not None:
@@ -215,22 +215,24 @@ class Output:
         )
 
     def _is_refused(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
-        """Whether the client does not take a message of that size. One that is sent takes the place
-        of an older one of its topic that waits [MQTT-4.6.0-6]."""
+        """Whether the message exceeds the client's Maximum Packet Size.
+
+        A message that is sent replaces a waiting older one of its topic [MQTT-4.6.0-6].
+        """
         if self.maximum_packet_size and self._too_large(first, message, subscription_ids):
             return True
         session = self.session
-        if session is not None and not first & 0x07:  # what is retained may be the older of the two
+        if session is not None and not first & 0x07:  # a retained message may be the older one
             session.overtake(message.topic)
             if not session.large:
-                self._look_at_all(False)
+                self._set_checks(False)
         return False
 
     def _too_large(self, first: int, message: Message, subscription_ids: list[int] | None) -> bool:
         limit = self.maximum_packet_size
         if message.size <= limit and not subscription_ids:
             return False
-        # A topic gets no new alias from a message that is near the limit, see `_encode`.
+        # A message near the limit assigns no new topic alias, see `_encode`.
         alias = self._aliases.get(message.topic, 0) if self._aliases else 0
         packet = message.encode_for(
             first, 1, subscription_ids, self._accounting.now, alias, named=not alias
@@ -242,24 +244,24 @@ class Output:
         self.acknowledge(0x62, packet_id, ReasonCode.SUCCESS)
 
     def later(self) -> None:
-        """Let the other clients have their turn."""
+        """Continue after the turns of the other clients."""
         if self._client is not None:
             self._client.later()
 
     def peer_status(self) -> PeerStatus:
-        """How the client's computer answers."""
+        """The state of the connection to the client's computer."""
         return self.transport.peer_status()
 
     def probe(self) -> None:
-        """Have the client's computer answer, if it can."""
+        """Make the client's computer answer, if it is alive."""
         self.transport.probe()
 
     def withhold(self, seconds: float) -> None:
-        """Let nothing out for so long."""
+        """Send nothing for this time."""
         self.transport.withhold(seconds)
 
     def close(self, reason: ReasonCode, message: str) -> None:
-        """End the connection with a DISCONNECT that says why; its will is due."""
+        """Close the connection with a reason code in DISCONNECT; the will is due."""
         if self._client is not None:
             self._client.close(reason, message)
 
@@ -268,7 +270,7 @@ class Output:
     def acknowledge(self, first: int, packet_id: int, code: int, reason: str = "") -> None:
         """Send PUBACK, PUBREC, PUBREL or PUBCOMP in its shortest form.
 
-        `reason` is for a refusal, and for clients that are to be told.
+        `reason` is sent with a refusal to clients that get reason strings.
         """
         packet = bytes((first, 2, packet_id >> 8, packet_id & 0xFF))
         if code:
@@ -278,7 +280,7 @@ class Output:
                     return
                 packet = bytes((first, 3, packet_id >> 8, packet_id & 0xFF, code))
             elif code == ReasonCode.QUOTA_EXCEEDED and self._accounting.failing:
-                # 3.1.1 cannot refuse, and what is acknowledged must be kept.
+                # 3.1.1 cannot refuse, and an acknowledged message must be stored.
                 raise ProtocolError(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
         out = self._out
         if not out:
@@ -287,9 +289,9 @@ class Output:
         self._counters.control_sent += 1
 
     def reject_publish(self, first: int, packet_id: int, rejection: PublishRejection) -> None:
-        """Acknowledge with what ROS has against a message: its publisher alone can mend that.
+        """Acknowledge a message with the reason why it could not be used, such as ROS's.
 
-        To 3.1.1 it is acknowledged as any other.
+        Clients of 3.1.1 get a normal acknowledgement.
         """
         if self.version == 5 and self.may_explain:
             words: Properties = {Property.REASON_STRING: rejection.reason}
@@ -298,14 +300,14 @@ class Output:
             self.acknowledge(first, packet_id, rejection.code)
 
     def send(self, packet: Packet) -> bool:
-        """Send any packet; False when it is larger than the client takes, also without words."""
+        """Send any packet; False if it is too large for the client even without reason string."""
         data = packet.encode(self.version or 4)
         limit = self.maximum_packet_size
         if limit and len(data) > limit:  # [MQTT-3.1.2-24]
             if (
                 isinstance(packet, Connack | Puback | Pubrec | Suback | Disconnect)
                 and packet.properties
-                and Property.REASON_STRING in packet.properties  # nothing else is with it
+                and Property.REASON_STRING in packet.properties  # the only property
             ):
                 # [MQTT-3.2.2-19], [MQTT-3.4.2-2], [MQTT-3.5.2-2], [MQTT-3.9.2-1], [MQTT-3.14.2-3]
                 packet.properties = None
@@ -318,9 +320,9 @@ class Output:
         return True
 
     def end(self) -> None:
-        """Send nothing more; the flush writes the last bytes, and closes the connection.
+        """Accept no further packets; the flush writes the last ones, and closes the connection.
 
-        Like all bytes they wait for what they acknowledge to be kept.
+        Like all packets these wait until the changes that they acknowledge are stored.
         """
         self._closed = True
         self._client = None
@@ -331,7 +333,7 @@ class Output:
     # --- the flush, and the network ------------------------------------------------------------
 
     def flush(self) -> None:
-        """Write what was sent since the last flush, and close if it was the last."""
+        """Write the packets since the last flush, and close the connection after `end`."""
         out = self._out
         if out:
             self._out = []
@@ -350,14 +352,14 @@ class Output:
                 self.resume_writing()
 
     def wait(self, committed: int) -> bool:
-        """Keep what was sent since the last flush, if it depends on a later batch than this."""
+        """Hold the packets since the last flush back if they depend on a later batch than this."""
         batch = self.batch
         session = self.session
         if session is not None and session.batch > batch:
             batch = session.batch
         waiting = self._waiting
         if waiting and waiting[-1][0] > batch:
-            batch = waiting[-1][0]  # nothing passes what waits
+            batch = waiting[-1][0]  # the order is preserved
         if batch <= committed:
             return False
         out, self._out = self._out, []
@@ -370,7 +372,7 @@ class Output:
         return True
 
     def release(self, committed: int) -> bool:
-        """Write what waited for this batch; True when something waits for a later one."""
+        """Write the packets that waited for this batch; True when others wait for a later one."""
         waiting = self._waiting
         if self._full and not self._out:
             self.writable = not self._closed
@@ -389,7 +391,7 @@ class Output:
         return False
 
     def abandon(self) -> None:
-        """Close without sending what waits: what it would acknowledge could not be kept."""
+        """Close without sending held packets: the changes that they acknowledge were not stored."""
         self._waiting.clear()
         self._out.clear()
         try:
@@ -399,12 +401,12 @@ class Output:
             self.transport.close()
 
     def resume_writing(self) -> None:
-        """The network takes bytes again: send what waited."""
+        """The network takes bytes again: send queued messages."""
         self.writable = True
         if self.session is not None and self.session.link is self:
             self.session.pump()
 
     def caught_up(self) -> None:
-        """The network has taken all it was given: send the large messages that waited for that."""
+        """The network has taken all output: send the large messages that waited for that."""
         if self.writable and self.session is not None and self.session.link is self:
             self.session.pump()

@@ -1,4 +1,4 @@
-"""The retained messages: one a topic, bounded in number and bytes, each until it expires."""
+"""Retained messages: one per topic, limited in number and bytes, each until it expires."""
 
 from __future__ import annotations
 
@@ -16,33 +16,32 @@ from appliance.broker.session import LEVEL_SIZE
 from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
 
-#: The cost to retain a message, or no longer; and levels of its topic for one unit of cost on top.
+#: The cost of retaining or deleting a message; LEVELS_PER_COST_UNIT levels of the topic add one.
 RETAIN_COST = 3
 LEVELS_PER_COST_UNIT = 2
 
 
-#: What is kept of a retained message beside it, in bytes: whose it is, and when it expires.
+#: The memory of a retained message beside itself, in bytes: for its owner, and for its expiry.
 OWNER_SIZE = 128
 EXPIRY_SIZE = 320
 
 
 def retained_size(message: Message) -> int:
-    """Bytes that are counted for a retained message: it, and its topic's levels in the tree."""
+    """Bytes counted for a retained message: itself, and the levels of its topic in the tree."""
     topic = message.topic
     size = message.size + OWNER_SIZE + (EXPIRY_SIZE if message.expires_at is not None else 0)
     levels = topic.count("/")
     return size + (text_size(topic) + LEVEL_SIZE * levels if levels else 0)
 
 
-#: What the appliance itself is told that retains more than all users together may.
+#: The reason when the appliance itself would retain more than all users together may.
 _IN_ALL: Final = "there is no room left (broker.limits.{})"
 
 
 class RetainedMessages:
-    """The retained messages by topic; `changed` is told of each that is new, replaced or gone.
+    """The retained messages by topic; `changed` is called when one is set, replaced or deleted.
 
-    One that is gone it is told as an empty message. A message is in the account of who published
-    it, the last one of several.
+    A deletion is passed as an empty message. A message counts for its last publisher's account.
     """
 
     def __init__(
@@ -51,15 +50,15 @@ class RetainedMessages:
         rate_limited_log: RateLimitedLog,
         changed: Callable[[Message, Account], None],
     ) -> None:
-        #: Bytes of all of them, see `retained_size`.
+        #: Bytes of all messages, see `retained_size`.
         self.bytes = 0
         self._accounting = accounting
         self._rate_limited_log = rate_limited_log
         self._changed = changed
         self._messages: TopicTree[Message] = TopicTree()
         self._owners: dict[str, Account] = {}
-        #: When they expire, soonest first, each with a number. Those that were replaced or deleted
-        #: meanwhile are here, too, but as two numbers only.
+        #: A heap of expiry times, each with a number. Messages that were replaced or deleted leave
+        #: these two numbers behind, and nothing else.
         self._expiring: list[tuple[float, int]] = []
         self._numbers: dict[str, int] = {}
         self._topics: dict[int, str] = {}
@@ -77,15 +76,15 @@ class RetainedMessages:
         return self._messages.find(topic_filter)
 
     def find_in_steps(self, topic_filter: str) -> Iterator[tuple[str, Message] | None]:
-        """`find`, with a None now and then, so that a long search can be put off in its middle."""
+        """Like `find`, but yields None now and then, so that a long search can be suspended."""
         return self._messages.find_in_steps(topic_filter)
 
     def owner(self, topic: str) -> Account:
-        """In whose account the topic's retained message is. Raises KeyError: there is none."""
+        """The account of the topic's retained message. Raises KeyError if there is none."""
         return self._owners[topic]
 
     def restore(self, messages: list[tuple[Message, Account]]) -> None:
-        """Take up what the store has kept."""
+        """Take over the messages of the store."""
         for message, owner in messages:
             self._put(message, owner)
 
@@ -117,11 +116,11 @@ class RetainedMessages:
         return True
 
     def shortage(self, message: Message, owner: Account) -> str:
-        """Why the message cannot be retained, in words, and which key says so; empty: it can."""
+        """Why the message cannot be retained, with the configuration key; empty if it can."""
         return self._shortage(message, self._messages.get(message.topic), owner)
 
     def delete(self, topic: str) -> None:
-        """Retain nothing for the topic any more."""
+        """Delete the topic's retained message."""
         self.keep(Message(topic, b"", retain=True), self._accounting.accounts.inside)
 
     def _put(self, message: Message, owner: Account) -> None:
@@ -144,14 +143,14 @@ class RetainedMessages:
             del self._topics[number]
 
     def _shortage(self, message: Message, old: Message | None, owner: Account) -> str:
-        """Why it may not take the old one's place, which makes room for it whosever it is."""
+        """Why it cannot be retained; replacing `old` frees that one's room, whoever owns it."""
         accounting = self._accounting
         accounts, limits, quotas = accounting.accounts, accounting.limits, accounting.quotas
         size = retained_size(message)
         before = self._owners[message.topic] if old is not None else None
         freed = retained_size(old) if old is not None else 0
         own = freed if before is owner else 0
-        if owner.is_inside:  # what users have leaves it as much as all of them have
+        if owner.is_inside:  # the appliance may hold as much as all users together
             if owner.retained >= limits.retained_messages + (before is owner):
                 return _IN_ALL.format("retained_messages")
             is_much = owner.retained_bytes - own + size > limits.retained_bytes
@@ -191,13 +190,13 @@ class RetainedMessages:
         self._numbers[message.topic] = number
         self._topics[number] = message.topic
         heapq.heappush(self._expiring, (message.expires_at, number))
-        # Those that were replaced are not kept until their time comes.
+        # Remove the entries of replaced messages before they are due.
         if len(self._expiring) > 2 * len(self._topics) + 64:
             self._expiring = [entry for entry in self._expiring if entry[1] in self._topics]
             heapq.heapify(self._expiring)
 
     def expire(self, now: float) -> bool:
-        """Delete those whose time is over, as many as one turn is for; True when there are more."""
+        """Delete expired messages, up to the cost limit of a turn; True when there are more."""
         counters = self._accounting.counters
         end = counters.cost + COST_PER_TURN
         while self._expiring and self._expiring[0][0] <= now:

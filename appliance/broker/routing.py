@@ -1,4 +1,4 @@
-"""Where a topic's messages go: all subscriptions, and what the rules say to them."""
+"""Routing: which subscriptions match a topic, and what the access rules allow."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import SubscriptionTree, check_topic, parse_shared
 
-#: Topics a session's routes are cached for; a client that publishes to more starts over, so that
-#: a stranger's invented topics cannot grow the cache.
+#: The limit of cached routes per session; the cache is cleared above it, so that invented topics
+#: cannot make it grow.
 CACHED_ROUTES = 1024
 
-#: And the longest of these topics, in bytes.
+#: The longest topic whose route is cached, in bytes.
 CACHED_TOPIC = 512
 
-#: What an entry of these caches takes, in bytes, beside the topic; and each of its targets.
+#: The memory of a cache entry beside its topic, in bytes, and of each of its targets.
 ROUTE_SIZE = 350
 TARGET_SIZE = 96
 
-#: The part of `limits.memory` that the caches of all sessions may take beside it.
+#: The limit of the caches of all sessions, as a fraction of `limits.memory` and in addition to it.
 CACHED_IN_ALL = 1 / 8
 
-#: Questions about one route that a message waits for at a time.
+#: Pending decisions on one route that a message waits for at a time.
 UNDECIDED = 16
 
 #: The cost to find a route, see `Counters.cost`; each match comes on top, and what the search
@@ -49,39 +49,39 @@ _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
 
 @dataclass(slots=True)
 class Fanout:
-    """What is known about one topic for one publishing session, until the epoch changes."""
+    """The route of one topic for one publishing session; valid until the epoch changes."""
 
     topic: str
     allowed: bool
-    #: The rule that decided.
+    #: The rule that allowed or denied it.
     reason: str
     targets: list[Target]
-    #: Shared subscriptions, and those of their members that may receive the topic.
+    #: Shared subscriptions, each with the members that may receive the topic.
     shares: list[tuple[Share, list[Target]]]
-    #: Whether there is any subscription to the topic, be it of a client that gets nothing.
+    #: Whether the topic has any subscription, even of a client that may not receive it.
     subscribed: bool
-    #: What could not be decided yet, as somebody is asked: such a route is not kept.
+    #: Decisions that are pending; a route with any is not cached.
     undecided: list[AccessQuery]
 
 
 class Router:
-    """Finds the route of a topic, and keeps it a session until the epoch changes.
+    """Finds the route of a topic, and caches it in the publishing session until the epoch changes.
 
-    `sessions` are all there are, by client id: what is known of topics is kept in them.
+    `sessions` are all sessions by client id; they contain the caches.
     """
 
     def __init__(
         self, access: Access, accounting: Accounting, sessions: dict[str, Session]
     ) -> None:
-        #: The rules in force.
+        #: The access rules in force.
         self.access = access
-        #: Those of them who may have to ask somebody else; None where nobody has to.
+        #: The rules if they may have to wait for a plugin's answer; None if they never do.
         self.pending_decisions: PendingDecisions | None = None
-        #: What could not be decided of the route that is being found.
+        #: The pending decisions of the route that is being looked up.
         self._undecided: list[AccessQuery] | None = None
-        #: By topic, what parts of the appliance have to say about who publishes to it.
+        #: By topic, the parts of the appliance that restrict who may publish to it.
         self.guards: dict[str, list[PublishGuard]] = {}
-        #: Grows whenever a cached route may be wrong.
+        #: Incremented whenever a cached route may be outdated.
         self.epoch = 0
         #: Shared subscriptions by their whole filter.
         self.shares: dict[str, Share] = {}
@@ -92,7 +92,7 @@ class Router:
         self._subscriptions: SubscriptionTree[tuple[Session, Subscription] | Share] = (
             SubscriptionTree()
         )
-        #: Bytes that went into the sessions' caches since these were last cleared.
+        #: Bytes that were added to the sessions' caches since these were last cleared.
         self._cached = 0
 
     def __len__(self) -> int:
@@ -100,11 +100,11 @@ class Router:
         return len(self._subscriptions)
 
     def changed(self) -> None:
-        """Let every route be found anew: what decides about them is not what it was."""
+        """Invalidate all cached routes."""
         self.epoch += 1
 
     def join(self, session: Session, subscription: Subscription) -> None:
-        """Put a subscription into the tree, or a member into its group."""
+        """Add a subscription to the tree, or a member to its group."""
         self.epoch += 1
         topic_filter = subscription.filter
         shared = parse_shared(topic_filter)
@@ -118,7 +118,7 @@ class Router:
         share.members[session] = subscription
 
     def leave(self, session: Session, topic_filter: str) -> None:
-        """Take a subscription out of the tree, or a member out of its group; may be done twice."""
+        """Remove a subscription from the tree, or a member from its group; may be called twice."""
         self.epoch += 1
         share = self.shares.get(topic_filter)
         if share is None:
@@ -131,7 +131,7 @@ class Router:
             del self.shares[topic_filter]
 
     def route(self, session: Session, topic_wire: bytes) -> Fanout:
-        """Where messages of the session to the topic go, looked up once an epoch.
+        """The route of the session's messages to the topic, looked up once in an epoch.
 
         Raises:
             ProtocolError: the topic is not valid; the connection has to end.
@@ -203,7 +203,7 @@ class Router:
         return self.decide(session.identity, Action.PUBLISH, topic)
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
-        """What the rules in force say; when that ends in a fault, it is not allowed."""
+        """The decision of the access rules; an exception in them denies."""
         decision = self._faults.run(
             "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
         )
@@ -214,7 +214,7 @@ class Router:
         return decision
 
     def excess(self, topic: str) -> str:
-        """What the topic or filter has too much of, if anything."""
+        """Which limit the topic or filter exceeds; empty for none."""
         limits = self._accounting.limits
         if topic.count("/") >= limits.topic_levels:
             return f"more than {limits.topic_levels} levels (broker.limits.topic_levels)"
@@ -225,9 +225,9 @@ class Router:
     def _targets(
         self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
     ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
-        """One entry a session, however many of its subscriptions match [MQTT-3.3.5-1].
+        """One target per session, however many of its subscriptions match [MQTT-3.3.5-1].
 
-        Shared subscriptions come on top: a session gets a message once more for each that chooses
+        Shared subscriptions are separate: a session gets a further copy for each group that chooses
         it (5.0 section 4.8.2).
         """
         merged: dict[str, Target] = {}
@@ -255,8 +255,8 @@ class Router:
     def _members(self, share: Share, topic: str) -> list[Target]:
         """The members of the group that may receive the topic.
 
-        All are asked about, so that no message misses a group of which anybody may have it: what
-        that takes is cost, for which who published waits.
+        All are checked, so that a group gets the message if any member may receive it. The cost is
+        counted for the publisher.
         """
         self._counters.cost += len(share.members)
         return [
@@ -269,8 +269,8 @@ class Router:
         """Whether the rules in force let the session receive the topic's messages."""
         if session.identity is None:
             return True
-        # Kept beside the routes: those are made anew with every subscription of anybody, which
-        # would ask the rules about all receivers of a topic again.
+        # Cached apart from the routes, which every new subscription invalidates: otherwise the
+        # rules would be evaluated again for all receivers of a topic.
         readable = session.readable
         if session.readable_epoch != self.access.epoch or len(readable) >= CACHED_ROUTES:
             readable.clear()
@@ -286,9 +286,9 @@ class Router:
         return allowed
 
     def may_still_receive(self, session: Session, topic: str) -> bool:
-        """Whether a message that waits may still be sent.
+        """Whether a queued message may still be sent.
 
-        It was allowed when it came: while plugins make up their minds anew it stays so.
+        It was allowed when it was queued, and stays so while a plugin's new decision is pending.
         """
         if session.identity is None or self.may_receive(session, topic):
             return True
@@ -296,7 +296,7 @@ class Router:
 
 
 def _route_size(route: Fanout, topic_wire: bytes) -> int:
-    """Bytes that a route takes in the cache of its session."""
+    """The memory of a route in the cache of its session, in bytes."""
     size = ROUTE_SIZE + text_size(route.topic) + len(topic_wire)
     members = [target for _, members in route.shares for target in members]
     for _, _, _, ids in (*route.targets, *members):

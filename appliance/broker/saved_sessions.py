@@ -1,4 +1,4 @@
-"""Sessions as the store has kept them, and how the broker takes them up again."""
+"""Stored sessions, and how the broker restores them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from appliance.mqtt.packets import Subscription
 
 @dataclass(slots=True)
 class PendingDelivery:
-    """A QoS 1 or 2 message that a session is to be sent; `share` is the filter of its group."""
+    """A stored QoS 1 or 2 message for a session; `share` is the filter of its group, if any."""
 
     message: Message
     qos: int
@@ -26,9 +26,9 @@ class PendingDelivery:
 
 @dataclass(slots=True)
 class SavedSession:
-    """A session and all that belongs to it; times are in seconds of the broker's clock.
+    """A stored session and its state; times are in seconds of the broker's clock.
 
-    `ends_at` is None for one whose client was connected.
+    `ends_at` is None if the client was connected.
     """
 
     identity: Identity
@@ -37,28 +37,27 @@ class SavedSession:
     will: PendingWill | None
     will_at: float | None
     subscriptions: list[Subscription] = field(default_factory=list)
-    #: Those of them whose retained messages were not all sent.
+    #: Those whose replay of retained messages was not finished.
     replaying: list[Subscription] = field(default_factory=list)
-    #: By packet id, in the order sent; None where only PUBREL is left.
+    #: By packet id, in the order sent; None where only PUBREL is left to be sent.
     inflight: dict[int, PendingDelivery | None] = field(default_factory=dict)
     queue: list[PendingDelivery] = field(default_factory=list)
-    #: QoS 2 messages that wait for PUBREL, with the sessions and groups that had no room for them.
+    #: QoS 2 messages that wait for PUBREL, with the sessions and groups without room for them.
     received: dict[int, tuple[Message, list[str], list[str]]] = field(default_factory=dict)
-    #: What the broker made of it.
+    #: The restored session.
     session: Session | None = None
 
 
 def restore(
-    broker: Broker, kept: list[SavedSession], retained: list[tuple[Message, Account]]
+    broker: Broker, saved: list[SavedSession], retained: list[tuple[Message, Account]]
 ) -> None:
-    """Take up the sessions and retained messages of the last run, before anybody connects.
+    """Restore the sessions and retained messages of the last run, before any client connects.
 
-    A client that was connected when that ended counts as gone since now: so do the time that
-    its session is kept, and the delay of its will. A session that was not to outlive its
-    connection is there for its will alone, which the next tick publishes (3.1.1 section
-    3.1.2.5, 5.0 section 3.1.2.5).
+    A client that was connected at the end of that run counts as disconnected now: its session
+    expiry and its will delay begin now. A session that does not outlive its connection is restored
+    for its will only, which the next tick publishes (3.1.1 section 3.1.2.5, 5.0 section 3.1.2.5).
     """
-    for entry in kept:
+    for entry in saved:
         session = Session(entry.identity.client_id, entry.identity, broker.accounting)
         entry.session = broker.sessions[session.client_id] = session
         session.expiry = entry.expiry
@@ -73,35 +72,37 @@ def restore(
         for subscription in entry.subscriptions:
             session.subscribe(subscription)
             broker.router.join(session, subscription)
-    for entry in sorted(kept, key=_left_at):
+    for entry in sorted(saved, key=_left_at):
         assert entry.session is not None
         broker.accounting.accounts.left(entry.session)
-    for entry in kept:  # what is owed names sessions and groups, all of which are there now
-        _restore_owed(broker, entry)
+    for entry in saved:  # deliveries refer to sessions and groups, all of which exist now
+        _restore_deliveries(broker, entry)
     broker.retained.restore(retained)
-    for entry in kept:
+    for entry in saved:
         assert entry.session is not None
-        for subscription in entry.replaying:  # from the beginning: what was sent is not known
+        for subscription in entry.replaying:  # from the beginning: what was sent is unknown
             broker.begin_replay(entry.session, subscription)
 
 
 def _left_at(entry: SavedSession) -> float:
-    # Who was still there then has left last.
+    # Clients that were connected at the end have left last.
     return math.inf if entry.ends_at is None else entry.ends_at - entry.expiry
 
 
-def _restore_owed(broker: Broker, entry: SavedSession) -> None:
-    def delivery(owed: PendingDelivery) -> Delivery:
-        share = broker.router.shares.get(owed.share) if owed.share is not None else None
-        return Delivery(owed.message, owed.qos, owed.retain, owed.subscription_ids, share)
+def _restore_deliveries(broker: Broker, entry: SavedSession) -> None:
+    def delivery(pending: PendingDelivery) -> Delivery:
+        share = broker.router.shares.get(pending.share) if pending.share is not None else None
+        return Delivery(
+            pending.message, pending.qos, pending.retain, pending.subscription_ids, share
+        )
 
     assert entry.session is not None
     entry.session.restore(
         {
-            packet_id: delivery(owed) if owed is not None else None
-            for packet_id, owed in entry.inflight.items()
+            packet_id: delivery(pending) if pending is not None else None
+            for packet_id, pending in entry.inflight.items()
         },
-        [delivery(owed) for owed in entry.queue],
+        [delivery(pending) for pending in entry.queue],
         {
             packet_id: UnreleasedPublish(
                 message,

@@ -1,7 +1,7 @@
-"""SUBSCRIBE and UNSUBSCRIBE: packets of thousands of filters, worked on in portions.
+"""SUBSCRIBE and UNSUBSCRIBE: a packet may have thousands of filters and is processed in steps.
 
-Between two portions it is the turn of other clients. The packet's own client is not read meanwhile,
-so that its answers keep their order.
+Other clients have their turns between the steps. The packet's own client is not read meanwhile, so
+that its answers keep their order.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsu
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_filter, parse_shared
 
-#: Levels of all filters of one SUBSCRIBE or UNSUBSCRIBE.
+#: The limit of levels in all filters of one SUBSCRIBE or UNSUBSCRIBE.
 MAXIMUM_LEVELS = 20_000
 
-#: The cost of a subscription, in and out; its levels come on top.
+#: The cost of adding or removing a subscription; each level of its filter adds one.
 SUBSCRIBE_COST = 20
 
-#: The cost to check a filter, and to look for its retained messages.
+#: The cost of checking a filter, and of looking up its retained messages.
 CHECK_COST = 3
 RETAINED_COST = 3
 
 
-#: Filters about which somebody is asked at a time.
+#: Filters whose pending decisions are requested at a time.
 ASKED_AT_ONCE = 4
 
 
 class AwaitingDecision:
-    """Given in place of an answer, where the work goes on when somebody else has answered."""
+    """Yielded instead of an answer: the work continues when a pending decision has been made."""
 
 
 AWAITING_DECISION: Final = AwaitingDecision()
@@ -48,9 +48,9 @@ def answers(
     wake: Callable[[], None],
     until: float,
 ) -> Iterator[Step]:
-    """Wait until what is asked has been answered, but no longer than `until`.
+    """Wait for pending decisions, but no longer than `until`.
 
-    `questions` gives what is to be asked now, which an answer may change.
+    `questions` returns the current queries, which a decision may change.
     """
     asked = broker.router.pending_decisions
     while asked is not None and broker.now < until:
@@ -68,13 +68,13 @@ def subscribe(
     *,
     explains: bool = False,
 ) -> Iterator[Step]:
-    """Do what the packet asks for; gives its SUBACK, and None where others are to have their turn.
+    """Process the packet; yields its SUBACK, and None where other clients should have a turn.
 
-    Who decides may first have to ask: `wake` is called when it is to be gone on with. With
-    `explains` the first refusal is told in words.
+    If a decision is pending, `wake` is called when the work can continue. With `explains` the
+    SUBACK contains the reason of the first refusal.
 
     Raises:
-        ProtocolError: a filter is none, or they are too many; none of them has any effect then.
+        ProtocolError: a filter is invalid, or there are too many; then none has any effect.
     """
     turn = _Turn(broker)
     subscriptions = packet.subscriptions
@@ -99,14 +99,14 @@ def subscribe(
         codes.append(code)
         if code <= ReasonCode.GRANTED_QOS_2:
             granted.append((subscription, is_new))
-        elif explains and words is None:  # one string for all of them: the first is told
+        elif explains and words is None:  # SUBACK has one string: that of the first refusal
             words = in_words(f"{quote(subscription.filter)}: {reason}")
         if turn.is_over(SUBSCRIBE_COST + subscription.filter.count("/")):
             yield None
     yield Suback(packet.packet_id, codes, words)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
     for subscription, is_new in granted:
         cost = RETAINED_COST
-        if subscription.filter in session.replays:  # the packet has it twice: so it is sent twice
+        if subscription.filter in session.replays:  # it is in the packet twice: replay it twice
             cost += len(session.replays) // 10
             session.pump()
         broker.replay_retained(session, subscription, is_new)
@@ -116,8 +116,8 @@ def subscribe(
 
 
 def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[AccessQuery]:
-    """What is to be decided about them: may it subscribe and, where that says the topic, receive
-    what is retained there?"""
+    """The access queries of subscriptions: to subscribe and, for a filter that is a topic, to
+    receive its retained message."""
     if session.identity is None:
         return []
     found: list[AccessQuery] = []
@@ -130,10 +130,10 @@ def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[
 
 
 def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterator[Step]:
-    """Do what the packet asks for; gives its UNSUBACK, and None as `subscribe` does.
+    """Process the packet; yields its UNSUBACK, and None as `subscribe` does.
 
     Raises:
-        ProtocolError: a filter is none, or they are too many; none of them has any effect then.
+        ProtocolError: a filter is invalid, or there are too many; then none has any effect.
     """
     turn = _Turn(broker)
     for _ in _check(broker, packet.filters, turn):
@@ -147,14 +147,14 @@ def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterat
 
 
 class _Turn:
-    """Counts the cost, and says when it was as much as one turn is for."""
+    """Counts cost, up to the limit of a turn."""
 
     def __init__(self, broker: Broker) -> None:
         self._counters = broker.counters
         self._left = COST_PER_TURN
 
     def is_over(self, cost: int) -> bool:
-        """Count so much more; the next turn begins when this one is over."""
+        """Add cost; True when the limit is reached, and then the next turn begins."""
         self._counters.cost += cost
         self._left -= cost
         if self._left > 0:
@@ -164,7 +164,7 @@ class _Turn:
 
 
 def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None]:
-    """Raises a ProtocolError when one is no topic filter, or all are too much; in portions."""
+    """Raises a ProtocolError if a filter is invalid, or the levels are too many; in steps."""
     if sum(name.count("/") + 1 for name in filters) > MAXIMUM_LEVELS:
         raise ProtocolError(
             ReasonCode.QUOTA_EXCEEDED, f"more than {MAXIMUM_LEVELS} levels in one packet"
@@ -176,7 +176,7 @@ def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None
 
 
 def _check_filter(broker: Broker, topic_filter: str) -> None:
-    """Raises a ProtocolError when it is no topic filter, shared or not (section 4.7)."""
+    """Raises a ProtocolError if it is not a valid topic filter, shared or not (section 4.7)."""
     try:
         check_filter(topic_filter)
     except ValueError as error:
