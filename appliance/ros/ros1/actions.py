@@ -1,12 +1,12 @@
-"""ROS 1's actions, seen as ROS 2's.
+"""Presents the actions of ROS 1 as those of ROS 2.
 
-actionlib makes an action `/act` of five topics: `goal` and `cancel` to its server, `status`,
-`feedback` and `result` from it. Everybody else here knows ROS 2's `/act/_action/…`: the services
-send_goal, cancel_goal and get_result, the topics status and feedback (actions.py). In ROS 1 a value
-follows the other without padding, so that what is inside a message is cut out of it and put into
-another as it stands; a goal's id is text there and 16 bytes here.
+An action `/act` of actionlib has five topics: `goal` and `cancel` to its server, `status`,
+`feedback` and `result` from it. The rest of the bridge uses ROS 2's `/act/_action/…`: the services
+send_goal, cancel_goal and get_result, and the topics status and feedback (calls/actions.py). ROS 1
+serializes without padding, so that an inner message is cut out of one message and put into another
+unchanged. The id of a goal is text in ROS 1 and 16 bytes here.
 
-Everything but the functions at the end is for the ROS thread.
+Everything except the functions at the end is for the ROS thread.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ HIDDEN = "/_action/"
 CANCEL = "action_msgs/srv/CancelGoal"
 STATUS = "action_msgs/msg/GoalStatusArray"
 
-#: Results that are kept for who asks late, of one action.
+#: Results of an action that are cached, for clients that ask for theirs late.
 MAX_RESULTS = 100
 
-#: Messages of status without a goal, after which its server does not know it.
+#: After so many status messages without a goal, its server does not know the goal.
 MAX_MISSED = 3
 
-#: By the numbers of actionlib_msgs/GoalStatus, those of action_msgs/msg/GoalStatus: pending is
-#: accepted, rejected is aborted, recalled is canceled, lost is unknown.
+#: The status of action_msgs/msg/GoalStatus by that of actionlib_msgs/GoalStatus: pending becomes
+#: accepted, rejected aborted, recalled canceled, lost unknown.
 _STATES = (1, 2, 5, 4, 6, 6, 3, 3, 5, 0)
 _REJECTED = 5
 _CANCELING = frozenset({2, 6, 7, 8})
 _ENDED = frozenset({2, 3, 4, 5, 8, 9})
 
-# The numbers of action_msgs/srv/CancelGoal.
+# Return codes of action_msgs/srv/CancelGoal.
 _NONE, _UNKNOWN_GOAL, _GOAL_ENDED = 0, 2, 3
 
 
@@ -79,8 +79,8 @@ _KNOWN = {
 
 
 def describe_action(name: str, load: Callable[[str], TypeDescription]) -> TypeDescription | None:
-    """The description of what an action is made of in ROS 2, `pkg/action/Name_Goal` and so on; None
-    for other types. `load` gives those of ROS 1, `pkg/msg/NameGoal`."""
+    """The description of a part of an action in ROS 2, such as `pkg/action/Name_Goal`; None for
+    other types. `load` returns those of ROS 1, `pkg/msg/NameGoal`."""
     if name in _KNOWN:
         return _KNOWN[name]
     package, slash, rest = name.partition("/action/")
@@ -106,7 +106,7 @@ def describe_action(name: str, load: Callable[[str], TypeDescription]) -> TypeDe
 def find_actions(types: dict[str, str], published: Iterable[str]) -> dict[str, str]:
     """The types `pkg/action/Name` of the actions that have a server, by their names.
 
-    `types` are those of all topics, `published` those that somebody publishes.
+    `types` are the types of all topics, `published` the topics that have a publisher.
     """
     found = {}
     for topic in published:
@@ -119,7 +119,7 @@ def find_actions(types: dict[str, str], published: Iterable[str]) -> dict[str, s
 
 
 def services_of(actions: dict[str, str]) -> dict[str, list[str]]:
-    """The services that these actions have in ROS 2."""
+    """The services that these actions have in ROS 2, with their types."""
     found = {}
     for name, type_name in actions.items():
         found[f"{name}{HIDDEN}send_goal"] = [f"{type_name}_SendGoal"]
@@ -129,10 +129,10 @@ def services_of(actions: dict[str, str]) -> dict[str, list[str]]:
 
 
 class ActionPublisher(Protocol):
-    """A publisher that knows who is connected."""
+    """A publisher that knows which nodes are connected to it."""
 
     def reaches(self, nodes: Iterable[str]) -> bool:
-        """Whether one of these nodes is."""
+        """Whether one of these nodes is connected."""
 
     def publish(self, cdr: bytes) -> None:
         """Publish a serialized message. Raises BusError."""
@@ -142,22 +142,22 @@ class ActionPublisher(Protocol):
 
 
 class ActionBus(Protocol):
-    """What is needed of the node."""
+    """The part of the node that actions use."""
 
     def now(self) -> int:
         """Nanoseconds since the epoch."""
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Call it on the ROS thread."""
+        """Call `callback` on the ROS thread."""
 
     def action_type(self, action: str) -> str | None:
-        """The type `pkg/action/Name` of an action, None when it has no server."""
+        """The type `pkg/action/Name` of an action; None when it has no server."""
 
     def action_servers(self, action: str) -> list[str]:
         """The nodes that serve an action."""
 
     def describe(self, type_name: str) -> TypeDescription:
-        """What a type is made of."""
+        """The description of a type."""
 
     def subscribe_raw(
         self, topic: str, type_name: str, qos: QosProfile, callback: Callable[..., None]
@@ -165,18 +165,19 @@ class ActionBus(Protocol):
         """Call `callback` with each message."""
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> ActionPublisher:
-        """Make a publisher of serialized messages."""
+        """Create a publisher of serialized messages."""
 
 
 class ActionClients:
-    """The clients of actions, as clients of ROS 2's three services, and their two topics."""
+    """Clients of actions, presented as clients of ROS 2's three services, and the two topics."""
 
     def __init__(self, bus: ActionBus) -> None:
         self._bus = bus
         self._servers: dict[str, _ActionServer] = {}
 
     def create_client(self, service: str, type_name: str) -> ActionClient:
-        """A client of `/act/_action/send_goal` and its like. Raises BusError, UnknownTypeError."""
+        """A client of `/act/_action/send_goal`, `cancel_goal` or `get_result`. Raises BusError,
+        UnknownTypeError."""
         name, _, verb = service.partition(HIDDEN)
         server = self._servers.get(name)
         if server is None:
@@ -185,15 +186,15 @@ class ActionClients:
                 raise BusError(f"{name} has no server")
             server = self._servers[name] = _ActionServer(self._bus, name, action)
         server.clients += 1
-        ways = {
+        methods = {
             "send_goal": server.send_goal,
             "get_result": server.get_result,
             "cancel_goal": server.cancel,
         }
-        return ActionClient(self, server, ways[verb])
+        return ActionClient(self, server, methods[verb])
 
     def release(self, server: _ActionServer) -> None:
-        """A client has ended."""
+        """Release the server of a client that was destroyed."""
         server.clients -= 1
         if not server.clients:
             server.close()
@@ -209,34 +210,34 @@ class ActionClients:
 
             def on_status(data: bytes) -> None:
                 nonlocal last
-                told = _if_readable(to_status, data)
-                if told is not None and told != last:  # actionlib says it five times a second
-                    last = told
-                    callback(told)
+                status = _if_readable(to_status, data)
+                if status is not None and status != last:  # actionlib repeats it 5 times a second
+                    last = status
+                    callback(status)
 
             return self._bus.subscribe_raw(f"{name}/status", _STATUS, _QOS, on_status)
 
         def on_feedback(data: bytes) -> None:
-            told = _if_readable(to_feedback, data)
-            if told is not None:
-                callback(told)
+            feedback = _if_readable(to_feedback, data)
+            if feedback is not None:
+                callback(feedback)
 
         message_type = f"{_message(type_name.removesuffix('_FeedbackMessage'))}ActionFeedback"
         return self._bus.subscribe_raw(f"{name}/feedback", message_type, _QOS, on_feedback)
 
 
 class ActionClient:
-    """A RosClient."""
+    """A RosClient of one of the three services of an action."""
 
     def __init__(
         self,
         actions: ActionClients,
         server: _ActionServer,
-        ask: Callable[[bytes, Callable[[bytes], None]], Callable[[], None]],
+        send: Callable[[bytes, Callable[[bytes], None]], Callable[[], None]],
     ) -> None:
         self._actions = actions
         self._server = server
-        self._ask = ask
+        self._send = send
         self._is_over = False
 
     def is_ready(self) -> bool:
@@ -247,7 +248,7 @@ class ActionClient:
             if not self._is_over:
                 done(response)
 
-        return self._ask(request, finish)
+        return self._send(request, finish)
 
     def destroy(self) -> None:
         self._is_over = True
@@ -257,35 +258,35 @@ class ActionClient:
 _QOS = QosProfile(depth=10)
 _STATUS = "actionlib_msgs/msg/GoalStatusArray"
 
-# A call is asked for a response, given its goal, when something has come from the server: the
-# response, or None to go on waiting.
+# Called for a pending call when a message of the server has arrived. Returns the response of the
+# call, or None to go on waiting.
 _FindResponse = Callable[["_PendingCall"], bytes | None]
 
 
 @dataclass(eq=False, slots=True)
 class _PendingCall:
-    """A call under way; `missed` counts messages of status without its goal."""
+    """A call that waits for its response. `missed` counts status messages without its goal."""
 
     goal: str
-    look: _FindResponse
+    find_response: _FindResponse
     done: Callable[[bytes], None]
     missed: int = 0
 
 
 @dataclass(eq=False, slots=True)
 class _Results:
-    """The newest results, by goal: the number of its status, and the message."""
+    """A cache of the newest results: the final status and the message of each goal."""
 
-    kept: OrderedDict[str, tuple[int, bytes]] = field(default_factory=OrderedDict)
+    by_goal: OrderedDict[str, tuple[int, bytes]] = field(default_factory=OrderedDict)
 
     def add(self, goal: str, status: int, result: bytes) -> None:
-        self.kept[goal] = status, result
-        if len(self.kept) > MAX_RESULTS:
-            self.kept.popitem(last=False)
+        self.by_goal[goal] = status, result
+        if len(self.by_goal) > MAX_RESULTS:
+            self.by_goal.popitem(last=False)
 
 
 class _ActionServer:
-    """An action's server, as it is seen from here."""
+    """The server of an action, as its messages show it."""
 
     def __init__(self, bus: ActionBus, name: str, type_name: str) -> None:
         self.name = name
@@ -293,37 +294,37 @@ class _ActionServer:
         self._bus = bus
         message = _message(type_name)
         self._no_result = compile_converter(bus.describe(f"{message}Result")).from_dict({})
-        #: Of each goal that the server tells of: the number of its status, and its stamp.
+        #: The status and the stamp of each goal that the server reports.
         self._goals: dict[str, tuple[int, bytes]] | None = None
         self._ids: dict[bytes, str] = {}
         self._results = _Results()
         self._calls: list[_PendingCall] = []
-        self._parts: list[Any] = []
+        self._endpoints: list[Any] = []
         try:
             for topic, kind, handle in (
                 ("status", _STATUS, self._on_status),
                 ("result", f"{message}ActionResult", self._on_result),
             ):
-                soon = partial(self._soon, handle)
-                self._parts.append(bus.subscribe_raw(f"{name}/{topic}", kind, _QOS, soon))
+                callback = partial(self._handle_soon, handle)
+                self._endpoints.append(bus.subscribe_raw(f"{name}/{topic}", kind, _QOS, callback))
             for topic, kind in (
                 ("goal", f"{message}ActionGoal"),
                 ("cancel", "actionlib_msgs/msg/GoalID"),
             ):
-                self._parts.append(bus.create_publisher(f"{name}/{topic}", kind, _QOS))
+                self._endpoints.append(bus.create_publisher(f"{name}/{topic}", kind, _QOS))
         except BaseException:
             self.close()
             raise
-        self._goal: ActionPublisher = self._parts[2]
-        self._cancel: ActionPublisher = self._parts[3]
+        self._goal: ActionPublisher = self._endpoints[2]
+        self._cancel: ActionPublisher = self._endpoints[3]
 
     def close(self) -> None:
-        """End it."""
-        for part in self._parts:
-            part.destroy()
+        """Destroy the endpoints."""
+        for endpoint in self._endpoints:
+            endpoint.destroy()
 
     def is_ready(self) -> bool:
-        """Whether the server is connected: a goal before that would be lost."""
+        """Whether the server is connected; a goal that is sent before would be lost."""
         servers = self._bus.action_servers(self.name)
         return (
             self._goals is not None
@@ -331,38 +332,38 @@ class _ActionServer:
             and self._cancel.reaches(servers)
         )
 
-    def _soon(self, handle: Callable[[bytes], None], data: bytes) -> None:
+    def _handle_soon(self, handle: Callable[[bytes], None], data: bytes) -> None:
         self._bus.call_soon(partial(handle, data))
 
-    # What is asked
+    # Calls
 
     def send_goal(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
-        """A goal: its id in 16 bytes, then itself."""
+        """Send a goal. The request is the id of the goal in 16 bytes, then the goal."""
         id_, goal = request[:16].hex(), request[16:]
         stamp = _stamp(self._bus.now())
         self._goal.publish(struct.pack("<I", 0) + stamp + _text("") + stamp + _text(id_) + goal)
 
-        def look(call: _PendingCall) -> bytes | None:
+        def find_response(call: _PendingCall) -> bytes | None:
             status = self._status(call.goal)
             return None if status is None else struct.pack("<?", status != _REJECTED) + stamp
 
-        return self._begin(_PendingCall(id_, look, done))
+        return self._begin(_PendingCall(id_, find_response, done))
 
     def get_result(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
-        """The result of a goal, when it has ended; that the server does not know it, when it keeps
-        telling of others only."""
+        """Respond with the result of a goal once it has ended, or with the status unknown once the
+        server has reported only other goals MAX_MISSED times."""
 
-        def look(call: _PendingCall) -> bytes | None:
-            ended = self._results.kept.get(call.goal)
+        def find_response(call: _PendingCall) -> bytes | None:
+            ended = self._results.by_goal.get(call.goal)
             if ended is not None:
                 return struct.pack("<b", _state(ended[0])) + ended[1]
             return struct.pack("<b", 0) + self._no_result if call.missed >= MAX_MISSED else None
 
-        return self._begin(_PendingCall(self._text_of(request[:16]), look, done))
+        return self._begin(_PendingCall(self._text_of(request[:16]), find_response, done))
 
     def cancel(self, request: bytes, done: Callable[[bytes], None]) -> Callable[[], None]:
-        """Cancel a goal; or for 16 zeros all up to a time, all there are for the time 0. It is
-        answered when the server tells that it does."""
+        """Cancel a goal; with 16 zeros for the id, all goals up to a time, and with the time 0 all
+        goals. Responds when the server reports that it cancels them."""
         is_all = not any(request[:16])
         id_ = "" if is_all else self._text_of(request[:16])
         status = None if is_all else self._status(id_)
@@ -375,7 +376,7 @@ class _ActionServer:
         is_meant = partial(_is_until, until)
         before = {goal for goal, (state, _) in (self._goals or {}).items() if state in _ENDED}
 
-        def look(call: _PendingCall) -> bytes | None:
+        def find_response(call: _PendingCall) -> bytes | None:
             goals = self._goals or {}
             if is_all:
                 wanted = [
@@ -396,10 +397,10 @@ class _ActionServer:
             infos = (_uuid(goal) + goals.get(goal, (0, bytes(8)))[1] for goal in wanted)
             return struct.pack("<bI", _NONE, len(wanted)) + b"".join(infos)
 
-        return self._begin(_PendingCall(id_, look, done), is_new=True)
+        return self._begin(_PendingCall(id_, find_response, done), is_new=True)
 
     def _begin(self, call: _PendingCall, *, is_new: bool = False) -> Callable[[], None]:
-        """Wait for the server; what it has said already counts, unless the question `is_new`."""
+        """Wait for the response. Past messages of the server count, unless the call `is_new`."""
         self._calls.append(call)
         if not is_new:
             self._bus.call_soon(partial(self._settle, [call]))
@@ -412,13 +413,13 @@ class _ActionServer:
 
     def _settle(self, calls: list[_PendingCall]) -> None:
         for call in calls:
-            response = call.look(call) if call in self._calls else None
+            response = call.find_response(call) if call in self._calls else None
             if response is not None:
                 self._calls.remove(call)
                 call.done(response)
 
     def _status(self, goal: str) -> int | None:
-        ended = self._results.kept.get(goal)
+        ended = self._results.by_goal.get(goal)
         if ended is not None:
             return ended[0]
         known = (self._goals or {}).get(goal)
@@ -427,7 +428,7 @@ class _ActionServer:
     def _text_of(self, id_: bytes) -> str:
         return self._ids.get(id_, id_.hex())
 
-    # What the server says
+    # Messages of the server
 
     def _on_status(self, data: bytes) -> None:
         goals = _if_readable(read_status, data)
@@ -440,9 +441,9 @@ class _ActionServer:
         self._settle(list(self._calls))
 
     def _on_result(self, data: bytes) -> None:
-        told = _if_readable(read_goal_message, data)
-        if told is not None:
-            self._results.add(*told)
+        result = _if_readable(read_goal_message, data)
+        if result is not None:
+            self._results.add(*result)
             self._settle(list(self._calls))
 
 
@@ -450,7 +451,7 @@ class _ActionServer:
 
 
 class _Cursor:
-    """A position in a message. What is not there raises struct.error or IndexError."""
+    """A position in a message. Reading beyond the end raises struct.error or IndexError."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -474,12 +475,12 @@ class _Cursor:
         return self.take(self.number("I")).decode(errors="replace")
 
     def header(self) -> None:
-        """Pass a std_msgs/Header."""
+        """Skip a std_msgs/Header."""
         self.take(12)
         self.text()
 
     def status(self) -> tuple[str, int, bytes]:
-        """A actionlib_msgs/GoalStatus: the goal's id, the number, the stamp of the goal."""
+        """The goal's id, the status and the goal's stamp of an actionlib_msgs/GoalStatus."""
         stamp = self.take(8)
         goal, status = self.text(), self.number("B")
         self.text()
@@ -487,14 +488,14 @@ class _Cursor:
 
 
 def read_status(data: bytes) -> list[tuple[str, int, bytes]]:
-    """What an actionlib_msgs/GoalStatusArray says of each goal: id, status, stamp."""
+    """The id, status and stamp of each goal in an actionlib_msgs/GoalStatusArray."""
     cursor = _Cursor(data)
     cursor.header()
     return [cursor.status() for _ in range(cursor.number("I"))]
 
 
 def read_goal_message(data: bytes) -> tuple[str, int, bytes]:
-    """What a feedback or result is of, the goal's status, and the message inside."""
+    """The id and the status of the goal of a feedback or result, and the inner message."""
     cursor = _Cursor(data)
     cursor.header()
     goal, status, _ = cursor.status()
@@ -502,7 +503,7 @@ def read_goal_message(data: bytes) -> tuple[str, int, bytes]:
 
 
 def to_status(data: bytes) -> bytes:
-    """An action_msgs/msg/GoalStatusArray of an actionlib_msgs/GoalStatusArray."""
+    """Convert an actionlib_msgs/GoalStatusArray to an action_msgs/msg/GoalStatusArray."""
     goals = read_status(data)
     return struct.pack("<I", len(goals)) + b"".join(
         _uuid(goal) + stamp + struct.pack("<b", _state(status)) for goal, status, stamp in goals
@@ -510,7 +511,7 @@ def to_status(data: bytes) -> bytes:
 
 
 def to_feedback(data: bytes) -> bytes:
-    """A `Name_FeedbackMessage` of a `NameActionFeedback`."""
+    """Convert a `NameActionFeedback` to a `Name_FeedbackMessage`."""
     goal, _, feedback = read_goal_message(data)
     return _uuid(goal) + feedback
 
@@ -528,7 +529,7 @@ def _state(status: int) -> int:
 
 
 def _uuid(goal: str) -> bytes:
-    """The 16 bytes that stand for a goal's id: those of our own goals are its digits."""
+    """The 16 bytes for the id of a goal. The ids of the bridge's own goals are their hex digits."""
     if re.fullmatch(r"[0-9a-f]{32}", goal):
         return bytes.fromhex(goal)
     return hashlib.blake2b(goal.encode(), digest_size=16).digest()
@@ -545,7 +546,7 @@ def _stamp(nanoseconds: int) -> bytes:
 
 
 def _is_until(until: bytes, stamp: bytes) -> bool:
-    """Whether a time is not after another, 0 of which means always."""
+    """Whether `stamp` is not after `until`, where 0 means always."""
     return not any(until) or struct.unpack("<II", stamp) <= struct.unpack("<II", until)
 
 

@@ -1,6 +1,7 @@
-"""The ends that a node on ROS 1 has: subscriptions, publishers, clients and services, as bytes.
+"""The endpoints of a node on ROS 1: subscriptions, publishers, clients and services of serialized
+messages.
 
-They are made with rospy, which is handed to them: only ros1.py imports it.
+They get rospy as an argument: only node.py imports it.
 """
 
 from __future__ import annotations
@@ -18,31 +19,31 @@ from appliance.ros.node import BusError, Durability, QosProfile, Respond
 from appliance.ros.ros1.peers import ServiceCall
 from appliance.ros.ros1.types import Definition, ServiceDefinition
 
-#: Messages of a publisher that are held until it is seen to be latched.
+#: Messages of a latched publisher that a subscription holds until the graph shows it as latched.
 MAX_HELD = 10
 
 
 class LatchTracker(Protocol):
-    """Who is told what publishers say of themselves."""
+    """Tracks which publishers are latched, from the headers of their connections."""
 
-    def hear(self, topic: str, node: str, is_latched: bool) -> bool:
-        """What a publisher says of itself; whether that is news."""
+    def track_latching(self, topic: str, node: str, is_latched: bool) -> bool:
+        """Note whether a publisher is latched. Returns whether that has changed."""
 
-    def hold(self, subscription: Ros1Subscription) -> None:
-        """Have it release what it holds after the next look."""
+    def release_later(self, subscription: Ros1Subscription) -> None:
+        """Call `release` of the subscription after the next refresh of the graph."""
 
-    def let_go(self, subscription: Ros1Subscription) -> None:
-        """It holds nothing any more."""
+    def cancel_release(self, subscription: Ros1Subscription) -> None:
+        """Do not call it: the subscription holds no messages."""
 
 
 class ClientNode(Protocol):
-    """The node, as far as its clients need it."""
+    """The part of the node that its clients use."""
 
     name: str
 
     @property
     def master_uri(self) -> str:
-        """Where the Master is."""
+        """The URI of the Master."""
 
     def call_soon(self, callback: Callable[[], None]) -> None:
         """Call it on the ROS thread."""
@@ -50,13 +51,13 @@ class ClientNode(Protocol):
     def is_served(self, service: str) -> bool:
         """Whether a service is on the graph."""
 
-    def doubt(self, service: str) -> None:
-        """A call of it has failed."""
+    def call_failed(self, service: str) -> None:
+        """A call of the service has failed: its type may have changed."""
 
 
 @cache
 def message_class(rospy: Any, definition: Definition) -> Any:
-    """What rospy takes for the class of a type, and has its bytes only."""
+    """A class that rospy accepts as a message class, whose messages have their bytes only."""
     attributes = {
         "__slots__": [],
         "_type": definition.name,
@@ -78,12 +79,12 @@ def _service_class(rospy: Any, definition: ServiceDefinition) -> Any:
 
 
 def forget_classes() -> None:
-    """Let go of what was made with a rospy that has ended, and with it of that, which is 1 MB."""
+    """Clear the caches of classes: these keep a rospy that has ended, which is 1 MB, in memory."""
     message_class.cache_clear()
     _service_class.cache_clear()
 
 
-def _of(kind: Any, data: bytes) -> Any:
+def _new_message(kind: Any, data: bytes) -> Any:
     message = kind()
     message._buff = data
     return message
@@ -98,21 +99,22 @@ def _serialized(message: Any) -> bytes:
 class Ros1Subscription:
     """A RosSubscription.
 
-    What latched publishers send is retained on MQTT, and only with a message it is told that one
-    is latched. The first of them is held until the graph was looked at again: most often the
-    subscription is then made anew, and the message comes once more.
+    Messages of latched publishers are retained on MQTT. Whether a publisher is latched is known
+    only once a message of it has arrived. Its first messages are held until the graph has been
+    refreshed: most often the subscription is then replaced by one for latched publishers, and the
+    message arrives once more.
     """
 
     def __init__(
         self,
         rospy: Any,
-        audience: LatchTracker,
+        latches: LatchTracker,
         topic: str,
         definition: Definition,
         is_latched: bool,
         callback: Callable[..., None],
     ) -> None:
-        self._audience = audience
+        self._latches = latches
         self._topic = topic
         self._is_latched = is_latched
         self._callback = callback
@@ -123,7 +125,7 @@ class Ros1Subscription:
         kind = message_class(rospy, definition)
         self._own = rospy.Subscriber(topic, kind, self._on_message, tcp_nodelay=True)
         found = self._own.impl.data_class
-        # rospy itself receives /clock when the time is simulated, as a message of its own class.
+        # With simulated time, rospy itself subscribes to /clock with a class of its own.
         is_own = not issubclass(found, rospy.AnyMsg) and found._md5sum == kind._md5sum
         if found is not kind and not is_own:
             other = self._own.impl.type
@@ -137,27 +139,30 @@ class Ros1Subscription:
         with self._lock:
             if self._is_over:
                 return
-            is_news = self._audience.hear(self._topic, header.get("callerid", ""), is_latched)
-            if is_latched and not self._is_latched and (is_news or self._held):
+            has_changed = self._latches.track_latching(
+                self._topic, header.get("callerid", ""), is_latched
+            )
+            if is_latched and not self._is_latched and (has_changed or self._held):
                 self._held.append(data)
-                self._audience.hold(self)
+                self._latches.release_later(self)
             else:
                 self._callback(data)
 
     def release(self) -> None:
-        """Hand on what was held: not all publishers are latched, so that this one stays."""
-        self._audience.let_go(self)
+        """Deliver the held messages. Not all publishers are latched, so that this subscription was
+        not replaced."""
+        self._latches.cancel_release(self)
         with self._lock:
             while self._held and not self._is_over:
                 self._callback(self._held.popleft())
 
     def take_lost(self) -> int:
-        return 0  # TCP loses none, and rospy does not count what its queues drop
+        return 0  # TCP loses no messages, and rospy does not count those that its queues drop
 
     def destroy(self) -> None:
         with self._lock:
             self._is_over = True
-        self._audience.let_go(self)
+        self._latches.cancel_release(self)
         self._own.unregister()
 
 
@@ -172,7 +177,7 @@ class Ros1Publisher:
             kind,
             latch=qos.durability is Durability.TRANSIENT_LOCAL,
             tcp_nodelay=True,
-            # A subscriber that does not read loses the oldest, and stops nobody.
+            # When a subscriber does not read, drop its oldest messages; do not block the others.
             queue_size=qos.depth,
         )
         if self._own.impl.data_class is not kind:
@@ -182,7 +187,7 @@ class Ros1Publisher:
 
     def publish(self, cdr: bytes) -> None:
         try:
-            self._own.publish(_of(self._class, cdr))
+            self._own.publish(_new_message(self._class, cdr))
         except self._refusals as error:
             raise BusError(str(error)) from error
 
@@ -195,7 +200,7 @@ class Ros1Publisher:
 
 
 class Ros1Client:
-    """A RosClient: each call is a connection and a thread of its own."""
+    """A RosClient. Each call has a connection and a thread of its own."""
 
     def __init__(self, node: ClientNode, service: str, definition: ServiceDefinition) -> None:
         self._node = node
@@ -213,10 +218,10 @@ class Ros1Client:
             if call in self._calls:
                 self._calls.discard(call)
                 if isinstance(result, BusError):
-                    node.doubt(self._service)
+                    node.call_failed(self._service)
                 done(result)
 
-        def tell(result: bytes | BusError) -> None:
+        def report(result: bytes | BusError) -> None:
             with suppress(BusError):
                 node.call_soon(partial(finish, result))
 
@@ -225,7 +230,7 @@ class Ros1Client:
             call.give_up()
 
         call = ServiceCall(
-            node.master_uri, node.name, self._service, self._definition, request, tell
+            node.master_uri, node.name, self._service, self._definition, request, report
         )
         self._calls.add(call)
         return give_up
@@ -237,7 +242,7 @@ class Ros1Client:
 
 
 class Ros1Service:
-    """A RosService. rospy waits for each answer on a thread of its own."""
+    """A RosService. rospy waits for each response on a thread of its own."""
 
     def __init__(
         self,
@@ -251,34 +256,34 @@ class Ros1Service:
         self._response_class = message_class(rospy, definition.response)
         self._callback = callback
         self._call_soon = call_soon
-        self._waiting: set[queue.SimpleQueue[bytes | None]] = set()
+        self._pending: set[queue.SimpleQueue[bytes | None]] = set()
         try:
-            self._own = rospy.Service(name, _service_class(rospy, definition), self._take)
+            self._own = rospy.Service(name, _service_class(rospy, definition), self._serve)
         except rospy.ServiceException as error:
             raise BusError(str(error)) from error
 
-    def _take(self, request: Any) -> Any:
+    def _serve(self, request: Any) -> Any:
         answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._waiting.add(answer)
+        self._pending.add(answer)
         try:
-            self._call_soon(partial(self._ask, request._buff, answer.put))
+            self._call_soon(partial(self._dispatch, request._buff, answer.put))
             response = answer.get()
         except BusError as error:
             raise self._error(str(error)) from error
         finally:
-            self._waiting.discard(answer)
+            self._pending.discard(answer)
         if response is None:
             raise self._error("nobody on MQTT answered")
-        return _of(self._response_class, response)
+        return _new_message(self._response_class, response)
 
-    def _ask(self, request: bytes, respond: Respond) -> None:
+    def _dispatch(self, request: bytes, respond: Respond) -> None:
         try:
             self._callback(request, respond)
         except Exception:
-            respond(None)  # rospy's thread would wait for good
+            respond(None)  # or rospy's thread would wait forever
             raise
 
     def destroy(self) -> None:
         self._own.shutdown("its route has ended")
-        for answer in list(self._waiting):
+        for answer in list(self._pending):
             answer.put(None)

@@ -1,9 +1,9 @@
-"""The node on ROS 1: the only file that imports rospy, and that only when the node starts.
+"""The node on ROS 1: the only module that imports rospy, and only when the node starts.
 
-rospy gives and takes messages as their bytes, through classes that have a type's name and MD5 sum
-and nothing else. It does not come back by itself when the Master was away or came anew: the state
-of the graph, which is asked for anyway, says when our registrations are missing from it, and they
-are made again. And it starts only once: to join anew, it is imported anew.
+Messages pass rospy as their bytes, through classes that have only the name and MD5 sum of a type.
+rospy does not reconnect when the Master was away or has been restarted. So the node, which polls
+the state of the graph anyway, registers again what is missing there. And rospy can be started only
+once: to join the bus again, the node imports it again.
 """
 
 from __future__ import annotations
@@ -56,29 +56,29 @@ from appliance.ros.ros1.types import Definition, describe, full_name, installed,
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the graph, of which the Master does not tell changes.
+#: Seconds between two polls of the graph: the Master does not notify of changes.
 POLL_INTERVAL = 0.2
 
-#: Seconds until the types of topics are asked for again though the same nodes have them: one of
-#: them may have made a topic anew.
+#: Seconds until the types of topics are fetched again though the same nodes have them: one of these
+#: may have created a topic again with another type.
 TYPES_INTERVAL = 1.0
 
-#: Seconds between two attempts to find a Master at the start.
-KNOCK_INTERVAL = 0.5
+#: Seconds between two attempts to reach the Master at the start.
+MASTER_RETRY_INTERVAL = 0.5
 
-#: Seconds that rospy may take to leave the bus.
-LEAVE_TIME = 3.0
+#: Seconds within which rospy has to leave the bus.
+LEAVE_TIMEOUT = 3.0
 
 DEFAULT_MASTER = "http://localhost:11311"
 
-#: Names of topics or services, and the nodes that have them.
+#: The nodes of each topic or service, by its name.
 _Graph = dict[str, list[str]]
 
 
 def available() -> tuple[bool, str]:
-    """Whether a node can be started here, and if not, one line that says why and what to do.
+    """Whether a node can be started here; if not, one line that says why and what to do.
 
-    Imports nothing.
+    Imports nothing of ROS.
     """
     if find_spec("rospy") is None:
         return False, (
@@ -99,7 +99,7 @@ def available() -> tuple[bool, str]:
 
 
 def found() -> str:
-    """The ROS 1 that is used, in words; where one is `available`."""
+    """The ROS 1 that is used, for people to read; call it only when one is `available`."""
     spec = find_spec("rospy")
     where = Path(spec.origin).parent.parent if spec is not None and spec.origin else "?"
     distribution = os.environ.get("ROS_DISTRO", "")
@@ -107,12 +107,12 @@ def found() -> str:
 
 
 def master_uri() -> str:
-    """Where the Master is, as every node of ROS 1 takes it."""
+    """The URI of the Master, from the environment as for every node of ROS 1."""
     return os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
 
 
 def remappings(arguments: Iterable[str]) -> Iterator[str]:
-    """The remappings among ROS arguments, with or without ROS 2's `-r` before them."""
+    """The remappings among ROS arguments, with or without a `-r` before them as in ROS 2."""
     before = ""
     for argument in arguments:
         if ":=" in argument and before not in ("-p", "--param"):
@@ -121,9 +121,9 @@ def remappings(arguments: Iterable[str]) -> Iterator[str]:
 
 
 class Ros1Node(FaultContainment):
-    """A RosNode on ROS 1. There can be one at a time in a process, as rospy is one.
+    """A RosNode on ROS 1. As rospy is, there can be only one at a time in a process.
 
-    Messages come on threads of rospy's, one at a time for each subscription.
+    rospy calls subscriptions on threads of its own, one message at a time for each subscription.
     """
 
     serialization = PACKED
@@ -134,51 +134,52 @@ class Ros1Node(FaultContainment):
         """`arguments` are remappings, `/cmd_vel:=/base/cmd_vel`, as on a command line."""
         super().__init__()
         self._arguments = list(remappings(arguments))
-        said = dict(argument.split(":=", 1) for argument in self._arguments)
+        names = dict(argument.split(":=", 1) for argument in self._arguments)
         space = os.environ.get("ROS_NAMESPACE", "") if namespace == "/" else namespace
-        space = said.get("__ns", space).strip("/")
+        space = names.get("__ns", space).strip("/")
         self.name = (
-            f"/{space}/{said.get('__name', name)}" if space else f"/{said.get('__name', name)}"
+            f"/{space}/{names.get('__name', name)}" if space else f"/{names.get('__name', name)}"
         )
-        self._master = Master(said.get("__master", master_uri()), self.name)
+        self._master = Master(names.get("__master", master_uri()), self.name)
         self.parameter_server: ParameterServer | None = MasterParameters(self._master)
         self._base_name = name
         self._namespace = namespace
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._told: dict[str, Definition] = {}
-        self._complained: set[str] = set()
-        self._forget()
+        self._remote_definitions: dict[str, Definition] = {}
+        self._warned: set[str] = set()
+        self._reset()
 
-    def _forget(self) -> None:
-        """Be as if there had been no bus yet."""
+    def _reset(self) -> None:
+        """Set the state of a node that has not joined the bus yet."""
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._is_running = False
         self._rospy: Any = None
         self._uri = ""
-        #: Why the Master cannot be asked, if it cannot.
-        self._silence: str | None = None
-        # The graph, as of the last look.
+        #: Why the Master does not answer; None when it does.
+        self._master_error: str | None = None
+        # The graph, as of the last poll.
         self._publishers: _Graph = {}
         self._subscribers: _Graph = {}
         self._servers: _Graph = {}
         self._types: dict[str, str] = {}
-        self._types_asked = 0.0
+        self._types_fetched_at = 0.0
         #: The types of the actions that have a server.
         self._actions: dict[str, str] = {}
         self._action_clients = ActionClients(self)
-        #: By topic and node, whether a publisher has said to be latched: it does in its messages.
-        self._heard: dict[tuple[str, str], bool] = {}
-        #: Definitions of types that are not installed, and the types of services.
+        #: By topic and node, whether a publisher is latched, which the connection's header says.
+        self._is_latched: dict[tuple[str, str], bool] = {}
+        #: Queries for definitions of types that are not installed, and for the types of services.
         self._definitions: QueryCache[Definition] = QueryCache()
         self._service_types: QueryCache[str] = QueryCache()
-        #: Subscriptions that hold messages until the next look; a dict for its order and its lock.
+        #: Subscriptions that hold messages until the next poll. A dict, whose single operations are
+        #: atomic and which keeps their order.
         self._holding: dict[Ros1Subscription, None] = {}
 
     @property
     def obstacle(self) -> str | None:
-        silence = self._silence
-        return None if silence is None else f"the ROS Master does not answer: {silence}"
+        error = self._master_error
+        return None if error is None else f"the ROS Master does not answer: {error}"
 
     def start(
         self,
@@ -193,7 +194,7 @@ class Ros1Node(FaultContainment):
             return
         if self._thread is not None:  # it has failed, and is about to end
             self._thread.join()
-            self._forget()
+            self._reset()
         self._thread = threading.Thread(
             target=self._run, args=(poll, failed), name="ros", daemon=True
         )
@@ -205,10 +206,10 @@ class Ros1Node(FaultContainment):
         thread, self._thread = self._thread, None
         if thread is None:
             return
-        thread.join(LEAVE_TIME)
+        thread.join(LEAVE_TIMEOUT)
         if thread.is_alive():
-            # It waits for a Master that does not answer, with a socket that has no time limit.
-            log.warning("ROS is left without a word: the Master does not answer")
+            # rospy waits for a Master that does not answer, on a socket without a timeout.
+            log.warning("the node could not unregister from ROS: the Master does not answer")
 
     def _run(self, poll: Callable[[], None], failed: Callable[[str], None]) -> None:
         reason = ""
@@ -217,7 +218,7 @@ class Ros1Node(FaultContainment):
                 self._is_running = True
                 self._spin(poll)
         except Exception as error:
-            # The thread's end, whatever ended it: it must be told, and the bus be left in order.
+            # Any error ends the thread: report it, and leave the bus properly.
             log.debug("the ROS thread ended", exc_info=True)
             reason = (
                 str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
@@ -229,7 +230,7 @@ class Ros1Node(FaultContainment):
             failed(reason)
 
     def _join(self) -> bool:
-        """Wait for the Master and become a node; False when the stop came first."""
+        """Wait for the Master and start the node. Returns False when it was stopped before."""
         os.environ["ROS_MASTER_URI"] = self._master.uri
         if self._namespace != "/":
             os.environ["ROS_NAMESPACE"] = self._namespace
@@ -238,12 +239,12 @@ class Ros1Node(FaultContainment):
         self._check_name()
         unload()
         self._rospy = rospy = import_module("rospy")
-        # rospy would take over the logging of the whole process.
+        # rospy would reconfigure the logging of the whole process.
         rospy.core.configure_logging = lambda *_, **__: None
         rospy.init_node(
             self._base_name,
             argv=["appliance", *self._arguments],
-            # What this node logs would be a message on a topic that may itself be bridged.
+            # The log lines of this node would be messages on a topic that may itself be bridged.
             disable_rosout=True,
             disable_signals=True,
         )
@@ -255,7 +256,10 @@ class Ros1Node(FaultContainment):
         return True
 
     def _check_name(self) -> None:
-        """The Master would end the other, and let that, tried again, end this one."""
+        """Raises BusError when another node has this name.
+
+        The Master would shut the other node down, and when that is restarted, this one.
+        """
         uri = self._find_namesake()
         if uri is not None:
             raise BusError(
@@ -268,12 +272,12 @@ class Ros1Node(FaultContainment):
             try:
                 self._master.call("getPid")
             except BusError as error:
-                if self._silence is None:
+                if self._master_error is None:
                     log.warning("waiting for the ROS Master: %s", error)
-                self._silence = str(error)
-                self._stopping.wait(KNOCK_INTERVAL)
+                self._master_error = str(error)
+                self._stopping.wait(MASTER_RETRY_INTERVAL)
             else:
-                self._silence = None
+                self._master_error = None
                 return True
         return False
 
@@ -284,7 +288,7 @@ class Ros1Node(FaultContainment):
                     f"{self.name} was shut down from outside: by `rosnode kill`, or by another "
                     "node of the same name"
                 )
-            if self._see():
+            if self._refresh_graph():
                 holding = list(self._holding)
                 poll()
                 for subscription in holding:
@@ -316,15 +320,15 @@ class Ros1Node(FaultContainment):
         graphs = (self._publishers, self._subscribers, self._servers)
         return sorted({node for graph in graphs for nodes in graph.values() for node in nodes})
 
-    def _see(self) -> bool:
-        """Look at the graph; False when there is none to be seen."""
+    def _refresh_graph(self) -> bool:
+        """Poll the graph. Returns False when the Master does not answer."""
         try:
             state = [dict(found) for found in self._master.call("getSystemState")]
             self._register_missing(*state)
             connected = self._add_connected(*state[:2])
-            is_other = state != [self._publishers, self._subscribers, self._servers]
-            if is_other or monotonic() >= self._types_asked + TYPES_INTERVAL:
-                self._types_asked = monotonic()
+            has_changed = state != [self._publishers, self._subscribers, self._servers]
+            if has_changed or monotonic() >= self._types_fetched_at + TYPES_INTERVAL:
+                self._types_fetched_at = monotonic()
                 types = dict(self._master.call("getTopicTypes"))
                 before = {topic: self._types[topic] for topic in connected if topic in self._types}
                 self._types = before | {
@@ -333,21 +337,21 @@ class Ros1Node(FaultContainment):
                 self._publishers, self._subscribers, self._servers = state
                 self._actions = find_actions(self._types, self._publishers)
                 there = {(topic, node) for topic in state[0] for node in state[0][topic]}
-                for key in self._heard.keys() - there:
-                    self._heard.pop(key, None)
-                self._definitions.keep(there)
+                for key in self._is_latched.keys() - there:
+                    self._is_latched.pop(key, None)
+                self._definitions.evict_others(there)
         except (BusError, TypeError, ValueError) as error:
-            if self._silence is None:
+            if self._master_error is None:
                 log.warning("the ROS Master does not answer; what is connected stays so: %s", error)
-            self._silence = str(error)
+            self._master_error = str(error)
             return False
-        if self._silence is not None:
-            self._silence = None
+        if self._master_error is not None:
+            self._master_error = None
             log.info("the ROS Master is back at %s", self._master.uri)
         return True
 
     def _register_missing(self, publishers: _Graph, subscribers: _Graph, servers: _Graph) -> None:
-        """Tell the Master what we have that it does not know of: it has come anew."""
+        """Register again what the Master does not know of: it has been restarted."""
         from rospy.impl.registration import get_service_manager, get_topic_manager
 
         topics, master = get_topic_manager(), self._master
@@ -355,13 +359,14 @@ class Ros1Node(FaultContainment):
         subscribed = [own for own in topics.get_subscriptions() if self._lacks(subscribers, own[0])]
         served = [own for own in get_service_manager().get_services() if own[0] not in servers]
         count = len(published) + len(subscribed) + len(served)
-        if not count or self._find_namesake():  # which the Master lets end this one, just now
+        # When there is a namesake, the Master is just shutting this node down for it.
+        if not count or self._find_namesake():
             return
         for topic, type_name in published:
             master.call("registerPublisher", topic, type_name, self._uri)
         for topic, type_name in subscribed:
             uris = master.call("registerSubscriber", topic, type_name, self._uri)
-            # As the Master tells it later, of others that come.
+            # The same message with which the Master reports publishers that register later.
             Master(self._uri, self.name).call("publisherUpdate", topic, uris)
         for service, uri in served:
             master.call("registerService", service, uri, self._uri)
@@ -371,8 +376,7 @@ class Ros1Node(FaultContainment):
         return self.name not in graph.get(topic, ())
 
     def _find_namesake(self) -> str | None:
-        """The URI of another node with this one's name; None when there is none, or none any
-        more."""
+        """The URI of another running node with this node's name; None when there is none."""
         with suppress(BusError):
             uri = str(self._master.call("lookupNode", self.name))
             if uri != self._uri:
@@ -381,8 +385,11 @@ class Ros1Node(FaultContainment):
         return None
 
     def _add_connected(self, publishers: _Graph, subscribers: _Graph) -> set[str]:
-        """Add who is connected to us: a Master that has come anew does not know of nodes that do
-        not register again, and these go on. Returns the topics that they have with us."""
+        """Add the nodes that are connected to this one.
+
+        A restarted Master does not know of nodes that do not register again, but these go on.
+        Returns the topics that they share with this node.
+        """
         from rospy.impl.registration import get_topic_manager
 
         topics = get_topic_manager()
@@ -415,20 +422,21 @@ class Ros1Node(FaultContainment):
         found = services_of(self._actions)
         for service, nodes in self._servers.items():
             key = service, *nodes
-            ask = partial(fetch_service_type, self._master.uri, self.name, service)
+            query = partial(fetch_service_type, self._master.uri, self.name, service)
             try:
-                name = self._service_types.get(key, ask)
-            except BusError as error:  # its node has ended without a word, most often
-                log.debug("%s is left out: %s", service, error)
+                name = self._service_types.get(key, query)
+            except BusError as error:  # most often its node has crashed and is still registered
+                log.debug("%s is skipped: %s", service, error)
                 continue
             if name is not None:
                 found[service] = [full_name(name, "srv")]
-        self._service_types.keep({(service, *nodes) for service, nodes in self._servers.items()})
+        known = {(service, *nodes) for service, nodes in self._servers.items()}
+        self._service_types.evict_others(known)
         return found
 
     def count(self, topic: str) -> tuple[int, int]:
         topic = self._resolve(topic.replace(HIDDEN, "/"))
-        # One that has said to be latched counts twice, so that it is seen to be another now.
+        # A latched publisher counts twice: the count changes when it becomes known to be latched.
         publishers = len(self._publishers.get(topic, ())) + len(self._latched(topic))
         return publishers, len(self._subscribers.get(topic, ()))
 
@@ -438,16 +446,16 @@ class Ros1Node(FaultContainment):
         found = []
         for node, type_name in self._others(self._publishers, topic):
             if self._is_known(type_name, node, topic):
-                # One that has said nothing yet is taken for what the others are.
-                is_latched = self._heard.get((topic, node), has_latched)
+                # A publisher that has sent nothing yet is assumed to be latched if any other is.
+                is_latched = self._is_latched.get((topic, node), has_latched)
                 durability = Durability.TRANSIENT_LOCAL if is_latched else Durability.VOLATILE
                 found.append(Endpoint(node, type_name, QosProfile(durability=durability, depth=1)))
         return found
 
     def _latched(self, topic: str) -> list[str]:
-        """The publishers that have said to be latched."""
-        heard = list(self._heard.items())  # other threads add to it
-        return [node for (name, node), is_latched in heard if is_latched and name == topic]
+        """The publishers that are known to be latched."""
+        known = list(self._is_latched.items())  # a copy: other threads add to it
+        return [node for (name, node), is_latched in known if is_latched and name == topic]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         topic = self._resolve(topic)
@@ -463,31 +471,38 @@ class Ros1Node(FaultContainment):
         return [(node, type_name) for node in graph.get(topic, ()) if node != self.name]
 
     def _is_known(self, type_name: str, node: str, topic: str) -> bool:
-        """Whether it is known what the type is made of, or that it cannot be: one that is not
-        installed here is asked for."""
+        """Whether the definition of the type is known, or known to be unavailable.
+
+        The definition of a type that is not installed here is fetched from the node.
+        """
         with suppress(UnknownTypeError):
             self._definition(type_name)
             return True
-        ask = partial(fetch_definition, self._master.uri, self.name, node, topic)
+        query = partial(fetch_definition, self._master.uri, self.name, node, topic)
         try:
-            told = self._definitions.get((topic, node), ask)
+            definition = self._definitions.get((topic, node), query)
         except BusError as error:
-            self._complain(type_name, f"is not installed here, and is not told: {error}")
-            return True
-        if told is not None and self._told.setdefault(type_name, told) != told:
-            self._complain(
-                type_name, f"is another for {node} than it was: restart the appliance to receive it"
+            self._warn_once(
+                type_name, f"is not installed here, and its publisher does not tell it: {error}"
             )
-        return told is not None
+            return True
+        if definition is None:
+            return False
+        if self._remote_definitions.setdefault(type_name, definition) != definition:
+            self._warn_once(
+                type_name,
+                f"of {node} is defined differently now: restart the appliance to receive it",
+            )
+        return True
 
-    def _complain(self, type_name: str, problem: str) -> None:
-        if type_name not in self._complained:
-            self._complained.add(type_name)
+    def _warn_once(self, type_name: str, problem: str) -> None:
+        if type_name not in self._warned:
+            self._warned.add(type_name)
             log.warning("%s %s", type_name, problem)
 
     def _definition(self, type_name: str) -> Definition:
-        told = self._told.get(type_name)
-        return told if told is not None else _installed(type_name)
+        remote = self._remote_definitions.get(type_name)
+        return remote if remote is not None else _installed(type_name)
 
     def describe(self, type_name: str) -> TypeDescription:
         action = describe_action(type_name, self.describe)
@@ -521,21 +536,21 @@ class Ros1Node(FaultContainment):
         contained = self._contained("ros.message", callback)
         return Ros1Subscription(self._rospy, self, topic, definition, is_latched, contained)
 
-    def hear(self, topic: str, node: str, is_latched: bool) -> bool:
-        """What a publisher says of itself; whether that is news."""
+    def track_latching(self, topic: str, node: str, is_latched: bool) -> bool:
+        """Note whether a publisher is latched. Returns whether that has changed."""
         key = topic, node
-        before = self._heard.get(key)
+        before = self._is_latched.get(key)
         if before is is_latched:
             return False
-        self._heard[key] = is_latched
+        self._is_latched[key] = is_latched
         return is_latched or before is not None
 
-    def hold(self, subscription: Ros1Subscription) -> None:
-        """Have it release what it holds after the next look."""
+    def release_later(self, subscription: Ros1Subscription) -> None:
+        """Call `release` of the subscription after the next refresh of the graph."""
         self._holding[subscription] = None
 
-    def let_go(self, subscription: Ros1Subscription) -> None:
-        """It holds nothing any more."""
+    def cancel_release(self, subscription: Ros1Subscription) -> None:
+        """Do not call it: the subscription holds no messages."""
         self._holding.pop(subscription, None)
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> Ros1Publisher:
@@ -558,16 +573,16 @@ class Ros1Node(FaultContainment):
 
     @property
     def master_uri(self) -> str:
-        """Where the Master is."""
+        """The URI of the Master."""
         return self._master.uri
 
     def is_served(self, service: str) -> bool:
         """Whether a service is on the graph."""
         return service in self._servers
 
-    def doubt(self, service: str) -> None:
-        """Ask a service anew for its type: a call of it has failed."""
-        self._service_types.doubt((service, *self._servers.get(service, ())))
+    def call_failed(self, service: str) -> None:
+        """Query the type of a service again, as a call of it has failed."""
+        self._service_types.invalidate((service, *self._servers.get(service, ())))
 
     def create_service(
         self, service: str, type_name: str, callback: Callable[[bytes, Respond], None]

@@ -1,10 +1,10 @@
-"""What is said to the Master and other nodes of ROS 1 beside rospy: questions, service calls.
+"""Requests to the Master and to other nodes of ROS 1 without rospy: queries and service calls.
 
-Everything has a time limit and a largest size, which rospy's own client has not: a computer that is
-switched off answers nothing, and a call that is given up must not leave a thread waiting.
+All of them have a timeout and a size limit, unlike those of rospy's own client: a computer that is
+switched off never answers, and an abandoned call must not leave a thread waiting.
 
-TCPROS is a header of `key=value` fields each way, then messages, everything behind its length in
-four bytes.
+In TCPROS each side sends a header of `key=value` fields, then messages. The length of each field,
+header and message precedes it, in four bytes.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from xml.parsers.expat import ExpatError
 from appliance.ros.node import BusError
 from appliance.ros.ros1.types import Definition, ServiceDefinition
 
-#: Seconds that the Master or a node may take to say something.
+#: Seconds within which the Master or a node must answer.
 TIMEOUT = 2.0
 
-#: Seconds until a question is asked again that was not answered.
+#: Seconds until a query that failed is repeated.
 RETRY_INTERVAL = 5.0
 
-#: Questions that are asked at a time.
+#: Queries that run at the same time, each on a thread.
 QUERY_THREADS = 4
 
-#: Bytes of a header, which has a type's definition in it, and of a response.
+#: The most bytes of a header, which contains the definition of a type, and of a response.
 MAX_HEADER_SIZE = 4 << 20
 MAX_RESPONSE_SIZE = 64 << 20
 
-#: What comes of an answer that is none: a port may be another program's by now.
-_WRONG = (
+#: The errors of a malformed answer: the port may belong to another program by now.
+_MALFORMED = (
     OSError,
     HTTPException,
     xmlrpc.client.Error,
@@ -61,7 +61,7 @@ class _Transport(xmlrpc.client.Transport):
 
 
 class Master:
-    """The Master, or a node, by its URI and XML-RPC; for one thread."""
+    """An XML-RPC client of the Master or of a node; for one thread."""
 
     def __init__(self, uri: str, caller: str) -> None:
         self.uri = uri
@@ -69,19 +69,20 @@ class Master:
         self._proxy: xmlrpc.client.ServerProxy | None = None
 
     def _connection(self) -> xmlrpc.client.ServerProxy:
-        if self._proxy is None:  # which does not take all that may be called a URI
+        if self._proxy is None:  # not in __init__: ServerProxy raises for a malformed URI
             self._proxy = xmlrpc.client.ServerProxy(self.uri, _Transport())
         return self._proxy
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """The value of an answer. Raises BusError, also when it says that it failed."""
+        """The value of an answer. Raises BusError, also when the answer reports a failure."""
         try:
             return _value(getattr(self._connection(), method)(self.caller, *arguments))
-        except _WRONG as error:
+        except _MALFORMED as error:
             raise BusError(f"{self.uri}: {error}") from error
 
     def call_each(self, method: str, calls: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """The values of many answers at once, None for what failed. Raises BusError."""
+        """The values of many answers in one request, None for those that failed. Raises
+        BusError."""
         many = [{"methodName": method, "params": (self.caller, *arguments)} for arguments in calls]
         try:
             answers: Any = self._connection().system.multicall(many) if many else []
@@ -90,11 +91,11 @@ class Master:
                 for answer in answers
             ]
         except xmlrpc.client.Fault:
-            if len(calls) == 1:  # there is no telling it, such as a number of 64 bits
+            if len(calls) == 1:  # XML-RPC cannot express the value, such as a 64-bit integer
                 return [None]
             half = len(calls) // 2
             return self.call_each(method, calls[:half]) + self.call_each(method, calls[half:])
-        except _WRONG as error:
+        except _MALFORMED as error:
             raise BusError(f"{self.uri}: {error}") from error
 
 
@@ -106,7 +107,7 @@ def _value(answer: Any) -> Any:
 
 
 class MasterParameters:
-    """The Master's parameters; a ParameterServer."""
+    """A ParameterServer of the Master's parameters."""
 
     def __init__(self, master: Master) -> None:
         self._master = master
@@ -119,7 +120,7 @@ class MasterParameters:
         return {
             name: _plain(value)
             for name, value in zip(names, values, strict=True)
-            if value is not None  # it has gone meanwhile
+            if value is not None  # deleted meanwhile
         }
 
     def set(self, name: str, value: Any) -> None:
@@ -127,7 +128,7 @@ class MasterParameters:
 
 
 def _plain(value: Any) -> Any:
-    """A value of XML-RPC in Python's own types: dates as their text."""
+    """A value of XML-RPC in Python's own types; a date becomes its text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     if isinstance(value, dict):
@@ -138,72 +139,75 @@ def _plain(value: Any) -> Any:
 
 
 class QueryCache(Generic[_Result]):
-    """Answers to questions, which are asked on threads of their own; for one thread.
+    """Runs blocking queries on threads of its own and caches their results; for one thread.
 
-    An executor's threads would be waited for at the end of the process, and who is asked may take
-    its time.
+    An executor would not do: Python waits for its threads when the process ends, and a query may
+    take long.
     """
 
     def __init__(self) -> None:
-        self._askers: list[threading.Thread] = []
-        self._questions: queue.SimpleQueue[tuple[Future[_Result], Callable[[], _Result]] | None]
-        self._questions = queue.SimpleQueue()
-        self._asked: dict[Any, tuple[Future[_Result], float]] = {}
-        #: What was answered before, until it is answered anew.
-        self._before: dict[Any, _Result] = {}
+        self._threads: list[threading.Thread] = []
+        self._queue: queue.SimpleQueue[tuple[Future[_Result], Callable[[], _Result]] | None]
+        self._queue = queue.SimpleQueue()
+        #: The result of each query, and when the query may be repeated if it failed.
+        self._results: dict[Any, tuple[Future[_Result], float]] = {}
+        #: Invalidated results, which hold until the query has been repeated.
+        self._stale: dict[Any, _Result] = {}
 
-    def get(self, key: Any, ask: Callable[[], _Result]) -> _Result | None:
-        """The answer of `ask`; None when it is not there yet. Raises BusError as `ask` did."""
-        asked = self._asked.get(key)
-        if asked is None or (asked[1] < monotonic() and asked[0].done() and asked[0].exception()):
-            asked = self._asked[key] = (self._ask(ask), monotonic() + RETRY_INTERVAL)
-        if not asked[0].done():
-            return self._before.get(key)
-        self._before.pop(key, None)
-        return asked[0].result()
+    def get(self, key: Any, query: Callable[[], _Result]) -> _Result | None:
+        """The result of `query`; None while it is not known yet. Raises BusError as `query` did."""
+        cached = self._results.get(key)
+        if cached is None or (
+            cached[1] < monotonic() and cached[0].done() and cached[0].exception()
+        ):
+            cached = self._results[key] = (self._submit(query), monotonic() + RETRY_INTERVAL)
+        if not cached[0].done():
+            return self._stale.get(key)
+        self._stale.pop(key, None)
+        return cached[0].result()
 
-    def _ask(self, ask: Callable[[], _Result]) -> Future[_Result]:
-        answer: Future[_Result] = Future()
-        self._questions.put((answer, ask))
-        if len(self._askers) < QUERY_THREADS:
-            asker = threading.Thread(target=self._run, name="ros-ask", daemon=True)
-            self._askers.append(asker)
-            asker.start()
-        return answer
+    def _submit(self, query: Callable[[], _Result]) -> Future[_Result]:
+        result: Future[_Result] = Future()
+        self._queue.put((result, query))
+        if len(self._threads) < QUERY_THREADS:
+            thread = threading.Thread(target=self._run, name="ros-query", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        return result
 
     def _run(self) -> None:
-        while (question := self._questions.get()) is not None:
-            answer, ask = question
-            if not answer.set_running_or_notify_cancel():
+        while (queued := self._queue.get()) is not None:
+            result, query = queued
+            if not result.set_running_or_notify_cancel():
                 continue
             try:
-                answer.set_result(ask())
-            except Exception as error:  # as an executor does: it is raised where it is asked for
-                answer.set_exception(error)
+                result.set_result(query())
+            except Exception as error:  # `get` raises it, as with an executor
+                result.set_exception(error)
 
-    def doubt(self, key: Any) -> None:
-        """Ask anew; what was answered holds until then."""
-        asked = self._asked.get(key)
-        if asked is not None and asked[0].done() and asked[0].exception() is None:
-            self._before[key] = asked[0].result()
-            del self._asked[key]
+    def invalidate(self, key: Any) -> None:
+        """Repeat the query at the next `get`; the present result holds until then."""
+        cached = self._results.get(key)
+        if cached is not None and cached[0].done() and cached[0].exception() is None:
+            self._stale[key] = cached[0].result()
+            del self._results[key]
 
-    def keep(self, keys: set[Any]) -> None:
-        """Forget all others."""
-        for key in self._asked.keys() - keys:
-            self._asked.pop(key)[0].cancel()
-        for key in self._before.keys() - keys:
-            del self._before[key]
+    def evict_others(self, keys: set[Any]) -> None:
+        """Remove all results but those of `keys`."""
+        for key in self._results.keys() - keys:
+            self._results.pop(key)[0].cancel()
+        for key in self._stale.keys() - keys:
+            del self._stale[key]
 
     def close(self) -> None:
-        """Ask nothing more."""
-        self.keep(set())
-        for _ in self._askers:
-            self._questions.put(None)
+        """End the threads once their present queries are done."""
+        self.evict_others(set())
+        for _ in self._threads:
+            self._queue.put(None)
 
 
 def fetch_definition(master_uri: str, caller: str, node: str, topic: str) -> Definition:
-    """The definition of a topic's type, as one of its publishers has it. Raises BusError."""
+    """The definition of a topic's type, from one of its publishers. Raises BusError."""
     uri = Master(master_uri, caller).call("lookupNode", node)
     protocol = Master(uri, caller).call("requestTopic", topic, [["TCPROS"]])
     if not isinstance(protocol, list) or len(protocol) != 3:
@@ -240,7 +244,7 @@ class ServiceCall:
         request: bytes,
         done: Callable[[bytes | BusError], None],
     ) -> None:
-        """`done` is called with the response, on that thread, unless the call was given up."""
+        """`done` is called with the response, on that thread, unless the call was abandoned."""
         self._master_uri = master_uri
         self._caller = caller
         self._service = service
@@ -253,7 +257,7 @@ class ServiceCall:
         threading.Thread(target=self._run, name="ros-call", daemon=True).start()
 
     def give_up(self) -> None:
-        """End it: nobody waits for the response any more."""
+        """Abandon the call: `done` is not called any more."""
         with self._lock:
             self._is_over = True
             if self._peer is not None:
@@ -290,7 +294,7 @@ class ServiceCall:
             try:
                 _shake_hands(peer, fields, service)
                 peer.sendall(struct.pack("<I", len(self._request)) + self._request)
-                # How long a service may work is for who called it to decide.
+                # How long a service may work is up to its caller.
                 peer.settimeout(None)
                 is_ok = _read(peer, 1, service) != b"\0"
                 response = _read_sized(peer, MAX_RESPONSE_SIZE, service)
@@ -303,7 +307,7 @@ class ServiceCall:
 
 
 def _address(uri: object, service: str) -> tuple[str, int]:
-    with suppress(ValueError):  # what a node registers nobody checks
+    with suppress(ValueError):  # the Master does not check what nodes register
         parts = urlsplit(str(uri))
         if parts.scheme == "rosrpc" and parts.hostname is not None and parts.port is not None:
             return parts.hostname, parts.port
@@ -315,7 +319,7 @@ def _connect(address: tuple[str, Any], who: str) -> socket.socket:
     try:
         peer = socket.create_connection((host, int(port)), TIMEOUT)
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    # What it tells may be no number, too large a one, or no name of a computer (UnicodeError).
+    # A node may register a port that is no number or too large, or no valid name (UnicodeError).
     except (OSError, ValueError, TypeError, OverflowError) as error:
         raise BusError(
             f"{who} cannot be reached at {host}:{port}: {error} (it tells the address that its "
@@ -325,8 +329,11 @@ def _connect(address: tuple[str, Any], who: str) -> socket.socket:
 
 
 def _shake_hands(peer: socket.socket, fields: Mapping[str, str], who: str) -> dict[str, str]:
-    """Send a header, and read the other's. Raises BusError, also for an error in it, and when the
-    other takes longer than PATIENCE for all of it."""
+    """Send a header, and read that of the peer.
+
+    Raises BusError, also when the peer's header reports an error, or is not complete within
+    TIMEOUT.
+    """
     until = monotonic() + TIMEOUT
     lines = [f"{key}={value}".encode() for key, value in fields.items()]
     header = b"".join(struct.pack("<I", len(line)) + line for line in lines)
@@ -366,7 +373,7 @@ def _read_sized(peer: socket.socket, largest: int, who: str, until: float | None
 
 
 def _read(peer: socket.socket, size: int, who: str, until: float | None = None) -> bytes:
-    """So many bytes; with `until` before that time."""
+    """Read `size` bytes; when `until` is given, before that time."""
     data = bytearray()
     while len(data) < size:
         try:

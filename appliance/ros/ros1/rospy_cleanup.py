@@ -1,7 +1,7 @@
-"""What rospy leaves undone: it stays in memory, its servers and their threads do not end, one
-caller keeps away all others, and it believes a length of 4 GB.
+"""Corrections of rospy: it stays in memory, does not end its servers and their threads, lets one
+peer block all others, and accepts a length of 4 GB.
 
-It is given here as a module, and imported in ros1.py alone.
+rospy is an argument here; only node.py imports it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from appliance.ros.ros1.types import MAX_MESSAGE_SIZE
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a caller of ours may take between two bytes of what it is for, and how many may do
-#: so at a time.
+#: Seconds that a peer may take between two bytes of its TCPROS header, and how many peers may be
+#: sending theirs at the same time.
 HANDSHAKE_TIMEOUT = 5.0
 MAX_HANDSHAKES = 200
 
 
 def unload() -> None:
-    """Let go of a rospy that has ended, to import it anew; nothing of it stays in memory."""
+    """Unload a rospy that has ended, so that it can be imported again; nothing of it stays in
+    memory."""
     core = sys.modules.get("rospy.core")
     if core is not None:
         forget_classes()
@@ -43,52 +44,55 @@ def unload() -> None:
 
 
 class ServerShutdown:
-    """The two servers of a node, to be ended with all their threads. rospy closes the sockets that
-    these wait at, which they do not notice, and keeps the connections, and others their ends. And
-    it hears one caller at a time out: one that says nothing would keep away all others."""
+    """Shuts the two servers of a node down, with all their threads and connections.
+
+    rospy closes the sockets on which the servers wait, which does not wake them, and leaves their
+    connections open. And it reads the header of one peer at a time, so that a peer that sends
+    nothing would block all others. Here each header is read on a thread of its own.
+    """
 
     def __init__(self, rospy: Any) -> None:
         from rosgraph.xmlrpc import XmlRpcNode
 
         owners = [getattr(hook, "__self__", None) for hook in rospy.core._shutdown_hooks]
         node = next((owner for owner in owners if isinstance(owner, XmlRpcNode)), None)
-        if node is None or node.server is None:  # shut down from outside already
+        if node is None or node.server is None:  # has been shut down from outside
             return
         self._node = node
         self._connections: WeakSet[socket.socket] = WeakSet()
         self._process = node.server.process_request
-        node.server.process_request = self._note_and_process
+        node.server.process_request = self._track_and_process
         base = rospy.impl.tcpros_base
         self._tcpros = base._tcpros_server
-        #: Connections of which it is not known yet what they are for; a dict for its lock.
-        self._callers: dict[socket.socket, None] = {}
+        #: Connections whose header is being read. A dict, whose single operations are atomic.
+        self._handshakes: dict[socket.socket, None] = {}
         self._admit = self._tcpros._tcp_server_callback
-        self._tcpros._tcp_server_callback = self._hear_out
+        self._tcpros._tcp_server_callback = self._read_header_on_thread
         if self._tcpros.tcp_ros_server is not None:
-            self._tcpros.tcp_ros_server.inbound_handler = self._hear_out
+            self._tcpros.tcp_ros_server.inbound_handler = self._read_header_on_thread
         self._read_header = base.read_ros_handshake_header
         base.read_ros_handshake_header = self._read_header_in_time
         rospy.core.add_preshutdown_hook(self._end)
 
-    def _note_and_process(self, request: socket.socket, address: object) -> None:
+    def _track_and_process(self, request: socket.socket, address: object) -> None:
         self._connections.add(request)
         self._process(request, address)
 
-    def _hear_out(self, caller: socket.socket, address: object) -> None:
+    def _read_header_on_thread(self, peer: socket.socket, address: object) -> None:
         def admit() -> None:
             try:
-                self._admit(caller, address)
+                self._admit(peer, address)
             finally:
-                self._callers.pop(caller, None)
+                self._handshakes.pop(peer, None)
 
-        if len(self._callers) >= MAX_HANDSHAKES:
-            caller.close()
+        if len(self._handshakes) >= MAX_HANDSHAKES:
+            peer.close()
             return
-        self._callers[caller] = None
-        threading.Thread(target=admit, name="ros caller", daemon=True).start()
+        self._handshakes[peer] = None
+        threading.Thread(target=admit, name="ros handshake", daemon=True).start()
 
     def _read_header_in_time(self, connection: socket.socket, *more: Any) -> Any:
-        if connection not in self._callers:  # one of our own
+        if connection not in self._handshakes:  # this node opened it
             return self._read_header(connection, *more)
         connection.settimeout(HANDSHAKE_TIMEOUT)
         try:
@@ -100,20 +104,20 @@ class ServerShutdown:
         self._node.is_shutdown = True
         self._node.server.shutdown()
         for connection in list(self._connections):
-            with suppress(OSError):  # one that has ended
-                connection.shutdown(socket.SHUT_RD)  # what it has asked for is answered
+            with suppress(OSError):  # closed already
+                connection.shutdown(socket.SHUT_RD)  # its present request is still answered
         tcp = self._tcpros.tcp_ros_server
         if tcp is not None:
             tcp.is_shutdown = True
             tcp.server_sock.shutdown(socket.SHUT_RDWR)  # wakes accept()
             tcp.server_sock.close()
-        for caller in list(self._callers):
+        for peer in list(self._handshakes):
             with suppress(OSError):
-                caller.shutdown(socket.SHUT_RDWR)
+                peer.shutdown(socket.SHUT_RDWR)
 
 
 class _HeaderBuffer(BytesIO):
-    """What has come of a TCPROS header, and then of what is behind it."""
+    """A buffer that refuses a TCPROS header longer than MAX_HEADER_SIZE."""
 
     _is_bounded = False
 
@@ -129,14 +133,16 @@ class _HeaderBuffer(BytesIO):
 
 
 def _announced(buffer: BytesIO) -> int:
-    """The length that is before what is in a buffer."""
+    """The length field at the start of a buffer."""
     with buffer.getbuffer() as data:
         return int.from_bytes(data[:4], "little")
 
 
 def limit_receive_size(rospy: Any) -> None:
-    """Pass over what is announced to be larger than anything is: rospy keeps what has come of a
-    message until it is complete, and a wrong length may say 4 GB."""
+    """Discard messages whose announced length exceeds MAX_MESSAGE_SIZE.
+
+    rospy buffers a message until it is complete, and a wrong length may be up to 4 GB.
+    """
     base = rospy.impl.tcpros_base
     receive, read_header = base.recv_buff, base.read_ros_handshake_header
 
@@ -146,7 +152,7 @@ def limit_receive_size(rospy: Any) -> None:
         if announced <= MAX_MESSAGE_SIZE:
             return count
         log.warning(
-            "a message of %d bytes, the most are %d, is left out", announced, MAX_MESSAGE_SIZE
+            "a message of %d bytes is dropped, at most %d are received", announced, MAX_MESSAGE_SIZE
         )
         left = 4 + announced - buffer.tell()
         while left:
@@ -160,7 +166,7 @@ def limit_receive_size(rospy: Any) -> None:
     def read_header_bounded(peer: socket.socket, buffer: BytesIO, size: int) -> Any:
         own = _HeaderBuffer()
         header = read_header(peer, own, size)
-        buffer.write(own.getvalue())  # what came behind it
+        buffer.write(own.getvalue())  # bytes that arrived behind the header
         return header
 
     base.recv_buff = receive_bounded

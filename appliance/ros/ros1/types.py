@@ -1,11 +1,11 @@
-"""ROS 1's message types: described from their definitions, which every node tells its peers.
+"""Message types of ROS 1, described from their definitions.
 
-A full definition is a message's own text, then those of all types in it, each behind a line of `=`
-and `MSG: package/Type`. Installed packages have it in `_full_text`, publishers tell it to who
-connects: a type that is not installed here can be received all the same.
+A full definition is the text of the message, then those of all nested types, each behind a line
+of `=` and a line `MSG: package/Type`. Installed packages have it in `_full_text`. Publishers send
+it to each subscriber, so that types that are not installed here can be received as well.
 
-In here types are called as in ROS 2, `std_msgs/msg/String` and `std_srvs/srv/Trigger`, which tells
-messages from services; `ros1_name` gives what ROS 1 calls them.
+The names of types are those of ROS 2, `std_msgs/msg/String` and `std_srvs/srv/Trigger`, which
+distinguish messages from services. `ros1_name` returns the name in ROS 1.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from appliance.ros.payload.definitions import (
     least_size,
 )
 
-#: Bytes of a definition, fields that it comes to with all that is in it, types in types, and bytes
-#: of the smallest message: a stranger's definition is no reason to run out of memory.
+#: Limits of a definition: its bytes, its fields with those of nested types, the depth of nesting,
+#: and the bytes of its smallest message. Any node can send one, which must not exhaust the memory.
 MAX_DEFINITION_SIZE = 1 << 20
 MAX_FIELDS = 5_000
-MAX_DEPTH = 16  # Python takes no more than 20 loops in loops
+MAX_DEPTH = 16  # Python compiles at most 20 nested loops
 MAX_MESSAGE_SIZE = 64 << 20
 
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:(msg|srv)/)?([A-Za-z]\w*)\Z", re.ASCII)
 _FIELD = re.compile(r"([A-Za-z][\w/]*)(?:\[(\d{0,9})\])?\s+([A-Za-z]\w*)\s*(=.*|#.*)?\Z", re.ASCII)
 _SEPARATOR = re.compile(r"^={80}$", re.MULTILINE)
 
-# Both are two numbers of four bytes, which ROS 2 calls differently.
+# Both are two numbers of four bytes, with other names than in ROS 2.
 _TIMES: dict[str, TypeDescription] = {
     name: TypeDescription(
         full_name,
@@ -55,7 +55,7 @@ _TIMES: dict[str, TypeDescription] = {
     )
 }
 
-#: What a time is.
+#: The type `time`.
 STAMP = _TIMES["time"]
 
 #: byte is an old name of int8, and char of uint8.
@@ -70,8 +70,8 @@ _BUILT_IN: dict[str, ItemType] = {
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A message type as peers tell it to each other: what it is called in ROS 1, the MD5 sum that
-    has to be the same at both ends, and its full text."""
+    """A message type as nodes exchange it: its name in ROS 1, its MD5 sum, which both sides must
+    have in common, and its full text."""
 
     name: str
     md5sum: str
@@ -80,7 +80,7 @@ class Definition:
 
 @dataclass(frozen=True, slots=True)
 class ServiceDefinition:
-    """A service type: what it is called in ROS 1, its MD5 sum and the two messages."""
+    """A service type: its name in ROS 1, its MD5 sum and its two messages."""
 
     name: str
     md5sum: str
@@ -145,7 +145,7 @@ def _import(name: str, kind: str) -> Any:
 def describe(name: str, text: str) -> TypeDescription:
     """The description of a message type `std_msgs/msg/String`, from its full definition.
 
-    Raises UnknownTypeError when the text is none, or is too large to be one.
+    Raises UnknownTypeError when the text is no definition, or exceeds a limit.
     """
     if len(text) > MAX_DEFINITION_SIZE:
         raise UnknownTypeError(f"no {name}: its definition has {len(text)} characters")
@@ -168,9 +168,9 @@ class _Parser:
 
     def describe(self, name: str, ros1: str, text: str, above: tuple[str, ...]) -> TypeDescription:
         if ros1 in above:
-            raise self._wrong(f"{ros1} contains itself")
+            raise self._error(f"{ros1} contains itself")
         if len(above) > MAX_DEPTH:
-            raise self._wrong(f"it is too deep: more than {MAX_DEPTH} types in types")
+            raise self._error(f"it is too deep: more than {MAX_DEPTH} types in types")
         fields: list[Field] = []
         count = 1
         for line in text.split("\n"):
@@ -179,25 +179,25 @@ class _Parser:
                 continue
             match = _FIELD.match(line)
             if match is None:
-                raise self._wrong(f"{ros1} has the line {line[:60]!r}")
+                raise self._error(f"{ros1} has the line {line[:60]!r}")
             type_name, length, field_name, rest = match.groups()
             if rest and rest.startswith("="):  # a constant
                 continue
             item = self._item(type_name, ros1, (*above, ros1))
             type_: FieldType = item
             if length is not None:
-                # With nothing to count them by, a few bytes could stand for any number of them.
+                # Items without bytes cannot be counted: a few bytes could stand for any number.
                 if least_size(item) == 0 or length == "0":
-                    raise self._wrong(f"{ros1}.{field_name} is an array of nothing")
+                    raise self._error(f"{ros1}.{field_name} is an array of nothing")
                 type_ = Array(item, int(length)) if length else Sequence(item)
             fields.append(Field(field_name, type_))
             if isinstance(item, TypeDescription):
                 count += self._known[item.name][1]
             else:
-                # Short arrays are read number by number.
+                # Generated code reads short arrays inline, a variable an item.
                 count += min(int(length), MAX_INLINE_ITEMS) if length else 1
             if count > MAX_FIELDS:
-                raise self._wrong(f"it has more than {MAX_FIELDS} fields")
+                raise self._error(f"it has more than {MAX_FIELDS} fields")
         description = TypeDescription(name, tuple(fields), PACKED)
         self._known[name] = description, count
         return description
@@ -217,8 +217,8 @@ class _Parser:
             return self._known[name][0]
         text = self._sections.get(type_name)
         if text is None:
-            raise self._wrong(f"it does not say what {type_name} is")
+            raise self._error(f"it does not say what {type_name} is")
         return self.describe(name, type_name, text, above)
 
-    def _wrong(self, problem: str) -> UnknownTypeError:
+    def _error(self, problem: str) -> UnknownTypeError:
         return UnknownTypeError(f"no {self._root}: its definition cannot be read: {problem}")

@@ -1,4 +1,4 @@
-"""The file by which Fast DDS, ROS 2's usual middleware, shares more memory between nodes."""
+"""The profile with which Fast DDS, ROS 2's usual middleware, shares more memory between nodes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent
-#: Ours: the built-in transports, with room for a few images.
+#: The appliance's own profile: the built-in transports, with room for a few images.
 PROFILE = _FOLDER / "fastdds.xml"
-#: By whether it is for nodes of this computer only, and for UDP without shared memory.
+#: The profiles by (is for nodes of this computer only, is for UDP without shared memory).
 _PROFILES = {
     (False, False): PROFILE,
     (False, True): _FOLDER / "fastdds_udp.xml",
@@ -19,14 +19,14 @@ _PROFILES = {
     (True, True): _FOLDER / "fastdds_local_udp.xml",
 }
 
-#: What names the file to a node, and what did up to ROS 2 Jazzy, when it was called Fast RTPS.
+#: The variables that name the profile to a node: now, and up to ROS 2 Jazzy (as Fast RTPS).
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
-#: With it a file of that name in the working directory is not read; up to Fast DDS 2, and since.
+#: With these set, no profile in the working directory is read: up to Fast DDS 2, and since.
 _SKIP_FILES = ("SKIP_DEFAULT_XML", "SKIP_DEFAULT_XML_FILE")
 _TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 
-#: What to do about messages that the middleware lost on their way here.
+#: The advice for messages that the middleware lost.
 LOST_IN_ROS = (
     "ROS's middleware lost these on their way here, most often because images do not fit into the "
     "512 KiB of memory that a publisher shares by default; `appliance fastdds > fastdds.xml` makes "
@@ -37,19 +37,19 @@ _SEGMENT = re.compile(r"(?<=<segment_size>)\d+(?=</segment_size>)")
 
 
 def profile(segment: int) -> str:
-    """The file's text, with so many bytes of memory for what a node publishes."""
+    """The text of the profile, with `segment` bytes of shared memory for a publishing node."""
     without_comment = re.sub(r"<!--.*?-->\n", "", PROFILE.read_text(), flags=re.DOTALL)
     return _SEGMENT.sub(str(segment), without_comment)
 
 
 def shares() -> Iterator[Path]:
-    """The folders that ROS's packages share files in; those of the wheels are in the venv."""
+    """The `share` folders of ROS's packages; that of the wheels is in the venv."""
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
 
 
 def is_old() -> bool:
-    """Whether it is Fast RTPS, up to ROS 2 Jazzy, which warns of the old variable since."""
+    """Whether it is Fast RTPS, up to ROS 2 Jazzy. Fast DDS warns of the old variable."""
     return any((share / "fastrtps").is_dir() for share in shares())
 
 
@@ -59,20 +59,20 @@ def is_used(environment: Mapping[str, str]) -> bool:
 
 
 def settings_of_user(environment: Mapping[str, str]) -> list[str]:
-    """What the user has said to Fast DDS: profiles, and transports that we have no profile for."""
-    said = [f"{name}={environment[name]}" for name in VARIABLES if environment.get(name)]
-    said += [f"{file} in {Path.cwd()}" for file in _FILES if Path(file).exists()]
+    """The user's settings of Fast DDS: profiles, and transports without a profile of ours."""
+    found = [f"{name}={environment[name]}" for name in VARIABLES if environment.get(name)]
+    found += [f"{file} in {Path.cwd()}" for file in _FILES if Path(file).exists()]
     transports = environment.get(_TRANSPORTS)
-    return said + ([f"{_TRANSPORTS}={transports}"] if transports not in (None, "UDPv4") else [])
+    return found + ([f"{_TRANSPORTS}={transports}"] if transports not in (None, "UDPv4") else [])
 
 
 def use_profile(environment: MutableMapping[str, str], *, is_local: bool = False) -> bool:
-    """Let Fast DDS read our profile: room for images. False when it must not: the user's own
-    settings go first. Where `is_local` it is for nodes of this computer only, and goes before
-    these: any other would open sockets to the network.
+    """Make Fast DDS read our profile, which has room for images.
 
-    On ROS 2 up to Jazzy a profile's transports would also undo `ROS_LOCALHOST_ONLY`, which Kilted
-    does not know any more.
+    Returns False without a change when the user has settings of Fast DDS: these take precedence.
+    The profile for nodes of this computer only, with `is_local`, overrides them: any other profile
+    would open sockets to the network. On ROS 2 up to Jazzy the transports of a profile would also
+    override `ROS_LOCALHOST_ONLY`, which Kilted does not know any more.
     """
     is_udp = environment.get(_TRANSPORTS) == "UDPv4"
     if not is_used(environment) or (
@@ -85,7 +85,7 @@ def use_profile(environment: MutableMapping[str, str], *, is_local: bool = False
         environment.update(dict.fromkeys(_SKIP_FILES, "1"))
     elif (
         settings_of_user(environment)
-        # In Humble and before it does not know the variable, and the profile says it.
+        # Up to Humble, Fast DDS does not know the variable: the profile configures UDP there.
         or (is_udp and not is_old())
     ):
         return False
@@ -94,6 +94,6 @@ def use_profile(environment: MutableMapping[str, str], *, is_local: bool = False
 
 
 def is_local(environment: Mapping[str, str]) -> bool:
-    """Whether Fast DDS reads our profile for nodes of this computer only."""
+    """Whether Fast DDS reads our profile for nodes of this computer."""
     ours = {str(path) for (local, _), path in _PROFILES.items() if local}
     return any(environment.get(variable) in ours for variable in VARIABLES)

@@ -1,6 +1,7 @@
-"""Which ROS 2 this process uses, which others there are, and what to do to use those.
+"""Finds the ROS 2 that this process uses, a sourced one beside it, and how to use that instead.
 
-Nothing of ROS is imported here: `appliance doctor` asks before, and the one file decides by it.
+Nothing of ROS is imported here: `appliance doctor` reports it without ROS, and the one file chooses
+its ROS with it.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-#: Which ROS the one file uses: `system` (the sourced one) or `bundled` (its own). Unset, it is the
-#: sourced one when that has types that the bundled one has not, and both have the same Python.
+#: The variable that selects the ROS of the one file: `system` (the sourced one) or `bundled` (its
+#: own). Unset, the sourced one is used when it has types that the bundled one lacks, and both have
+#: the same Python.
 CHOICE = "ROS_FROM"
 
 DEFAULT_RMW = "rmw_fastrtps_cpp"
@@ -28,8 +30,8 @@ PythonVersion = tuple[int, int]
 
 @dataclass(frozen=True)
 class Sourced:
-    """A ROS 2 that the environment names: the Python that its rclpy is for, the folder that this is
-    in, and its distribution where ROS_DISTRO says it."""
+    """A sourced ROS 2, from the environment: the Python version of its rclpy, the folder of its
+    Python packages, and its distribution where ROS_DISTRO names it."""
 
     python: PythonVersion
     site: Path
@@ -47,10 +49,11 @@ class Sourced:
 
 @dataclass(frozen=True)
 class Installation:
-    """The ROS 2 that is used, and `advice`, a sentence on what to do where there is something.
+    """The ROS 2 that is used.
 
-    `source` is `sourced`, `bundled` (in the one file), `installed` (from PyPI) or `none`; `where`
-    is the folder of its Python packages. `rmw` and `domain` are as the environment has them.
+    `source` is `sourced`, `bundled` (in the one file), `installed` (from PyPI) or `none`. `where`
+    is the folder of its Python packages. `rmw` and `domain` are from the environment. `advice` is
+    a sentence on what to do, empty when there is nothing to do.
     """
 
     source: Literal["sourced", "bundled", "installed", "none"]
@@ -69,7 +72,7 @@ class Installation:
 
 
 def find(environment: Mapping[str, str] | None = None) -> Installation:
-    """What an import of rclpy finds in this process. Imports nothing."""
+    """The ROS 2 that an import of rclpy finds in this process. Imports nothing."""
     environment = os.environ if environment is None else environment
     sourced = find_sourced(environment)
     spec = find_spec("rclpy")
@@ -94,7 +97,7 @@ def find(environment: Mapping[str, str] | None = None) -> Installation:
 
 
 def find_sourced(environment: Mapping[str, str]) -> Sourced | None:
-    """The first ROS 2 that PYTHONPATH or AMENT_PREFIX_PATH leads to, as sourcing sets them."""
+    """The first ROS 2 in PYTHONPATH or AMENT_PREFIX_PATH, which sourcing a setup file sets."""
     fitting: list[Sourced] = []
     others: list[Sourced] = []
     for site in _sites(environment):
@@ -115,7 +118,7 @@ def _sites(environment: Mapping[str, str]) -> Iterator[Path]:
 
 
 def is_wanted(environment: Mapping[str, str]) -> Sourced | None:
-    """The sourced ROS, when the one file shall use it in place of its own, see CHOICE."""
+    """The sourced ROS, when the one file shall use it instead of its own; see CHOICE."""
     choice = environment.get(CHOICE, "")
     sourced = find_sourced(environment) if choice != "bundled" else None
     if sourced is None or not sourced.fits:
@@ -126,7 +129,7 @@ def is_wanted(environment: Mapping[str, str]) -> Sourced | None:
 
 
 def is_frozen() -> bool:
-    """Whether this is the one file."""
+    """Whether this process runs from the one file."""
     return bool(getattr(sys, "frozen", False))
 
 

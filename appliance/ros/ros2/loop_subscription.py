@@ -1,9 +1,9 @@
 """Subscriptions on ROS 2 whose messages the event loop's thread takes itself.
 
-An executor wakes two threads a message, its own and then the loop's, and at a thousand messages a
-second waking costs more than all else. Here the middleware's thread calls `eventfd_write`, as the C
-library has it, for each message: no interpreter and none of its locks, and the loop waits for the
-file descriptor as for any other.
+An executor wakes two threads for each message, its own and then the loop's, and at a thousand
+messages a second these wake-ups cost more than everything else. Here the thread of the middleware
+calls the C library's `eventfd_write` for each message, without the interpreter or its lock, and the
+loop waits for that file descriptor as for any other.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from appliance.net.callbacks import Entries
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, TakeBatch
 
-#: What the loop's thread takes before it lets others have their turn: a millisecond of work.
+#: The most messages and bytes that the loop's thread takes before other callbacks run: about 1 ms.
 BATCH = 64
 BATCH_BYTES = 2 * LARGE
 
-#: Seconds in which there is always more than a batch until it is no burst any more: the loop cannot
-#: keep up, and what it takes gets ever older.
+#: Seconds of always more than a batch after which it is not a burst any more: the loop cannot keep
+#: up, and the messages that it takes get ever older.
 BEHIND_AFTER = 0.5
 
-#: So many small messages in a row it takes until a topic with a large one is thought small again.
+#: After so many small messages in a row, a topic that had a large one counts as small again.
 SMALL_IN_A_ROW = 16
 
-#: How many messages of a subscription are timed first, and of how many one is then.
+#: The first messages of a subscription are all timed; then one of ONE_TIMED_OF is.
 FIRST_TIMED = 100
 ONE_TIMED_OF = 16
 
@@ -38,19 +38,19 @@ _SET_CALLBACK = "rcl_subscription_set_on_new_message_callback"
 
 
 class UnavailableError(Exception):
-    """Subscriptions cannot be taken from here; the message says why."""
+    """The loop's thread cannot take messages itself here; the error text says why."""
 
 
 class Doorbell:
     """A file descriptor that is readable when a subscription has new messages."""
 
     def __init__(self, pointer: int) -> None:
-        """For the `rcl_subscription_t` there. Raises UnavailableError."""
-        # With 32 bits, eventfd_write does not take its arguments the way a callback is given them.
+        """`pointer` is the address of the `rcl_subscription_t`. Raises UnavailableError."""
+        # On 32 bits, the callback's arguments are not passed as eventfd_write expects them.
         if ctypes.sizeof(ctypes.c_void_p) < 8:
             raise UnavailableError("not on a computer with 32 bits")
         try:
-            # rclpy has loaded it; another copy would not know the subscription.
+            # The copy that rclpy has loaded; another one would not know the subscription.
             rcl = ctypes.CDLL("librcl.so", os.RTLD_NOW | os.RTLD_NOLOAD)
             self._set_callback = getattr(rcl, _SET_CALLBACK)
             ring = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
@@ -63,41 +63,41 @@ class Doorbell:
             raise UnavailableError("this middleware does not tell of new messages")
 
     def rings(self) -> int:
-        """How many messages have come since it was last asked."""
+        """The number of messages that have arrived since the last call."""
         try:
             return os.eventfd_read(self.fd)
         except BlockingIOError:
             return 0
 
     def ring(self) -> None:
-        """As if one had come."""
+        """Make the descriptor readable, as if a message had arrived."""
         os.eventfd_write(self.fd, 1)
 
     def silence(self, pointer: int) -> None:
-        """It does not ring any more. The middleware waits here for a thread that is just ringing,
-        so that `close` may follow, which must come before the subscription's end."""
+        """Remove the callback. The middleware waits here for a thread that is just in it, so that
+        `close` may follow. Must be called before the subscription is destroyed."""
         self._set_callback(pointer, None, None)
 
     def close(self) -> None:
-        """After `silence`, when nobody waits for it any more."""
+        """Close the descriptor. Call `silence` first, and remove the descriptor from the loop."""
         os.close(self.fd)
 
 
 class Losses(Protocol):
-    """What the middleware lost of a subscription's messages. For the ROS thread."""
+    """Counts the messages of a subscription that the middleware lost. For the ROS thread."""
 
     def take(self) -> int:
-        """How many since it was asked last."""
+        """The number of messages lost since the last call."""
 
     def destroy(self) -> None:
-        """Before the subscription's own end."""
+        """Destroy it. Must be called before the subscription is destroyed."""
 
 
 class LoopSubscription:
-    """A subscription that no executor knows; a RosSubscription.
+    """A RosSubscription without an executor.
 
-    Large messages, and those right behind them, are left to the ROS thread: on the loop's they
-    would be in everybody's way. That they are there is noticed on the loop's all the same.
+    Large messages, and those right behind them, are handed over to the ROS thread: on the loop's
+    thread they would delay everything else. The loop's thread is still the one that is notified.
     """
 
     def __init__(
@@ -110,8 +110,11 @@ class LoopSubscription:
         on_loop: TakeBatch,
         losses: Losses,
     ) -> None:
-        """`handle` is rclpy's own, which becomes this one's to destroy. `call_soon` leads to the
-        ROS thread, where `callback` is called, and this is. Raises UnavailableError."""
+        """Called on the ROS thread. Raises UnavailableError.
+
+        `handle` is rclpy's own; this object destroys it. `call_soon` calls on the ROS thread, where
+        `callback` takes large messages.
+        """
         self._handle = handle
         self._take_message = handle.take_message
         self._message_class = message_class
@@ -124,11 +127,11 @@ class LoopSubscription:
         self._since = time.monotonic_ns()
         self._until_timed = 1
         self._timed = 0
-        #: Messages that the doorbell rang for and that have not been taken; fewer than none when
-        #: some were taken before it rang for them.
-        self._owed = 0
+        #: Messages that were notified and not taken yet. Negative when messages were taken before
+        #: their notification.
+        self._notified = 0
         self._lost = 0
-        #: How many small messages are missing until the topic is thought small.
+        #: Small messages in a row that are missing until the topic counts as small; 0 when it does.
         self._large_for = 0
         #: Since when there has always been more than a batch, by the loop's clock; else None.
         self._behind_since: float | None = None
@@ -144,11 +147,11 @@ class LoopSubscription:
         self._losses.destroy()
         with self._handle:
             self._doorbell.silence(self._handle.pointer)
-        # If the loop's thread is taking messages at this moment, it happens when that is done.
+        # When the loop's thread is just taking messages, the handle is destroyed after that.
         self._handle.destroy_when_not_in_use()
         try:
             self._entries.from_thread("ros.close", self._close)
-        except RuntimeError:  # the loop is closed, and waits for nothing any more
+        except RuntimeError:  # the loop is closed, and does not use the descriptor any more
             self._doorbell.close()
 
     def take_lost(self) -> int:
@@ -158,11 +161,12 @@ class LoopSubscription:
 
     def _listen(self) -> None:
         if not self._is_ended:
-            self._entries.reader("ros.ring", self._doorbell.fd, self._ring, failed=self._quiet)
+            self._entries.reader("ros.ring", self._doorbell.fd, self._ring, failed=self._drain)
 
-    def _quiet(self) -> None:
-        """What rang is not taken now, or it would ring for ever: it is when it rings again."""
-        self._owed += self._doorbell.rings()
+    def _drain(self) -> None:
+        """Reset the descriptor, or the loop would be called forever. The messages are taken at the
+        next notification."""
+        self._notified += self._doorbell.rings()
 
     def _close(self) -> None:
         self._loop.remove_reader(self._doorbell.fd)
@@ -186,16 +190,16 @@ class LoopSubscription:
             if self._behind_since is None:
                 self._behind_since = now
             is_late = now > self._behind_since + BEHIND_AFTER
-            # Not by a callback of the loop's: with what comes meanwhile there would be two turns a
-            # round, then three, and one that is left when the ROS thread has been given the rest.
-            self._owed -= 1
+            # Not by a callback of the loop's: with new notifications there would be two calls an
+            # iteration, then three, and a stray one once the ROS thread has the subscription.
+            self._notified -= 1
             self._doorbell.ring()
         lost, self._lost = self._lost, 0
         self._on_loop(batch, lost, is_late)
 
     def _hand_over(self, batch: list[tuple[bytes, int]]) -> None:
-        """Let the ROS thread have these messages and what there is more; until it is done, the
-        subscription is its own."""
+        """Hand these messages and the subscription over to the ROS thread, until that has taken all
+        messages."""
         self._loop.remove_reader(self._doorbell.fd)
         with suppress(BusError):  # the bus is gone
             self._call_soon(lambda: self._take_large(batch))
@@ -221,7 +225,7 @@ class LoopSubscription:
                 self._callback(*message)
         finally:
             if has_more:
-                self._call_soon(lambda: self._take_large([]))  # others have their turn before
+                self._call_soon(lambda: self._take_large([]))  # behind other callbacks
             else:
                 lost, self._lost = self._lost, 0
                 with suppress(RuntimeError):  # the loop is closed
@@ -229,25 +233,25 @@ class LoopSubscription:
                         "ros.take_back", self._take_back, lost, failed=self._listen
                     )
 
-    # The one that has the subscription
+    # The thread that has the subscription
 
     def _take(self) -> tuple[list[tuple[bytes, int]], bool]:
-        """Up to a batch of what there is, and whether that may not be all."""
+        """Take up to a batch of messages. Returns these and whether there may be more."""
         batch: list[tuple[bytes, int]] = []
         size = 0
-        self._owed += self._doorbell.rings()
+        self._notified += self._doorbell.rings()
         take, message_class = self._take_message, self._message_class
         try:
             with self._handle:
                 while len(batch) < BATCH and size < BATCH_BYTES:
                     taken = take(message_class, True)
                     if taken is None:
-                        # What rang and is not there had to make room.
-                        self._lost += max(self._owed, 0)
-                        self._owed = min(self._owed, 0)
+                        # Messages that were notified and are gone were dropped by the queue.
+                        self._lost += max(self._notified, 0)
+                        self._notified = min(self._notified, 0)
                         return batch, False
                     cdr, info = taken
-                    self._owed -= 1
+                    self._notified -= 1
                     size += len(cdr)
                     if len(cdr) > LARGE:
                         self._large_for = SMALL_IN_A_ROW
@@ -255,7 +259,7 @@ class LoopSubscription:
                         self._large_for -= 1
                     self._until_timed -= 1
                     batch.append((cdr, 0 if self._until_timed else self._published_at(info)))
-        except RuntimeError:  # rclpy's InvalidHandle: it has been destroyed just now
+        except RuntimeError:  # rclpy's InvalidHandle: the subscription was destroyed meanwhile
             return batch, False
         return batch, True
 
@@ -266,10 +270,10 @@ class LoopSubscription:
 
 
 def published_at(info: Any, since: int) -> int:
-    """When rclpy says that a message was published, in nanoseconds since the epoch; 0 for what was
-    published before `since`, and kept for late subscribers.
+    """When a message was published, in nanoseconds since the epoch.
 
-    `since` is of the clock that only counts: the other one may have been set meanwhile.
+    0 for messages that were published before `since`, which durability brings to late subscribers.
+    `since` is of the monotonic clock, as the wall clock may have been set meanwhile.
     """
     at = int(info["source_timestamp"])
     return at if time.time_ns() - at < time.monotonic_ns() - since else 0

@@ -1,7 +1,7 @@
-"""How far this computer can be heard: a DDS participant stays with the network that it began with.
+"""Which nodes this computer can reach: a DDS participant never notices new network interfaces.
 
-One that begins at the boot, before there is a network, hears nothing of other computers for ever,
-and of this one neither when not even the loopback was up.
+A participant that starts at boot before there is a network never discovers nodes on other
+computers, and none on this one either when not even the loopback was up.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import psutil
 
 from appliance.ros.ros2 import discovery
 
-#: Where Fast DDS is loaded from: the library's name up to ROS 2 Jazzy, and since.
+#: The library of Fast DDS among the mapped files: its name up to ROS 2 Jazzy, and since.
 _FAST_DDS = re.compile(r"(/\S+/lib(?:fastrtps|fastdds)\.so\S*)$", re.MULTILINE)
 
 
 class NetworkScope(IntEnum):
-    """Who can be heard."""
+    """Which nodes can be reached."""
 
     NOBODY = 0
     THIS_COMPUTER = 1
@@ -33,7 +33,7 @@ class NetworkScope(IntEnum):
 
 
 def find_scope(environment: Mapping[str, str] | None = None) -> NetworkScope:
-    """What there is now, as far as ROS may use it."""
+    """The present scope, limited to what discovery is configured for."""
     environment = os.environ if environment is None else environment
     found = NetworkScope.NOBODY
     states = psutil.net_if_stats()
@@ -49,12 +49,12 @@ def find_scope(environment: Mapping[str, str] | None = None) -> NetworkScope:
 
 
 def refresh_fast_dds() -> None:
-    """Let Fast DDS, where it is loaded already, look for the networks that there are now.
+    """Make Fast DDS, where it is loaded already, read the network interfaces again.
 
-    It looks once a process, and for a participant that is made later remembers what it saw. What
-    makes it look again it offers to C++ only, and ROS does not pass it on (ros2/rmw#344).
+    It reads them once a process and caches them for later participants. It exports the function
+    that refreshes the cache to C++ only, and ROS does not pass it on (ros2/rmw#344).
     """
     with suppress(OSError):
         for path in set(_FAST_DDS.findall(Path("/proc/self/maps").read_text())):
-            with suppress(AttributeError):  # it does not remember
+            with suppress(AttributeError):  # this version does not cache them
                 ctypes.CDLL(path)._ZN8eprosima10SystemInfo17update_interfacesEv()

@@ -1,4 +1,4 @@
-"""The node on ROS 2: the only file that imports rclpy, and that only when the node starts."""
+"""The node on ROS 2: the only module that imports rclpy, and only when the node starts."""
 
 from __future__ import annotations
 
@@ -49,26 +49,26 @@ from appliance.ros.ros2.network_scope import NetworkScope, find_scope, refresh_f
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the graph, of which rclpy does not tell changes.
+#: Seconds between two polls of the graph: rclpy does not notify of changes.
 POLL_INTERVAL = 0.15
 
-#: Seconds between two looks at what networks there are.
+#: Seconds between two checks for new networks.
 NETWORK_INTERVAL = 2.0
 
-#: What ROS takes for the name of a topic or service, and no more characters than that. On DDS there
-#: may be others: asking ROS about one raises an error.
+#: The names of topics and services that ROS accepts, and their greatest length. DDS may have
+#: others, but a query to ROS for one of these raises an error.
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 _LONGEST_NAME = 247
 
-#: Those above have no ports of their own on DDS.
+#: The highest domain with ports of its own on DDS.
 HIGHEST_DOMAIN = 232
 
 
 def available() -> tuple[bool, str]:
-    """Whether a node can be started here, and if not, one line that says why and what to do.
+    """Whether a node can be started here; if not, one line that says why and what to do.
 
-    Imports nothing. A middleware that is asked for and not there is found out here because rcl
-    would end the whole process over it.
+    Imports nothing of ROS. A middleware that is configured but not installed is detected here,
+    because rcl would end the whole process over it.
     """
     found = installation.find()
     if found.source == "none" or (found.advice and os.environ.get(installation.CHOICE) == "system"):
@@ -84,15 +84,16 @@ def available() -> tuple[bool, str]:
 
 
 def _wrong_domain() -> str:
-    """What is wrong with ROS_DOMAIN_ID, over which Fast DDS would end the whole process."""
-    said = os.environ.get("ROS_DOMAIN_ID", "").strip()
-    if not said or (said.isdecimal() and int(said) <= HIGHEST_DOMAIN):
+    """The error text for a wrong ROS_DOMAIN_ID, over which Fast DDS would end the whole process;
+    empty when it is valid."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if not domain or (domain.isdecimal() and int(domain) <= HIGHEST_DOMAIN):
         return ""
-    return f"ROS_DOMAIN_ID is {said}: a domain is a number from 0 to {HIGHEST_DOMAIN}"
+    return f"ROS_DOMAIN_ID is {domain}: a domain is a number from 0 to {HIGHEST_DOMAIN}"
 
 
 def _resources(kind: str) -> Iterator[str]:
-    """The names that the ament index has for a kind of resource; the wheels' index is the venv."""
+    """The names of a kind of resource in the ament index; that of the wheels is in the venv."""
     for folder in fastdds.shares():
         index = folder / "ament_index" / "resource_index" / kind
         if index.is_dir():
@@ -100,7 +101,7 @@ def _resources(kind: str) -> Iterator[str]:
 
 
 class Ros2Node(FaultContainment):
-    """A RosNode on ROS 2, with raw subscriptions and, where there is one, the EventsExecutor."""
+    """A RosNode on ROS 2, with raw subscriptions and, where rclpy has it, the EventsExecutor."""
 
     serialization = CDR
     parameter_server: ParameterServer | None = None
@@ -114,10 +115,10 @@ class Ros2Node(FaultContainment):
         arguments: Sequence[str] = (),
         use_sim_time: bool = False,
     ) -> None:
-        """`domain_id` None takes ROS_DOMAIN_ID, as every ROS node does. `arguments` are those that
-        stand behind `--ros-args` on a command line; they go before name and namespace.
+        """With `domain_id` None the domain is ROS_DOMAIN_ID, as for every ROS node. `arguments` are
+        those behind `--ros-args` on a command line; they override name and namespace.
 
-        Other nodes are told from this one by their full name, which ROS wants to be unique.
+        The full name distinguishes this node from others, so it must be unique, as ROS demands.
         """
         super().__init__()
         self.name = f"{namespace.rstrip('/')}/{name}"
@@ -134,9 +135,9 @@ class Ros2Node(FaultContainment):
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
-        #: Who could be heard when the bus was joined.
-        self._reach = NetworkScope.NOBODY
-        #: Whether the loop's thread may take messages itself, as far as is known.
+        #: The scope of the network when the node joined the bus.
+        self._scope = NetworkScope.NOBODY
+        #: Whether the loop's thread can take messages itself; False once that has failed.
         self._takes_on_loop = True
         self._on_loop: weakref.WeakSet[LoopSubscription] = weakref.WeakSet()
 
@@ -172,9 +173,9 @@ class Ros2Node(FaultContainment):
             self._join()
             self._spin(poll)
         except Exception as error:
-            # The thread's end, whatever ended it: it must be told, and the bus be left in order.
+            # Any error ends the thread: report it, and leave the bus properly.
             log.debug("the ROS thread ended", exc_info=True)
-            reason = str(error) if isinstance(error, BusError) else _described(error)
+            reason = str(error) if isinstance(error, BusError) else _error_text(error)
         finally:
             self._leave()
         if reason:
@@ -187,8 +188,8 @@ class Ros2Node(FaultContainment):
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
 
-        # First: a network that comes meanwhile is not, or not for certain, among those it has.
-        self._reach = find_scope()
+        # Before the node joins, as it may miss a network that appears meanwhile.
+        self._scope = find_scope()
         refresh_fast_dds()
         self._rclpy = rclpy
         self._context = Context()
@@ -202,7 +203,7 @@ class Ros2Node(FaultContainment):
             self._base_name,
             namespace=self._namespace,
             context=self._context,
-            # What this node logs would be a message on a topic that may itself be bridged.
+            # The log lines of this node would be messages on a topic that may itself be bridged.
             enable_rosout=False,
             start_parameter_services=False,
             parameter_overrides=[Parameter("use_sim_time", value=True)]
@@ -218,17 +219,17 @@ class Ros2Node(FaultContainment):
         from rclpy.executors import ExternalShutdownException
         from rclpy.task import Future
 
-        look_at = time.monotonic() + NETWORK_INTERVAL
+        check_at = time.monotonic() + NETWORK_INTERVAL
         poll()
         never: Any = Future(executor=self._executor)
         try:
             while not self._stopping.is_set():
-                # A finite time-out also mends EventsExecutor, whose endless wait overflows.
+                # EventsExecutor needs a finite timeout, too: an endless wait overflows there.
                 self._executor.spin_until_future_complete(never, timeout_sec=POLL_INTERVAL)
                 poll()
-                if self._reach < NetworkScope.NETWORK and time.monotonic() >= look_at:
-                    look_at = time.monotonic() + NETWORK_INTERVAL
-                    if find_scope() > self._reach:
+                if self._scope < NetworkScope.NETWORK and time.monotonic() >= check_at:
+                    check_at = time.monotonic() + NETWORK_INTERVAL
+                    if find_scope() > self._scope:
                         raise BusError("there was no network yet when it was joined, and is now")
         except ExternalShutdownException:
             if not self._stopping.is_set():
@@ -269,8 +270,10 @@ class Ros2Node(FaultContainment):
         return [f"{namespace.rstrip('/')}/{name}" for name, namespace in found]
 
     def elsewhere(self) -> set[str]:
-        """The nodes that have endpoints on other computers, or in containers with a network of
-        their own; none where the middleware is not Fast DDS, which tells by its ids."""
+        """The nodes with endpoints on other computers, or in containers with their own network.
+
+        Empty when the middleware is not Fast DDS, whose endpoint ids contain the host.
+        """
         from rclpy.impl.implementation_singleton import rclpy_implementation
 
         middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
@@ -283,7 +286,7 @@ class Ros2Node(FaultContainment):
                 *self._node.get_subscriptions_info_by_topic(topic),
             ):
                 name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-                if "_NODE_NAME_UNKNOWN_" in name:  # it has not said so yet, or is no node of ROS
+                if "_NODE_NAME_UNKNOWN_" in name:  # not announced yet, or no node of ROS
                     name = "one without a name"
                 hosts.setdefault(name, set()).add(bytes(info.endpoint_gid[2:4]))
         here = hosts.get(self.name, set())
@@ -295,10 +298,10 @@ class Ros2Node(FaultContainment):
     def services(self) -> dict[str, list[str]]:
         from rclpy.node import NodeNameNonExistentError
 
-        # Asked for all at once, ROS also names the services that there are only clients of.
+        # A query for all services at once would also return those that have only clients.
         found: dict[str, list[str]] = {}
         for node in self._node.get_node_names_and_namespaces():
-            # It has gone meanwhile, or its name is none that ROS takes.
+            # The node has left meanwhile, or ROS does not accept its name.
             with suppress(NodeNameNonExistentError, *_errors()):
                 named = _named(self._node.get_service_names_and_types_by_node(*node))
                 for service, types in named.items():
@@ -377,9 +380,9 @@ class Ros2Node(FaultContainment):
         middleware = rclpy_implementation.rclpy_get_rmw_implementation_identifier()
         if not middleware.startswith("rmw_fastrtps"):
             raise UnavailableError(f"it has not been tried with {middleware}")
-        check_is_valid_msg_type(message_class)  # it also loads what the type needs
+        check_is_valid_msg_type(message_class)  # it also loads the type support
         with _as_bus_error(ValueError), self._node.handle:
-            # What rclpy would make has to be told to the node, and with it to the executor.
+            # rclpy's create_subscription would add it to the node, and so to the executor.
             handle = rclpy_implementation.Subscription(
                 self._node.handle, message_class, topic, _to_rclpy(qos).get_c_qos_profile()
             )
@@ -428,17 +431,18 @@ def _named(found: list[tuple[str, list[str]]]) -> dict[str, list[str]]:
 
 
 class _Losses:
-    """Asks the middleware what it lost of a subscription's messages; no executor knows of it, as
-    with EventsExecutor destroying an endpoint that one listens to can crash.
+    """Counts the messages of a subscription that the middleware lost.
 
-    What had to make room for newer messages in the subscription's own queue is not in it.
+    The event is not added to an executor: with EventsExecutor, destroying an endpoint with an event
+    handler can crash. Messages that the subscription's own queue dropped are not counted.
     """
 
     def __init__(self, handle: Any) -> None:
-        """For rclpy's handle of a subscription. Where the middleware does not tell, it is 0."""
+        """`handle` is rclpy's, of the subscription. Without support of the middleware, `take`
+        always returns 0."""
         implementation = import_module("rclpy.impl.implementation_singleton").rclpy_implementation
         kinds = implementation.rcl_subscription_event_type_t
-        # In ROS 2 Humble it has another name.
+        # ROS 2 Humble has another name for it.
         kind = getattr(implementation, "EventHandle", None) or implementation.QoSEvent
         self._refusals = _errors()
         self._event: Any = None
@@ -449,8 +453,8 @@ class _Losses:
         if self._event is None:
             return 0
         with suppress(*self._refusals), self._event:
-            told = self._event.take_event()
-            return int(told.total_count_change) if told is not None else 0
+            status = self._event.take_event()
+            return int(status.total_count_change) if status is not None else 0
         return 0
 
     def destroy(self) -> None:
@@ -483,7 +487,7 @@ class _Ros2Publisher:
     def publish(self, cdr: bytes) -> None:
         try:
             self._publish(cdr)
-        except self._refusals as error:  # the transport is full, or the node is gone
+        except self._refusals as error:  # the transport is full, or the node has ended
             raise BusError(str(error)) from error
 
     def destroy(self) -> None:
@@ -491,7 +495,8 @@ class _Ros2Publisher:
 
 
 class _Ros2Client:
-    """rclpy takes and gives no serialized requests, so they are message objects on the way."""
+    """A RosClient. rclpy accepts only message objects, so that requests are deserialized, and
+    responses serialized."""
 
     def __init__(self, node: Any, own: Any, service_class: Any) -> None:
         from rclpy.serialization import deserialize_message, serialize_message
@@ -516,7 +521,7 @@ class _Ros2Client:
                 return
             try:
                 response: bytes | BusError = self._serialize(future.result())
-            except Exception as error:  # what a future has may be any: it must not end the thread
+            except Exception as error:  # a future may raise anything, which must not end the thread
                 response = BusError(str(error))
             done(response)
 
@@ -550,12 +555,12 @@ class _Ros2Service:
             self._own = node.create_service(
                 service_class, name, lambda request, _: request, qos_profile=_to_rclpy(CALLS)
             )
-        # The executor sends what the callback returns. To answer later, or not at all, without
-        # a coroutine that the executor would keep for ever, its way out is taken over.
+        # The executor sends the return value of the callback. To respond later or never, without
+        # a coroutine that the executor would keep forever, its `send_response` is replaced.
         self._send = self._own.send_response
-        self._own.send_response = self._take
+        self._own.send_response = self._dispatch
 
-    def _take(self, request: Any, header: Any) -> None:
+    def _dispatch(self, request: Any, header: Any) -> None:
         def respond(response: bytes | None) -> None:
             if response is not None and self._own is not None:
                 with _as_bus_error():
@@ -570,8 +575,8 @@ class _Ros2Service:
 
 @functools.cache
 def load_message(name: str) -> type[Any]:
-    """The class of a message type: with its compiled support or, where that does not load, read
-    from its definition. Raises UnknownTypeError that says why it is neither.
+    """The class of a message type with its compiled support; where that does not load, a class from
+    the definition. Raises UnknownTypeError, which says why there is neither.
     """
     try:
         return _with_support(import_message(name))
@@ -603,7 +608,7 @@ def _with_support(found: type[Any]) -> type[Any]:
 
 
 def interfaces() -> dict[str, list[str]]:
-    """The types of each package of interfaces that is installed: `std_msgs/msg/String`."""
+    """The types of each installed package of interfaces, such as `std_msgs/msg/String`."""
     found: dict[str, list[str]] = {}
     for folder in fastdds.shares():
         index = folder / "ament_index" / "resource_index" / "rosidl_interfaces"
@@ -614,7 +619,7 @@ def interfaces() -> dict[str, list[str]]:
 
 
 def import_service(name: str) -> Any:
-    """The class of a service `std_srvs/srv/Trigger`, and of those that an action is made of,
+    """The class of a service such as `std_srvs/srv/Trigger`, or of an action's services
     `pkg/action/Name_SendGoal` and `pkg/action/Name_GetResult`. Raises UnknownTypeError.
     """
     request = load_message(f"{name}_Request")
@@ -624,7 +629,7 @@ def import_service(name: str) -> Any:
     return service
 
 
-def _described(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     if "have the security libraries" in str(error):
         return (
             "ROS_SECURITY_ENABLE is true, and this Fast DDS was built without security, as PyPI's "
@@ -650,8 +655,8 @@ def _as_bus_error(*more: type[Exception]) -> Iterator[None]:
 
 
 def _new_executor(context: Any) -> tuple[Any, bool]:
-    """The best that there is, and whether that is EventsExecutor: it costs an eighth of the others,
-    and exists from ROS 2 Jazzy on."""
+    """The best available executor, and whether it is EventsExecutor, which takes an eighth of the
+    CPU time of the others and exists since ROS 2 Jazzy."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -662,7 +667,7 @@ def _new_executor(context: Any) -> tuple[Any, bool]:
 
 
 def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
-    """What calls the callback with some messages' time; rclpy tells it of all that it is given."""
+    """A callback that passes the times of some messages on; rclpy gives it the times of all."""
     since = time.monotonic_ns()
     until_timed = ONE_TIMED_OF
 
@@ -680,22 +685,22 @@ def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:
 
 @functools.cache
 def _timed_subscription() -> Any:
-    """The class of a subscription that tells its callback when some of its messages were published,
-    those `since` a time.
+    """The class of subscriptions that pass the publication time of some messages to the callback,
+    of those that were published after `since`.
 
-    With EventsExecutor, in Kilted, the callback cannot ask for that: what the middleware tells of a
-    message ends the executor. But it looks up the callback just before it takes a message, and one
-    that is taken here instead comes with its time.
+    With EventsExecutor, in Kilted, a callback cannot request the message info: it would end the
+    executor. But the executor reads `callback` just before it takes a message, and a message that
+    is taken there instead has its time.
     """
     from rclpy.subscription import Subscription
 
-    class TimedSubscription(Subscription):  # type: ignore[type-arg]  # not in all is it generic
+    class TimedSubscription(Subscription):  # type: ignore[type-arg]  # generic in some versions only
         _callback: Any
         _until_timed = 1
         _timed = 0
         since = 0
 
-        @property  # type: ignore[misc]  # it is set before a subscription becomes one of these
+        @property  # type: ignore[misc]  # an attribute in the base class
         def callback(self) -> Any:
             self._until_timed -= 1
             if not self._until_timed:
@@ -713,8 +718,8 @@ def _timed_subscription() -> Any:
 
 
 def _event_callbacks() -> Any:
-    """The module of the event callback classes, which are always given empty: rclpy's defaults only
-    write to the log, and with EventsExecutor destroying an endpoint that has some can crash."""
+    """The module of the event callback classes, which are always used without callbacks: rclpy's
+    defaults only log, and with EventsExecutor destroying an endpoint with some can crash."""
     try:
         return import_module("rclpy.event_handler")
     except ImportError:  # ROS 2 Humble

@@ -76,7 +76,7 @@ async def test_who_asks_is_answered_when_its_request_fails(
 
     def ask() -> None:
         try:
-            service._take(SimpleNamespace(_buff=b""))
+            service._serve(SimpleNamespace(_buff=b""))
         except ServiceError as error:
             told.append(str(error))
 

@@ -209,7 +209,7 @@ def test_a_node_whose_port_is_another_program_s(world: World, appliance: Ros1App
         threading.Thread(target=server.serve_forever, daemon=True).start()
         register(world, "/odd/reused", f"http://127.0.0.1:{server.server_address[1]}/")
         appliance.wait_for_log(
-            "own_msgs/msg/Reused is not installed here, and is not told: .*syntax"
+            "own_msgs/msg/Reused is not installed here, and its publisher does .*syntax"
         )
         server.shutdown()
     assert "no bridge to ROS" not in appliance.log
