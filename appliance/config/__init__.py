@@ -1,8 +1,8 @@
-"""appliance.yaml: read, checked as a whole, and turned into typed settings.
+"""appliance.yaml: parsed, validated as a whole, and turned into typed settings.
 
-Every problem is found in one go and told with its file, line and key; nothing is guessed. Sizes and
-durations carry their unit, paths are relative to the file, `${NAME}` and `${NAME:-default}` take
-environment variables, and values that look like secrets are masked wherever settings are printed.
+All problems are reported at once, each with its file, line and key; nothing is guessed. Sizes and
+durations carry their unit, paths are relative to the file, `${NAME}` and `${NAME:-default}` are
+replaced by environment variables, and values that look like secrets are masked in output.
 """
 
 from __future__ import annotations

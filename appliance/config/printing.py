@@ -1,4 +1,4 @@
-"""Settings as they are shown: what looks like a secret is masked."""
+"""Settings for output: values that look like secrets are masked."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from appliance.config.yaml_document import KeyPath
 _SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
 
 
-# As far as the last @ of a word: people also write passwords with a slash or an @ in them.
+# Up to the last @ of a word, because passwords may contain a slash or an @.
 _URL_PASSWORD = re.compile(r"(?<=://)([^/\s:@]*):\S+(?=@)")
 
 
@@ -25,7 +25,7 @@ OPEN_WITH_SECRETS = (
 
 
 def mask(path: KeyPath, value: Any) -> Any:
-    """The value as it may be printed: masked when its key or its form says that it is a secret."""
+    """The value for output: masked when its key or its form marks it as a secret."""
     if isinstance(value, Mapping):
         return {key: mask((*path, key), inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
@@ -36,14 +36,14 @@ def mask(path: KeyPath, value: Any) -> Any:
 
 
 def _is_secret(path: KeyPath) -> bool:
-    """Whether a key says so, or one above it that is no plugin's name: `tokens: {alice: …}`."""
+    """Whether a key of the path names a secret: `tokens: {alice: …}`; plugins' names do not."""
     return any(
         isinstance(part, str) and "." not in part and _SECRET_KEY.search(part) for part in path
     )
 
 
 def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
-    """All that `mask` hides in a value, to be kept out of what others say about it."""
+    """All secrets that `mask` hides in a value, to remove them from other texts such as errors."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from secrets_in(inner, (*path, key))
@@ -57,12 +57,12 @@ def secrets_in(value: Any, path: KeyPath = ()) -> Iterator[str]:
         for match in _URL_PASSWORD.finditer(value):
             secret = match[0].partition(":")[2]
             yield secret
-            if "@" in secret:  # it may as well have ended there
+            if "@" in secret:  # the password may end at the first @ as well
                 yield secret.partition("@")[0]
 
 
 def is_open_with_secrets(settings: Settings) -> bool:
-    """Whether every user of this computer can read secrets in the file of these settings."""
+    """Whether the settings file has secrets and is readable by every user of this computer."""
     if settings.file is None:
         return False
     try:
@@ -71,11 +71,11 @@ def is_open_with_secrets(settings: Settings) -> bool:
         text = settings.file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return False
-    # What an environment variable has put there is not in the file.
+    # Secrets from environment variables are not in the file.
     return any(secret in text for secret in secrets_in(settings.broker.plugins))
 
 
 def describe(settings: Settings) -> dict[str, Any]:
-    """Every setting in force as plain values, in the form of appliance.yaml, secrets masked."""
+    """All settings as plain values, structured as in appliance.yaml, with secrets masked."""
     described: dict[str, Any] = mask((), settings.model_dump(mode="json"))
     return described

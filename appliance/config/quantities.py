@@ -1,4 +1,4 @@
-"""Values with a unit or a place: sizes, durations, addresses, modes and paths of files."""
+"""Types of values with a syntax of their own: sizes, durations, addresses, file modes, paths."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def _quantity(value: object, units: Mapping[str, int], wanted: str) -> float:
 
 
 def format_size(value: int) -> str:
-    """The shortest exact way to write so many bytes: `16 MiB`."""
+    """A size in the largest unit that is exact: `16 MiB`."""
     return _in_units(value, SIZE_UNITS)
 
 
 def about_size(value: float) -> str:
-    """About so many bytes: `1.5 MiB`."""
+    """A size rounded to three digits: `1.5 MiB`."""
     for unit in ("B", "KiB", "MiB"):
         if value < 1024:
             return f"{value:.3g} {unit}"
@@ -59,7 +59,7 @@ def about_size(value: float) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """The shortest exact way to write so many seconds, to the millisecond: `5 min`."""
+    """A duration, rounded to milliseconds, in the largest unit that is exact: `5 min`."""
     return _in_units(round(seconds * 1000), DURATION_UNITS)
 
 
@@ -69,13 +69,14 @@ def _in_units(value: int, units: Mapping[str, int]) -> str:
 
 
 def either(words: Sequence[str]) -> str:
+    """An enumeration: `a, b or c`."""
     return " or ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
 class Bind(NamedTuple):
-    """An address to listen on. An empty host is every address of this computer; port 0 any port.
+    """An address to listen on. An empty host means all addresses of this computer, port 0 any port.
 
-    With a `path` it is a Unix socket there, which has neither.
+    With a `path` it is a Unix socket, which has no host and port.
     """
 
     host: str
@@ -89,7 +90,7 @@ class Bind(NamedTuple):
 
     @property
     def loopback(self) -> bool:
-        """Whether only this computer can reach it."""
+        """Whether it is reachable from this computer only."""
         if self.path is not None:
             return True
         try:
@@ -98,7 +99,7 @@ class Bind(NamedTuple):
             return self.host == "localhost"
 
     def collides(self, other: Bind) -> bool:
-        """Whether no two sockets can listen on the two, one of which may be every address."""
+        """Whether two sockets cannot listen on both; one of the two may be all addresses."""
         if self.path is not None or other.path is not None:
             return self.path == other.path
         if self.port != other.port or not self.port:
@@ -135,7 +136,7 @@ def _parse_address(value: object, info: ValidationInfo) -> Bind:
 
 
 def _parse_mode(value: object) -> int:
-    """A file's mode; YAML reads 0660 as a number in base 8, and in quotes it is text."""
+    """A file mode. YAML parses 0660 as an octal number, and "0660" in quotes as text."""
     modes = {"0600": 0o600, "0660": 0o660, "0666": 0o666}
     mode = modes.get(value) if isinstance(value, str) else value
     if mode not in modes.values() or isinstance(mode, bool):
@@ -145,7 +146,7 @@ def _parse_mode(value: object) -> int:
 
 
 def parse_seconds(value: object, info: ValidationInfo) -> float:
-    # In a file a duration has a unit; in code, where the type says so, plain seconds do.
+    # A duration needs a unit in a file; code, which has no context, may pass plain seconds.
     if info.context is None and isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
     return parse_duration(value)
@@ -180,7 +181,7 @@ Mode = Annotated[
 ]
 
 
-# Defaults of paths are validated as well: that is what makes them relative to the file.
+# Defaults of paths are validated as well, which resolves them relative to the file.
 FilePath = Annotated[Path, PlainValidator(parse_path), Field(validate_default=True)]
 
 

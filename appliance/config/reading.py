@@ -1,4 +1,4 @@
-"""A file becomes settings, or all that is wrong with it is told: where, what, what was meant."""
+"""Loads appliance.yaml, and reports all problems in it with line, key, cause and suggestion."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument
 from appliance.host.environment import of_service
 
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
-"""Where the configuration is looked for when no file is named; the first that exists is used."""
+"""Default locations of the configuration; the first file that exists is used."""
 
 
-#: Characters of a file that can be meant.
+#: The largest configuration file, in characters; a longer one is probably another file.
 _MAX_SIZE = 1 << 20
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `problems` has everything that is wrong with it."""
+    """The configuration cannot be used; `problems` has all of its problems."""
 
     def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("\n".join(map(str, problems)))
@@ -73,7 +73,8 @@ def find(path: Path | None = None) -> Path:
 def load(path: Path | None = None) -> Settings:
     """The settings of that file, or of the first of SEARCH_PATH. Raises ConfigError.
 
-    Those of the service are read with its variables, too: a shell of its administrator has none.
+    For the file of the systemd service, the service's environment variables apply too: the shell of
+    an administrator does not have them.
     """
     file = find(path)
     try:
@@ -89,9 +90,9 @@ def load(path: Path | None = None) -> Settings:
 
 
 def load_control(path: Path | None = None) -> Settings:
-    """The defaults, with nothing but `control` of a file that `load` finds something wrong with.
+    """Default settings with only `control` taken from a file that `load` rejects.
 
-    The running one goes on with what it has read before, and can still be asked.
+    A running appliance keeps the settings that it has loaded before, and can still be queried.
     """
     text, file = "", path or SEARCH_PATH[0]
     with suppress(ConfigError, OSError):
@@ -103,7 +104,7 @@ def load_control(path: Path | None = None) -> Settings:
 
 
 def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:
-    """The settings in `text`; `file` names it in errors and is what paths are relative to."""
+    """The settings in `text`; `file` is named in errors; paths are relative to its directory."""
     document = YamlDocument(text, file, os.environ if environment is None else environment)
     problems = document.problems
     try:
@@ -123,8 +124,8 @@ def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -
     return settings
 
 
-def _way(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | None, str]:
-    """What two routes must not have in common; patterns may differ in the type alone."""
+def _route_key(route: TopicRoute, robot: str) -> tuple[str | tuple[str, ...], str | None, str]:
+    """The key that must be unique among routes; patterns may differ in the type only."""
     return route.ros, route.type if route.is_pattern else None, route.topic(robot)
 
 
@@ -143,11 +144,11 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         problem = "needs a listener with tls: true that asks for client certificates"
         yield ("broker", "tls", "username_from"), problem
     yield from _cross_check_routes(settings.bridge)
-    ways: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
+    keys: dict[tuple[str | tuple[str, ...], str | None, str], int] = {}
     for number, route in enumerate(settings.bridge.topics):
         if route.is_exclusion:
             continue
-        first = ways.setdefault(_way(route, settings.robot), number)
+        first = keys.setdefault(_route_key(route, settings.robot), number)
         if route.to == "mqtt":
             for key in route.command_keys:
                 yield ("bridge", "topics", number, key), "is for routes to ROS only"
@@ -166,7 +167,7 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
 
 
 def _cross_check_bus(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
-    """What ROS 1 and ROS 2 do not have in common."""
+    """Settings that only one of ROS 1 and ROS 2 has."""
     is_ros1 = bridge.bus == "ros1"
     foreign, own = ("cdr", "ros1") if is_ros1 else ("ros1", "cdr")
     sections: tuple[tuple[str, Sequence[TopicRoute | ServiceRoute | ActionRoute]], ...] = (
@@ -190,7 +191,7 @@ def _cross_check_bus(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
 
 
 def _cross_check_routes(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
-    """What holds for the routes of every section."""
+    """Checks for the routes of every section."""
     sections: dict[str, Sequence[Route]] = {
         "topics": bridge.topics,
         "services": bridge.services,
@@ -253,7 +254,7 @@ def _cross_check_called(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
 
 
 def _place(detail: ErrorDetails) -> KeyPath:
-    """The path of what is wrong, down to the entry of a list that was checked as a whole."""
+    """The path of the error, including the entry of a list that was validated as a whole."""
     error = detail.get("ctx", {}).get("error")
     return (*detail["loc"], error.position) if isinstance(error, InListError) else detail["loc"]
 
@@ -270,7 +271,7 @@ _PLAIN = {
 }
 
 
-#: What sections look like that are easily taken for a value.
+#: Examples for sections that are easily mistaken for plain values.
 _EXAMPLES = {
     "allow": "{linear.z: [0]}",
     "clamp": "{linear.x: [-0.5, 0.5]}",
@@ -289,7 +290,7 @@ _BOUNDS = {
 
 
 def _explain(detail: ErrorDetails, written: str | None) -> str:
-    """One of pydantic's errors in this project's words, with what was written, masked."""
+    """The text for one of pydantic's errors, with the value as written in the file, masked."""
     kind, path, context = detail["type"], detail["loc"], detail.get("ctx", {})
     if kind == "extra_forbidden":
         known = list(_section_at(path[:-1]).model_fields)
@@ -314,7 +315,7 @@ def _explain(detail: ErrorDetails, written: str | None) -> str:
 
 
 def _section_at(path: KeyPath) -> type[BaseModel]:
-    """The model that describes the mapping at that path."""
+    """The model of the mapping at that path."""
 
     def models(annotation: Any) -> Iterator[type[BaseModel]]:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

@@ -1,4 +1,4 @@
-"""The sections of appliance.yaml, each key with its type and default."""
+"""The sections of appliance.yaml: each key with its type, range and default."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ from appliance.config.values import (
     check_service_type,
     check_topic_template,
     from_names,
-    leaves_out,
+    excludes_only,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 DataclassT = TypeVar("DataclassT", bound="DataclassInstance")
 
 PACKET_SIZE_MAX = 255 << 20
-"""Less than the largest Remaining Length that MQTT can say (section 1.5.5: four bytes of 7 bits): a
+"""Below the largest Remaining Length of MQTT (section 1.5.5: four bytes of 7 bits), because a
 packet may grow by some properties on its way from one client to another."""
 
 COMMAND_KEYS = (
@@ -84,10 +84,10 @@ COMMAND_KEYS = (
     "clamp",
     "allow",
 )
-"""The keys of a route that say when a command may reach ROS, and with what in it."""
+"""Keys of a route that restrict when a command may reach ROS, and with which values."""
 
 MQTT_KEYS = ("fields", "rate", "bytes_per_second", "qos", "retain")
-"""Those that say what is published on MQTT, and have no meaning on the way to ROS."""
+"""Keys of a route that apply to what is published on MQTT, and not to ROS."""
 
 
 class _Section(BaseModel):
@@ -96,24 +96,24 @@ class _Section(BaseModel):
     def build(self, kind: type[DataclassT], **values: Any) -> DataclassT:
         """The dataclass that another part takes its settings in.
 
-        `values` are the fields that differ from this section in name or form; every other field is
-        the key of the same name, so that a setting is written down here and there, and not copied
-        in a third place.
+        `values` are the fields that differ from this section in name or type; every other field
+        gets the key of the same name. So a setting is declared here and in that dataclass, and not
+        copied in a third place.
         """
         named = {each.name for each in fields(kind)} - values.keys()
         return kind(**{name: getattr(self, name) for name in named}, **values)
 
 
 def _section() -> Any:
-    # An empty mapping that is validated, and not a ready section: so its paths see the context.
+    # The default is a mapping that gets validated, so that paths in it see the context.
     return Field(default={}, validate_default=True)
 
 
 class Listener(_Section):
-    """One address that clients connect to, with or without TLS; `mode` is for a Unix socket.
+    """One listening address, with or without TLS; `mode` is that of a Unix socket.
 
-    What is None of `client_certificates`, `min_version` and `ciphers` is as `broker.tls` says, and
-    `anonymous` as `broker.anonymous`.
+    `client_certificates`, `min_version` and `ciphers` default to those of `broker.tls`, and
+    `anonymous` to `broker.anonymous`.
     """
 
     bind: Address
@@ -127,22 +127,22 @@ class Listener(_Section):
 
     @property
     def is_mqtts(self) -> bool:
-        """Whether a plain MQTT client with TLS connects to it."""
+        """Whether it is MQTT over TLS, without WebSocket."""
         return self.tls and self.protocol == "mqtt"
 
     @field_validator("tls")
     @classmethod
     def _check_tls(cls, tls: bool, info: ValidationInfo) -> bool:
-        bind = info.data.get("bind")  # None when it is wrong itself
+        bind = info.data.get("bind")  # None when `bind` is invalid itself
         if tls and bind is not None and bind.path is not None:
             raise ValueError("must be false for a Unix socket: nobody can listen in on it")
         return tls
 
 
 class TlsSection(_Section):
-    """The server's certificate, whose client certificates are accepted, and what they are for.
+    """The server's certificate, the CA of accepted client certificates, and their use.
 
-    Without `crl` it is `ca.crl` beside `ca`, if there is one.
+    `crl` defaults to `ca.crl` in the directory of `ca`, if that exists.
     """
 
     certificate: FilePath = Path("certs/server.crt")
@@ -156,7 +156,7 @@ class TlsSection(_Section):
 
 
 class UserLimitsSection(_Section):
-    """What one user may have at most, of what all clients have; None is as others leave room."""
+    """Limits of one user within those of all clients; None: as much as others leave free."""
 
     connections: Count | None = None
     sessions: Count | None = None
@@ -171,7 +171,7 @@ _LIMITS = Limits()
 
 
 class LimitsSection(_Section):
-    """What one client, and all together, may use. Sizes in bytes, times in seconds."""
+    """Limits of one client and of all together. Sizes in bytes, times in seconds."""
 
     connections: Count = _LIMITS.connections
     connections_per_address: Count = 250
@@ -200,7 +200,7 @@ class LimitsSection(_Section):
     user: UserLimitsSection = _section()
 
     def of_broker(self) -> Limits:
-        """Those that the broker enforces; listeners and logins have the others."""
+        """The limits that the broker enforces; listeners and the login throttle have the others."""
         return self.build(
             Limits,
             keep=0 if self.keep == "latest" else self.keep,
@@ -211,7 +211,7 @@ class LimitsSection(_Section):
 
 
 class PluginAnswersSection(_Section):
-    """How long plugins may take, and for how long and how many of their answers hold."""
+    """The timeout of plugins, and for how long and how many of their answers are cached."""
 
     timeout: Annotated[Duration, Field(gt=0)] = 5.0
     keep: Annotated[Duration, Field(ge=0)] = 10.0
@@ -220,7 +220,7 @@ class PluginAnswersSection(_Section):
 
 
 class AuditSection(_Section):
-    """Where is written who connected, was refused and changed what; None for nowhere."""
+    """The audit log of connections, refusals and changes; without a path there is none."""
 
     path: OptionalPath = None
     size: Annotated[Size, Field(ge=1 << 10)] = 10 << 20
@@ -228,7 +228,7 @@ class AuditSection(_Section):
 
 
 class StoreSection(_Section):
-    """Where sessions and retained messages are kept; `size` is in bytes, `age` in seconds."""
+    """The store of sessions and retained messages; `size` in bytes, `age` in seconds."""
 
     path: FilePath = Path("state/store.db")
     durability: Literal["power", "process", "off"] = "power"
@@ -237,7 +237,7 @@ class StoreSection(_Section):
 
 
 class BrokerSection(_Section):
-    """The MQTT broker: where it listens, who may come in, what may be used up."""
+    """The MQTT broker: its listeners, access control and limits."""
 
     listeners: list[Listener] = Field(
         default=[
@@ -267,23 +267,23 @@ class BrokerSection(_Section):
         return self.build(Features, response_information=self.response_information or "")
 
     def lets_in_anonymous(self, listener: Listener) -> bool:
-        """Whether clients that give no user name come in by that listener."""
+        """Whether that listener accepts clients without a user name."""
         return self.anonymous if listener.anonymous is None else listener.anonymous
 
     def client_certificates(self, listener: Listener) -> Literal["off", "optional", "required"]:
-        """Whether that listener asks its clients for one."""
+        """Whether that listener requests or requires client certificates."""
         if listener.client_certificates is not None:
             return listener.client_certificates
-        # Asked for a certificate that it does not have, a browser gives a WebSocket up.
+        # A browser without a certificate that is asked for one gives up the WebSocket.
         if listener.protocol == "websocket" and self.tls.client_certificates == "optional":
             return "off"
         return self.tls.client_certificates
 
 
 class RouteDefaults(_Section):
-    """What a route does unless it says otherwise: rate in Hz, None for no limit; None is auto.
+    """Defaults of topic routes. `rate` in Hz, None for no limit; `qos` and `retain`: None is auto.
 
-    `compression` is of payloads, and named to clients in the user property `content-encoding`.
+    `compression` is that of payloads; clients see it in the user property `content-encoding`.
     """
 
     encoding: Encoding = "json"
@@ -296,7 +296,7 @@ class RouteDefaults(_Section):
 
 
 class OnSilenceSection(_Section):
-    """The stop message of a route to ROS, and when it is published; `after` in seconds."""
+    """The stop message of a route to ROS, published after `after` seconds without a command."""
 
     after: Annotated[Duration, Field(gt=0)]
     publish: Annotated[dict[str, Any], BeforeValidator(check_message)] = {}
@@ -304,10 +304,10 @@ class OnSilenceSection(_Section):
 
 
 class Route(_Section):
-    """What is bridged, by its name on ROS, and where it is on MQTT.
+    """A route: names on ROS, and the topic on MQTT.
 
-    `ros` is a name, a pattern, or a list of these in which `!` leaves some out again. A route of
-    which nothing else is said but what is left out holds for all patterns of its section.
+    `ros` is a name, a pattern, or a list of these, in which `!` excludes names again. A route that
+    has only exclusions applies to all patterns of its section.
     """
 
     ros: RosNames
@@ -315,17 +315,17 @@ class Route(_Section):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """`ros`, as many as there are."""
+        """`ros` as a tuple."""
         return (self.ros,) if isinstance(self.ros, str) else self.ros
 
     @property
     def is_exclusion(self) -> bool:
-        """Whether it only says what the other routes of its section leave out."""
-        return leaves_out(self.ros)
+        """Whether it only has exclusions, for the other routes of its section."""
+        return excludes_only(self.ros)
 
     @property
     def is_pattern(self) -> bool:
-        """Whether the route is for many names."""
+        """Whether the route can match several names."""
         return not self.is_exclusion and (len(self.names) > 1 or "*" in self.names[0])
 
     @model_serializer(mode="wrap")
@@ -334,15 +334,15 @@ class Route(_Section):
         return {"ros": every["ros"]} if self.is_exclusion else every
 
     def topic(self, robot: str) -> str:
-        """The MQTT topic of this route on that robot; that of many names keeps `{ros}` in it."""
+        """The MQTT topic of this route on that robot; a pattern's topic keeps `{ros}`."""
         topic = self.mqtt.replace("{robot}", robot)
         return topic if self.is_pattern else topic.replace("{ros}", self.names[0])
 
 
 class TopicRoute(RouteDefaults, Route):
-    """One ROS topic that is carried to MQTT, from MQTT, or both ways; or many of them.
+    """A route of ROS topics: to MQTT, to ROS, or both ways.
 
-    What is under COMMAND_KEYS holds for what goes to ROS; times in seconds.
+    COMMAND_KEYS apply to messages for ROS; times in seconds.
     """
 
     to: Annotated[Direction, BeforeValidator(check_direction)] = Field(None, validate_default=True)
@@ -360,27 +360,27 @@ class TopicRoute(RouteDefaults, Route):
 
     @property
     def command_keys(self) -> list[str]:
-        """Those of COMMAND_KEYS that say something else than their default."""
-        return self._said(COMMAND_KEYS)
+        """The COMMAND_KEYS that differ from their defaults."""
+        return self._configured(COMMAND_KEYS)
 
     @property
     def mqtt_keys(self) -> list[str]:
-        """Those of MQTT_KEYS that do."""
-        return self._said(MQTT_KEYS)
+        """The MQTT_KEYS that differ from their defaults."""
+        return self._configured(MQTT_KEYS)
 
-    def _said(self, keys: tuple[str, ...]) -> list[str]:
+    def _configured(self, keys: tuple[str, ...]) -> list[str]:
         fields = TopicRoute.model_fields
         return [key for key in keys if getattr(self, key) != fields[key].default]
 
 
 class _CalledRoute(Route):
-    """What every route has that is called; `timeout` in seconds."""
+    """Keys of every route whose names are called; `timeout` in seconds."""
 
     timeout: Annotated[Duration, Field(gt=0)] = 5.0
 
 
 class ServiceRoute(_CalledRoute):
-    """ROS services that MQTT clients call, or one that they answer (`to: mqtt`)."""
+    """ROS services that MQTT clients call, or (`to: mqtt`) one that MQTT clients answer."""
 
     to: Literal["ros", "mqtt"] = "ros"
     type: Annotated[str, AfterValidator(check_service_type)] | None = None
@@ -389,7 +389,7 @@ class ServiceRoute(_CalledRoute):
 
 
 class ActionRoute(_CalledRoute):
-    """ROS actions for MQTT clients; `keep_result` in seconds."""
+    """ROS actions that MQTT clients send goals to; `keep_result` in seconds."""
 
     type: Annotated[str, AfterValidator(check_action_type)] | None = None
     encoding: CallEncoding = "json"
@@ -399,7 +399,7 @@ class ActionRoute(_CalledRoute):
 
 
 class ParameterRoute(_CalledRoute):
-    """Parameters of ROS nodes, for MQTT clients to read and set: `/node/parameter`."""
+    """Parameters of ROS nodes that MQTT clients read and set: `/node/parameter`."""
 
     ros: ParameterNames
     mqtt: Annotated[str, AfterValidator(check_node_topic)] = "{robot}{node}/_param"
@@ -407,18 +407,18 @@ class ParameterRoute(_CalledRoute):
 
     @property
     def is_pattern(self) -> bool:
-        """Whether the route is for many nodes."""
+        """Whether the route can match several nodes."""
         nodes = {name.rpartition("/")[0] for name in self.names if not name.startswith("!")}
         return len(nodes) > 1 or any("*" in node for node in nodes)
 
     def topic(self, robot: str) -> str:
-        """The MQTT topic on that robot; the node's name is still to be filled in."""
+        """The MQTT topic on that robot; it keeps `{node}`."""
         return self.mqtt.replace("{robot}", robot)
 
 
 class BridgeLimitsSection(_Section):
-    """Calls and goals under way: of all together, of one user (None: a quarter of these) and of
-    one client; and what one message for ROS may have: bytes of JSON or text, and items."""
+    """Limits of concurrent calls and goals: of all clients, of one user (None: a quarter of these)
+    and of one client; and limits of one message for ROS: bytes of JSON or text, and items."""
 
     calls: Count = 500
     calls_per_user: Count | None = None
@@ -428,7 +428,7 @@ class BridgeLimitsSection(_Section):
 
 
 class BridgeSection(_Section):
-    """The way between the robot's bus and the broker; `diagnostics` in seconds, 0 for none."""
+    """The bridge between ROS and the broker; `diagnostics` in seconds, 0 for none."""
 
     bus: Literal["ros2", "ros1", "none"] = "ros2"
     node: Annotated[str, AfterValidator(check_node)] = "appliance"
@@ -449,7 +449,7 @@ class BridgeSection(_Section):
     @classmethod
     def _take_defaults(cls, topics: list[TopicRoute], info: ValidationInfo) -> list[TopicRoute]:
         defaults = info.data.get("defaults")
-        if defaults is None:  # they are wrong themselves, and that is told
+        if defaults is None:  # they are invalid themselves, which is reported
             return topics
         shared = {name: getattr(defaults, name) for name in RouteDefaults.model_fields}
 
@@ -461,7 +461,7 @@ class BridgeSection(_Section):
 
 
 class LogSection(_Section):
-    """What is logged and how; `levels` has a level for each logger named, such as appliance.ros."""
+    """Level and format of the log; `levels` has levels of single loggers, such as appliance.ros."""
 
     level: Level = "info"
     format: Literal["human", "json"] = "human"
@@ -482,5 +482,5 @@ class Settings(_Section):
 
     @property
     def file(self) -> Path | None:
-        """The file these settings were read from; None when they were made in code."""
+        """The file that these settings were read from; None when they were made in code."""
         return self._file

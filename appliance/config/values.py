@@ -1,4 +1,4 @@
-"""What other values may be: names, types and fields of ROS, messages, choices."""
+"""Types and validators of other values: ROS names, types and fields, messages, choices."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def _parse_retain(value: object) -> bool | None:
     raise ValueError("must be true, false or auto")
 
 
-#: The depth of a history in ROS is an int of C.
-MOST_KEPT = 2**31 - 1
+#: The largest history depth in ROS, which is a C int.
+MAX_DEPTH = 2**31 - 1
 
 
 def _parse_keep(value: object) -> int | Literal["latest"]:
     if value == "latest":
         return "latest"
     if isinstance(value, int) and not isinstance(value, bool) and value > 0:
-        if value > MOST_KEPT:
-            raise ValueError(f"must be at most {MOST_KEPT}, as far as ROS counts")
+        if value > MAX_DEPTH:
+            raise ValueError(f"must be at most {MAX_DEPTH}, as far as ROS counts")
         return value
     raise ValueError("must be latest, or how many messages to keep (1 or more)")
 
@@ -69,7 +69,7 @@ def _check_ros_name(value: str) -> str:
 
 
 def _check_ros_pattern(value: str) -> str:
-    """A ROS name, or a pattern of names in which `*` is part of a name and `**` of a path."""
+    """A ROS name, or a pattern: `*` matches within one part of a name, `**` any number of parts."""
     if "*" not in value:
         return _check_ros_name(value)
     _check_ros_name(re.sub(r"\*+", "x", value))
@@ -79,7 +79,7 @@ def _check_ros_pattern(value: str) -> str:
 
 
 class InListError(ValueError):
-    """What is wrong with one entry of a list, and which."""
+    """An error in one entry of a list, with the position of the entry."""
 
     def __init__(self, position: int, what: str) -> None:
         super().__init__(what)
@@ -89,7 +89,7 @@ class InListError(ValueError):
 def _parse_ros_names(
     value: object, check: Callable[[str], object] = _check_ros_pattern
 ) -> str | tuple[str, ...]:
-    """A name or pattern, or a list of them; what begins with `!` is left out."""
+    """A name or pattern, or a list of them; one that begins with `!` is excluded."""
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, (list, tuple)) or not names:
         raise ValueError("must be a ROS name, a pattern, or a list of them")
@@ -106,7 +106,7 @@ def _parse_ros_names(
 
 
 def _parse_parameters(value: object) -> str | tuple[str, ...]:
-    """Parameters as `_check_parameter` has them, or a list of them, as `_parse_ros_names`."""
+    """A parameter as in `_check_parameter`, or a list, as in `_parse_ros_names`."""
     return _parse_ros_names(value, _check_parameter)
 
 
@@ -152,7 +152,7 @@ def check_node_topic(value: str) -> str:
     return check_topic_template(value, "{node}")
 
 
-#: How a parameter is named.
+#: The syntax of a parameter's name.
 OF_NODE = (
     "must be a node's full name, '/', and a parameter's: /arm/speed, /arm/* for all of /arm, /**/* "
     "for all of every node"
@@ -160,11 +160,11 @@ OF_NODE = (
 
 
 def _check_parameter(value: str) -> None:
-    """The full name of a node, `/`, and the name of a parameter; all may be patterns."""
+    """The full name of a node, `/`, and the name of a parameter; each may be a pattern."""
     node, slash, name = value.rpartition("/")
     if not slash or not re.fullmatch(r"[\w.*-]+", name):
         raise ValueError(OF_NODE)
-    if node:  # of ROS 1, /speed is a parameter that is no node's
+    if node:  # in ROS 1, /speed is a parameter without a node
         _check_ros_pattern(node)
 
 
@@ -183,21 +183,21 @@ def check_action_type(value: str) -> str:
 
 
 def from_names(value: object) -> object:
-    """A route of which only the names are said."""
+    """Expand a route that consists of names only."""
     return {"ros": value} if isinstance(value, (str, list, tuple)) else value
 
 
 def check_direction(value: object, info: ValidationInfo) -> object:
-    names = info.data.get("ros")  # None when they are wrong themselves
+    names = info.data.get("ros")  # None when `ros` is invalid itself
     if value is not None:
         return value
-    if names is not None and not leaves_out(names):
+    if names is not None and not excludes_only(names):
         raise PydanticCustomError("missing", "is needed")
     return "mqtt"
 
 
-def leaves_out(names: str | tuple[str, ...]) -> bool:
-    """Whether nothing is wanted, only left out."""
+def excludes_only(names: str | tuple[str, ...]) -> bool:
+    """Whether all names are exclusions."""
     return all(name.startswith("!") for name in ([names] if isinstance(names, str) else names))
 
 
@@ -237,7 +237,7 @@ def check_allow(value: object) -> object:
 def check_message(value: object) -> object:
     try:
         json.dumps(value, allow_nan=False)
-    except TypeError:  # a date, most likely, which YAML makes of 2024-01-01
+    except TypeError:  # most likely a date: YAML parses 2024-01-01 as one
         raise ValueError("has a value that JSON does not know; put text in quotes") from None
     except ValueError:
         raise ValueError("has a number that JSON does not know; NaN is written null") from None
@@ -252,7 +252,7 @@ def check_plugins(value: object) -> object:
             raise ValueError(
                 f"{name!r} must be the full path of a plugin class: package.module.Class"
             )
-    # A plugin without settings is written with nothing after its colon.
+    # A plugin without settings has nothing after its colon.
     return {name: {} if settings is None else settings for name, settings in value.items()}
 
 

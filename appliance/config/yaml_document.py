@@ -1,7 +1,7 @@
-"""A YAML file as plain values that remembers where each of them was written.
+"""A YAML parser that records the line of each value.
 
-Beyond YAML: `${NAME}` and `${NAME:-default}` take environment variables (`$${NAME}` is the text
-itself), and a key that is given twice is a problem, not a silent replacement.
+Extensions: `${NAME}` and `${NAME:-default}` are replaced by environment variables (`$${NAME}` is the
+text itself), and a duplicate key is an error instead of a silent replacement.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import yaml
 KeyPath = tuple["str | int", ...]
 """The keys and list positions that lead to a value, from the top of the file."""
 
-#: More values than a configuration has: a few lines of aliases of aliases can stand for billions.
-_MOST_VALUES = 100_000
+#: Limit on values, aliases expanded: a few lines of nested aliases can expand to billions.
+_MAX_VALUES = 100_000
 
 _VARIABLE = re.compile(r"\$?\$\{([A-Za-z_][A-Za-z0-9_]*)(?::-([^}]*))?\}")
 
 
 @dataclass(frozen=True)
 class ConfigProblem:
-    """One thing that is wrong: where (line 0: in the file as a whole), which key, and what."""
+    """One problem: its file, line (0: the file as a whole) and key, and what is wrong."""
 
     file: Path
     line: int
@@ -38,13 +38,13 @@ class ConfigProblem:
 
 
 def dotted(path: KeyPath) -> str:
-    """The path as people write it: `bridge.topics[0].rate`."""
+    """The path in dotted form: `bridge.topics[0].rate`."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return "".join(parts).removeprefix(".")
 
 
 class YamlDocument:
-    """One YAML document: its values, and the problems of its form (`faulty`: the keys with one)."""
+    """One YAML document: its values, and its syntax problems (`faulty`: the keys that have one)."""
 
     def __init__(self, text: str, file: Path, environment: Mapping[str, str]) -> None:
         self.file = file
@@ -57,17 +57,17 @@ class YamlDocument:
         self.values = self._read(text)
 
     def line(self, path: KeyPath) -> int:
-        """The line of that key, or of the nearest thing around it that was written; 0 for none."""
+        """The line of that key, or of the nearest key above it in the tree; 0 for none."""
         while path and path not in self._lines:
             path = path[:-1]
         return self._lines.get(path, 0)
 
     def written(self, path: KeyPath) -> str | None:
-        """The value's own text, before environment variables; None for a list or a mapping."""
+        """The value as written, before substitution; None for a list or a mapping."""
         return self._written.get(path)
 
     def problem(self, path: KeyPath, what: str) -> ConfigProblem:
-        """A problem at that key, with its line; the caller says where it goes."""
+        """A problem at that key, with its line; the caller collects it."""
         return ConfigProblem(self.file, self.line(path), dotted(path), what)
 
     def _report(self, path: KeyPath, what: str) -> None:
@@ -96,8 +96,8 @@ class YamlDocument:
         self, loader: yaml.SafeLoader, node: yaml.Node, path: KeyPath, around: tuple[yaml.Node, ...]
     ) -> Any:
         self._count += 1
-        if self._count > _MOST_VALUES:
-            raise yaml.YAMLError(f"more than {_MOST_VALUES} values, those of aliases among them")
+        if self._count > _MAX_VALUES:
+            raise yaml.YAMLError(f"more than {_MAX_VALUES} values, those of aliases among them")
         self._lines.setdefault(path, node.start_mark.line + 1)
         if node in around:
             self._report(path, "is an alias of something that contains it")
@@ -141,7 +141,7 @@ class YamlDocument:
         text, tag = node.value, node.tag
         if "${" in text:
             text = _VARIABLE.sub(lambda match: self._variable(match, path), text)
-            if node.style is None:  # unquoted: a number in the variable is a number
+            if node.style is None:  # unquoted: a variable may hold a number
                 tag = loader.resolve(yaml.ScalarNode, text, (True, False))  # type: ignore[no-untyped-call]
         try:
             return loader.construct_object(yaml.ScalarNode(tag, text, node.start_mark))
@@ -154,7 +154,7 @@ class YamlDocument:
             return match[0][1:]
         name, default = match[1], match[2]
         value = self._environment.get(name)
-        if default is not None:  # as in a shell: also in place of an empty one
+        if default is not None:  # as in a shell, the default also replaces an empty value
             return value or default
         if value is None:
             self._report(path, f"the environment variable {name} is not set")
