@@ -62,8 +62,8 @@ from appliance.config.values import (
     check_ros_type,
     check_service_type,
     check_topic_template,
-    from_names,
     excludes_only,
+    from_names,
 )
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """A YAML parser that records the line of each value.
 
-Extensions: `${NAME}` and `${NAME:-default}` are replaced by environment variables (`$${NAME}` is the
-text itself), and a duplicate key is an error instead of a silent replacement.
+Extensions: `${NAME}` and `${NAME:-default}` are replaced by environment variables (`$${NAME}` is
+the text itself), and a duplicate key is an error instead of a silent replacement.
 """
 
 from __future__ import annotations
