@@ -264,7 +264,7 @@ class Bridge:
         """Subscribe on MQTT, and join the bus in the background."""
         self._session = self._broker.attach(BRIDGE_CLIENT_ID, _Link(self._receive))
         self._subscribe()
-        self._broker.departures.append(self._context.arrivals.departed)
+        self._broker.departures.append(self._context.staleness.on_departed)
         self.calls.start()
         self._clear_schemas(self._session)
         self.clean_up_retained()
@@ -307,8 +307,8 @@ class Bridge:
             self._diagnostics.stop()
         for flow in self._to_ros.values():
             flow.leave()
-        if self._context.arrivals.departed in self._broker.departures:
-            self._broker.departures.remove(self._context.arrivals.departed)
+        if self._context.staleness.on_departed in self._broker.departures:
+            self._broker.departures.remove(self._context.staleness.on_departed)
         await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session
@@ -353,7 +353,7 @@ class Bridge:
 
     def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
         size = size_of(message.payload)
-        number = self._context.arrivals.count()
+        number = self._context.staleness.next_number()
         for receiver in self._receivers.get(message.topic, ()):
             self._dispatch(receiver, message, retain, origin, number, size)
 

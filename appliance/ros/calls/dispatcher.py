@@ -51,7 +51,7 @@ from appliance.ros.payload.encodings.registry import (
 )
 from appliance.ros.payload.payloads import InputLimits
 from appliance.ros.topics.conversions import ConversionQueue, user_of
-from appliance.ros.topics.staleness import SENT_AT, said_age
+from appliance.ros.topics.staleness import SENT_AT, stated_age
 
 log = logging.getLogger(__name__)
 
@@ -565,7 +565,7 @@ class CallDispatcher:
         """
         is_expired = message.expires_at is not None and message.expires_at <= self._broker.now
         try:
-            age = said_age(message.properties, time.time())
+            age = stated_age(message.properties, time.time())
         except ValueError as error:
             if not endpoint.is_cancel:
                 raise CallError("bad_request", str(error)) from None

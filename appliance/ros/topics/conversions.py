@@ -1,9 +1,9 @@
-"""Converting large messages for ROS: one a turn of the event loop, with everybody else in between.
+"""A fair queue for the conversion of large messages: one message per iteration of the event loop.
 
-A large message takes milliseconds to convert, and all others wait meanwhile. So one is converted as
-it comes, and those that come before the loop has been round once more wait in a queue: users take
-turns, and each user's clients; what one client sends stays in its order, small messages too. For
-the event loop's thread.
+A large message takes milliseconds to convert, and blocks the loop meanwhile. So one is converted as
+it comes, and those that come before the loop has finished another iteration are queued: users take
+turns, and so do the clients of a user. The messages of one client stay in order, small ones too.
+For the event loop's thread.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from appliance.broker.session import Session
 from appliance.net.callbacks import Entries
 from appliance.ros.payload.payloads import ZSTD_MAGIC
 
-#: Bytes of a payload up to which converting it takes some ten microseconds.
+#: A payload of at most so many bytes is converted within some ten microseconds.
 LITTLE = 1024
 
-#: Bytes of one user that wait for their turn; each of them with so much for what is around it.
+#: The limit of the bytes that are queued for one user; OVERHEAD is added for each message.
 WAITING_OF_USER = 16 * 1024 * 1024
 OVERHEAD = 1024
 
 T = TypeVar("T")
 
-#: Who sent it; None for what is nobody's, such as a retained message.
+#: The session that sent a message; None for a message without one, such as a retained message.
 Who: TypeAlias = "Session | None"
 
 
 def size_of(payload: bytes) -> int:
-    """Bytes of a payload as far as work is concerned: a few of zstd can be a megabyte."""
+    """The size of a payload as a measure of work: a few bytes of zstd can become a megabyte."""
     return len(payload) + (LITTLE if payload.startswith(ZSTD_MAGIC) else 0)
 
 
 def user_of(who: Who) -> str | None:
-    """The user whose client it is; None for all that are anonymous."""
+    """The user of a session; None for all anonymous ones."""
     return None if who is None else who.account.username
 
 
@@ -50,36 +50,36 @@ class _Work:
 
 
 class ConversionQueue:
-    """Does what takes long, one thing a turn."""
+    """Runs long work, one piece per iteration of the event loop."""
 
     def __init__(self, entries: Entries, accounting: Accounting) -> None:
         self._entries = entries
         self._accounting = accounting
-        #: What waits, by client; and the clients whose turn it is, by user.
+        #: The queued work by client; and the clients with queued work, in turn, by user.
         self._waiting: dict[Who, deque[_Work]] = {}
         self._users: OrderedDict[str | None, deque[Who]] = OrderedDict()
         self._bytes: Counter[Account] = Counter()
-        #: Whether the others have not had their turn yet since the last one.
+        #: Whether the loop has not finished an iteration since the last piece of work.
         self.is_busy = False
 
     def waits(self, who: Who) -> bool:
-        """Whether something of this client waits for its turn."""
+        """Whether work of this client is queued."""
         return who in self._waiting
 
     def has_room(self, who: Who, size: int) -> bool:
-        """Whether so many bytes more of the client may wait. Who has no other bound for what it
-        lets wait asks first."""
+        """Whether so many more bytes may be queued for the client. A caller that has no other
+        limit asks this first."""
         if who is None:
             return True
         size += OVERHEAD
         own = self._bytes[who.account]
-        # One alone needs no more than memory.
+        # A single message is not subject to the limit of its user, only to that of memory.
         is_share = not own or own + size <= WAITING_OF_USER
         return is_share and self._accounting.fits(who.account, size)
 
     def do(self, who: Who, size: int, work: Callable[[], None]) -> None:
-        """Do the work, which is on a payload of so many bytes, now or when it is its turn. What it
-        raises is a fault."""
+        """Do the work, on a payload of so many bytes, now or in its turn. An exception in it is a
+        fault."""
         if who in self._waiting:
             self._wait(who, size, work)
         elif size <= LITTLE:
@@ -90,7 +90,7 @@ class ConversionQueue:
             self._take(work)
 
     def now(self, work: Callable[[], T]) -> T | None:
-        """Do what cannot wait, and return what comes of it; what does wait has its turn later."""
+        """Do work that cannot be queued, and return its result; queued work is done later."""
         return self._take(work)
 
     def _wait(self, who: Who, size: int, work: Callable[[], None]) -> None:
@@ -113,15 +113,15 @@ class ConversionQueue:
             del self._bytes[account]
 
     def _take(self, work: Callable[[], T]) -> T | None:
-        """Do it, and let the others have their turn."""
+        """Do it, and nothing else of the queue before the loop's next iteration."""
         was_busy, self.is_busy = self.is_busy, True
-        # The time of the thread's own work, whoever else has the processor.
+        # The processor time of this thread: other processes do not count.
         begun = thread_time()
         try:
             return self._run(work)
         finally:
             self._accounting.counters.cost += int((thread_time() - begun) * 1e6)
-            # What came meanwhile is read in the next round, and is answered before the one after.
+            # What came meanwhile is read in the next iteration, and answered before the one after.
             if not was_busy:
                 self._entries.soon("turns.pause", self._pause, failed=self._pause)
 

@@ -1,4 +1,4 @@
-"""What holds for a ROS topic, whichever routes lead there: who commands it alone, and which
+"""The state that all routes to one ROS topic share: which client commands it alone, and which
 commands a stop message has overtaken."""
 
 from __future__ import annotations
@@ -17,36 +17,35 @@ BRIDGE_CLIENT_ID = "_bridge"
 
 _FREE = Decision(True, "nobody commands it")
 
-#: Why a command is not carried out that waited for something when a stop came.
+#: Why a command that was held or queued when a stop came is not carried out.
 OVERTAKEN = "a stop came after it"
 
-#: Stops of one client in a row, each at most so many seconds after the one before, from which on it
-#: only repeats what it says, as a joystick does that nobody touches. Who presses a button in alarm
-#: presses it less often.
+#: After so many stops in a row, each at most so many seconds after the one before, a client only
+#: repeats its stop, as an idle joystick does. Nobody presses a button in alarm that often.
 REPEATED = 5
-WITHIN = 1.0
+REPEAT_WITHIN = 1.0
 
-#: Clients of which is known when they stopped a topic.
-CLIENTS = 1000
+#: Clients whose last stop is remembered; the oldest is evicted.
+MAX_CLIENTS = 1000
 
 
 class CommandRoute(Protocol):
-    """A route with rules that leads to the topic."""
+    """A route with command rules that leads to the topic."""
 
     @property
     def is_exclusive(self) -> bool:
-        """Whether one client commands there at a time."""
+        """Whether only one client at a time may command."""
 
     def watch(self) -> None:
-        """See when the holder of the lease has been silent for too long."""
+        """Watch for the lease's holder being silent for too long."""
 
-    def stops(self, cdr: bytes) -> bool:
-        """Whether it is the route's stop message, or says the same."""
+    def is_stop_message(self, cdr: bytes) -> bool:
+        """Whether it is the route's stop message, or equivalent to it."""
 
 
 @dataclass(slots=True)
 class _Stops:
-    """Those of one client: how many in a row, and the last one's number and time."""
+    """The stops of one client: how many in a row, and the number and time of the last one."""
 
     number: int = -1
     at: float = -math.inf
@@ -54,36 +53,36 @@ class _Stops:
 
 
 class Lease:
-    """One for each ROS topic; times are in seconds.
+    """The lease of one ROS topic; times are in seconds.
 
-    It is given by routes that are exclusive, and holds for all that lead to the topic. So does a
-    stop: what came before it is not carried out behind it, by whatever route and whose ever it is.
-    But where the robot stands already, who only repeats its stop overtakes nothing but what it has
-    sent itself: beside an idle joystick no command that waits would be carried out otherwise.
+    Exclusive routes grant it, and it holds for all routes that lead to the topic. So does a stop:
+    commands that came before it are not carried out after it, whatever their route and client. But
+    if the robot is stopped already, a client that only repeats its stop overtakes only its own
+    commands: otherwise no held or queued command would be carried out beside an idle joystick.
     """
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.holder: Session | None = None
         #: When the holder commanded last.
-        self.heard_at = -math.inf
+        self.commanded_at = -math.inf
         self._routes: list[CommandRoute] = []
         #: A stop overtakes commands with a lower number (`StalenessDetector.number`). The second
         #: number is for commands without a session, which every stop overtakes.
         self._stopped = 0
         self._stopped_last = 0
-        #: The stops of each client, by its client id: it may have a new connection since.
+        #: The stops of each client, by its client id: it may have reconnected since.
         self._stops: OrderedDict[str, _Stops] = OrderedDict()
-        #: Whether what went to ROS last was a stop.
-        self._stands = False
+        #: Whether the last message for ROS was a stop.
+        self._is_stopped = False
 
-    def join(self, route: CommandRoute) -> None:
-        """A route with rules leads there."""
+    def add_route(self, route: CommandRoute) -> None:
+        """A route with command rules leads to the topic from now on."""
         self._routes.append(route)
 
-    def part(self, route: CommandRoute) -> None:
-        """It does no longer. The lease is over with the last one that is exclusive; until then
-        others watch it."""
+    def remove_route(self, route: CommandRoute) -> None:
+        """A route does so no longer. The lease ends with the last exclusive route; until then the
+        other ones watch it."""
         self._routes.remove(route)
         exclusive = [other for other in self._routes if other.is_exclusive]
         if not exclusive:
@@ -93,27 +92,27 @@ class Lease:
                 other.watch()
 
     def stop(self, number: int) -> None:
-        """A stop goes to ROS: nothing is carried out any more that came before that number."""
+        """A stop goes to ROS: commands with lower numbers are not carried out any more."""
         self._stopped = max(self._stopped, number)
         self._stopped_last = max(self._stopped_last, number)
-        self._stands = True
+        self._is_stopped = True
 
-    def said(self, cdr: bytes, number: int, origin: Session | None, now: float) -> None:
-        """A message of the session goes to ROS that came with that number: it may be what one of
-        the routes there knows as a stop."""
+    def on_published(self, cdr: bytes, number: int, origin: Session | None, now: float) -> None:
+        """The session's message with that number goes to ROS: it is a stop if it is the stop
+        message of one of the routes to the topic."""
         own = None if origin is None else self._stops.get(origin.client_id)
-        if not any(route.stops(cdr) for route in self._routes):
-            self._stands = False
+        if not any(route.is_stop_message(cdr) for route in self._routes):
+            self._is_stopped = False
             if own is not None:
                 own.in_a_row = 0
             return
         if origin is not None:
             own = self._stops_of(origin.client_id)
             if number != own.number:  # it may have several routes
-                own.in_a_row = own.in_a_row + 1 if now - own.at <= WITHIN else 1
+                own.in_a_row = own.in_a_row + 1 if now - own.at <= REPEAT_WITHIN else 1
                 own.number, own.at = max(own.number, number), now
         is_repeated = own is not None and own.in_a_row >= REPEATED
-        if self._stands and is_repeated:
+        if self._is_stopped and is_repeated:
             self._stopped_last = max(self._stopped_last, number)
         else:
             self.stop(number)
@@ -121,13 +120,13 @@ class Lease:
     def _stops_of(self, client_id: str) -> _Stops:
         own = self._stops.setdefault(client_id, _Stops())
         self._stops.move_to_end(client_id)
-        if len(self._stops) > CLIENTS:
+        if len(self._stops) > MAX_CLIENTS:
             _, forgotten = self._stops.popitem(last=False)
             self._stopped = max(self._stopped, forgotten.number)
         return own
 
     def is_overtaken(self, number: int, origin: Session | None) -> bool:
-        """Whether a stop has gone to ROS that came later, and overtakes what the session sent."""
+        """Whether a later stop that went to ROS overtakes the session's command."""
         if origin is None:
             return number < self._stopped_last
         own = self._stops.get(origin.client_id)
@@ -144,7 +143,7 @@ class Lease:
 
 
 class Leases:
-    """Those of all topics that routes lead to; for the loop's thread."""
+    """The leases of all topics that routes lead to; for the loop's thread."""
 
     def __init__(self) -> None:
         self._leases: WeakValueDictionary[str, Lease] = WeakValueDictionary()

@@ -1,43 +1,46 @@
-"""How old a command is: what is known of it, from which evidence, and what is decided.
+"""Decides whether a command is fresh, stale, or part of a queue that a client replays.
 
-A command that is carried out late moves a robot that nobody steers any more. MQTT messages do not
-say when they were made, and client libraries queue what is published without a connection and send
-it later as if it were new. So a command's age is taken from these, in this order:
+A stale command moves a robot that nobody steers any more. MQTT messages do not carry the time at
+which they were made, and client libraries queue what is published without a connection and send it
+later as if it were new. The age of a command is therefore inferred from the following evidence, in
+this order:
 
-| what is seen                                           | what that proves, and what is decided |
+| evidence                                               | conclusion and decision               |
 |--------------------------------------------------------|---------------------------------------|
-| user property `sent-at`, of clocks that agree          | its age: carried out at once, or old  |
-| Message Expiry that is over, DUP, a PUBREL that comes  | it is old: refused, and what comes    |
-| late, a will                                           | behind it is a queue                  |
-| a command less than `oldest` after one that was new    | it is younger: carried out at once    |
-| the first since CONNECT, or since a longer silence,    | nothing: it waits for as long as the  |
-| and none behind it                                     | next of a queue takes, or until a     |
-|                                                        | DISCONNECT, and is carried out        |
-| the same, and others behind it at once                 | a queue: none is carried out, neither |
+| user property `sent-at`, of clocks that agree          | its age: carried out at once, or      |
+|                                                        | refused as stale                      |
+| Message Expiry that is over, DUP, a late PUBREL,       | it is stale: refused, and the         |
+| a will                                                 | commands behind it are a queue        |
+| less than `oldest` after a command that was fresh      | it is fresh: carried out at once      |
+| the first since CONNECT, or since a longer silence,    | unknown: held for as long as the next |
+| and none behind it                                     | one of a queue would take, or until a |
+|                                                        | DISCONNECT, then carried out          |
+| the same, and others directly behind it                | a queue: none is carried out, neither |
 |                                                        | the first nor the newest              |
-| they go on at the pace of somebody who steers          | a queue would come faster: carried    |
+| commands go on at the pace of somebody who steers      | a queue would come faster: carried    |
 |                                                        | out from the third on                 |
 
-A Message Expiry Interval that is left proves nothing: it counts down in servers only, not in a
-client's queue. A message that stops the robot is carried out though it is old, see
-`Commands`, and shows all the same that what comes behind it is a queue.
+What is left of a Message Expiry Interval proves nothing: it counts down in servers only, not in a
+client's queue. A stale message that stops the robot is carried out all the same, see `Commands`;
+it still proves that the commands behind it are a queue.
 
-A client has one queue for all that it sends: what is known of it holds for all its topics, and two
-commands have a pause between them only when all of its messages have one. What the appliance has
-not read for longer than `oldest` is a new beginning; of what came since, the appliance cannot tell
-when. A command that comes in parts is as old as its first byte.
+A client has one queue for all that it sends. So evidence holds for all of its topics, and there is
+a gap between two commands only if none of its messages lie in between. If the appliance has not
+read from a client for longer than `oldest`, the evidence begins anew, since the time at which the
+unread messages came is unknown. A command that comes in parts is as old as its first byte.
 
-A queue ends by a silence or by that pace, never by a time: a stream that is faster than `BURST`
-allows (125 Hz) is never carried out without `sent-at`.
+A queue ends with a silence or with the pace of steering, never after a time: without `sent-at`, a
+stream that is faster than `BURST` allows (125 Hz) is never carried out.
 
-The pace of somebody who steers is two gaps in a row that are no burst. A queue of QoS 1 may come
-one by one, each behind the acknowledgement of the one before, and a busy or distant client then
-has a pace as well. So what the client is sent is withheld for a moment, acknowledgements included:
-who still goes on does not wait for these, and has no such queue.
+The pace of steering is two gaps in a row that are longer than `BURST`. A queue of QoS 1 may come
+one message at a time, each after the acknowledgement of the one before; then the queue of a busy or
+distant client has such a pace as well. To tell them apart, everything that is sent to the client is
+withheld for a moment, acknowledgements included: a client that goes on does not wait for
+acknowledgements, and has no such queue.
 
-Not to be known without `sent-at`: the age of a single command; of a queue that a slow network or
-a starved client spreads over gaps as long as those of steering; and a delay that grows little by
-little.
+Without `sent-at` there is no way to know: the age of a single command; the age of a queue that a
+slow network or a starved client spreads over gaps as long as those of steering; a delay that grows
+little by little.
 """
 
 from __future__ import annotations
@@ -53,39 +56,40 @@ from appliance.broker.ports import LOCAL_PEER, PeerStatus
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, quote
 
-#: The user property that says when a command was made.
+#: The user property with the time at which a command was made.
 SENT_AT = "sent-at"
 
-#: What it may look like.
+#: The accepted forms of it, for error texts.
 _FORMS = "seconds since 1970 (1780000000.25) or RFC 3339 (2026-05-28T20:26:40.25Z)"
 
-#: Numbers from which on it is no second that anybody means: the year 5138, and thousands of it.
+#: Larger numbers are not meant as seconds: the least of them is the year 5138.
 _UNITS = ((1e17, "nanoseconds"), (1e14, "microseconds"), (1e11, "milliseconds"))
 
-#: Seconds that a client's clock may be ahead of ours; a command may be older by as much.
+#: Seconds that a client's clock may be ahead of ours; a command may be older by as much than it
+#: states.
 AHEAD = 0.25
 
-#: Seconds that the first command waits for another behind it, beside two round trips: Nagle's
-#: algorithm and delayed acknowledgements keep the second of a queue back for 40 ms.
+#: Seconds for which a first command is held, in addition to two round trips: Nagle's algorithm and
+#: delayed acknowledgements delay the second message of a queue by 40 ms.
 WAIT = 0.1
 
-#: Seconds between two messages from which on it is no burst.
+#: Messages with shorter gaps than this, in seconds, are a burst.
 BURST = 0.008
 
-#: Such gaps in a row until a client counts as one that steers.
+#: Longer gaps in a row after which a client counts as one that steers.
 STEADY = 2
 
-#: Seconds that a client's acknowledgements are withheld, to see whether it goes on without them:
-#: more than there are between two of its commands. And from one such try to the next.
-WITHHELD = 0.15
+#: Seconds for which acknowledgements are withheld, to see whether a client goes on without them:
+#: more than lie between two of its commands. And the least time between two such attempts.
+WITHHOLD = 0.15
 TRY_AGAIN = 1.0
 
-#: Why a command is not carried out: it is of a queue; or one of the first two of what may be one,
-#: or a stream, which is as usual, and no reason to warn of anything.
+#: Why a command is not carried out: it is part of a queue; or it is one of the first two of what
+#: may be a queue or a stream, which is usual and no reason for a warning.
 QUEUED = "others came with it at once, as of a queue"
-BEGINS = "a stream is carried out from its third command on"
+STREAM_BEGINS = "a stream is carried out from its third command on"
 
-#: Clients of which is known that they left while they drove.
+#: Clients that are remembered because they left while they drove; the oldest is evicted.
 EXPECTED = 1000
 
 
@@ -93,80 +97,80 @@ class CommandVerdict(Enum):
     """What to do with a command."""
 
     CARRY_OUT = "carry out"
-    #: Until `StalenessDetector.waiting_time` is over, unless another comes.
+    #: Hold it until `StalenessDetector.waiting_time` is over, unless another comes.
     WAIT = "wait"
     REFUSE = "refuse"
 
 
 @dataclass(slots=True)
 class _Pace:
-    """How the commands of one client come, since its connection or its last silence began."""
+    """The evidence on one client since its connection or its last silence began."""
 
     last: float
-    #: Whether the command that came last was its first; or the second of what may be a stream.
+    #: Whether the last command was its first one, or the second one of what may be a stream.
     is_first: bool = True
-    begins: bool = False
-    #: Before what came last, and the longest since the beginning: for a route whose `oldest` is
-    #: shorter, that was a silence.
+    begins_stream: bool = False
+    #: The gap before the last command, and the longest gap since the beginning: for a route with a
+    #: shorter `oldest`, that gap was a silence.
     gap: float = math.inf
     longest: float = 0.0
-    #: Gaps in a row that are no burst.
+    #: Gaps in a row that are longer than `BURST`.
     steady: int = 0
     is_waiting: bool = False
     is_queue: bool = False
     is_known: bool = False
-    #: Whether what came last may have waited in here for too long.
-    was_held: bool = False
-    #: Of the message that came last.
+    #: Whether the last command may have been unread in the appliance for too long.
+    was_delayed: bool = False
+    #: The number and the verdict of the last command.
     number: int = -1
     verdict: CommandVerdict = CommandVerdict.CARRY_OUT
-    #: Where a first command waits.
+    #: The routes that hold a first command.
     holders: list[PendingCommands] = field(default_factory=list)
     withheld_until: float = -math.inf
 
 
 class PendingCommands(Protocol):
-    """A route that lets first commands wait."""
+    """A route that holds first commands."""
 
-    def drop_waiting(self, origin: Session, why: str) -> None:
-        """What waits of the session is not carried out: it is of a queue."""
+    def drop_pending(self, origin: Session, why: str) -> None:
+        """Drop the command that is held for the session: it is part of a queue."""
 
 
 class StalenessDetector:
-    """The commands of all clients to all topics, as they come; times in seconds.
+    """Judges the commands of all clients to all topics as they come; times in seconds.
 
-    A client has one queue for all topics: what is known of it by one route holds for the others.
+    A client has one queue for all topics: evidence from one route holds for the others.
     """
 
     def __init__(self) -> None:
-        #: Of the message for ROS that came last, of all clients' and whatever route it has.
+        #: The number of the last message for ROS, of any client and for any route.
         self.number = 0
         self._paces: dict[Session, _Pace] = {}
-        #: Of those of QoS 2, how they come, before they are released.
-        self._coming: dict[Session, _Pace] = {}
-        self._expected: OrderedDict[str, None] = OrderedDict()
+        #: The same for commands of QoS 2, as they come and before they are released.
+        self._unreleased: dict[Session, _Pace] = {}
+        self._expected_replays: OrderedDict[str, None] = OrderedDict()
 
-    def count(self) -> int:
-        """A message for ROS has come; returns its number, which is one for all its routes."""
+    def next_number(self) -> int:
+        """Number a message for ROS that has come; the number is the same for all its routes."""
         self.number += 1
         return self.number
 
     def judge(
         self, origin: Session, qos: int, oldest: float, now: float, number: int = -1
     ) -> CommandVerdict:
-        """What to do with a command of unknown age that has come now.
+        """Decide what to do with a command of unknown age that has come now.
 
-        `number` is the message's, which may have several routes; -1 when it is not known.
+        `number` identifies the message, which may have several routes; -1 when it is unknown.
         """
         pace = self._paces.get(origin)
         is_same = pace is not None and pace.number == number >= 0
         if pace is not None and pace.longest > oldest:
-            # Known by a route with a longer `oldest` only: for this one it begins.
+            # The evidence is from a route with a longer `oldest`: for this one it begins anew.
             gap = pace.gap if is_same else now - pace.last
             verdict = self._begin(origin, oldest, now)
             began = self._paces[origin]
-            began.was_held = _is_held(origin, oldest)
-            if began.was_held or gap < self.waiting_time(origin, oldest):
+            began.was_delayed = _is_delayed(origin, oldest)
+            if began.was_delayed or gap < self.waiting_time(origin, oldest):
                 began.is_queue, began.is_waiting = True, False
                 verdict = CommandVerdict.REFUSE
         elif pace is not None and is_same and self._is_for_all(pace, origin, oldest):
@@ -176,46 +180,46 @@ class StalenessDetector:
         pace = self._paces[origin]
         pace.number, pace.verdict = number, verdict
         if verdict is CommandVerdict.REFUSE:
-            self._drop(pace, origin, self.why(origin))
+            self._drop(pace, origin, self.refusal_reason(origin))
         return verdict
 
     def _is_for_all(self, pace: _Pace, origin: Session, oldest: float) -> bool:
-        """Whether the verdict holds for a route with that `oldest`, too."""
-        return pace.verdict is CommandVerdict.REFUSE or not _is_held(origin, oldest)
+        """Whether the verdict holds for a route with this `oldest`, too."""
+        return pace.verdict is CommandVerdict.REFUSE or not _is_delayed(origin, oldest)
 
-    def why(self, origin: Session) -> str:
-        """Why its command was refused that was judged last."""
+    def refusal_reason(self, origin: Session) -> str:
+        """Why the last command that was judged was refused."""
         pace = self._paces.get(origin)
-        return BEGINS if pace is not None and pace.begins else QUEUED
+        return STREAM_BEGINS if pace is not None and pace.begins_stream else QUEUED
 
     def _judge(
         self, pace: _Pace | None, origin: Session, qos: int, oldest: float, now: float
     ) -> CommandVerdict:
-        was_held = pace is not None and pace.was_held
-        is_held = _is_held(origin, oldest)
-        if pace is None or now - pace.last > oldest or (is_held and not was_held):
+        was_delayed = pace is not None and pace.was_delayed
+        is_delayed = _is_delayed(origin, oldest)
+        if pace is None or now - pace.last > oldest or (is_delayed and not was_delayed):
             verdict = self._begin(origin, oldest, now)
             pace = self._paces[origin]
-            if is_held:  # whatever it has said since, this may be older
+            if is_delayed:  # whatever has come since, this one may be older
                 pace.is_queue, pace.is_waiting, verdict = True, False, CommandVerdict.REFUSE
-            pace.was_held = is_held
+            pace.was_delayed = is_delayed
             return verdict
         gap = pace.gap = now - pace.last
         pace.longest = max(pace.longest, gap)
         pace.last = now
-        pace.begins = False
-        if is_held:
+        pace.begins_stream = False
+        if is_delayed:
             pace.is_queue, pace.is_waiting, pace.steady = True, False, 0
             return CommandVerdict.REFUSE
-        pace.was_held = False
+        pace.was_delayed = False
         if pace.is_known:
             return CommandVerdict.CARRY_OUT
         if qos < 2:
             self._time(pace, origin, qos, gap, now)
         else:
-            coming = self._coming.get(origin)
-            pace.steady = 0 if coming is None else coming.steady
-        pace.begins = pace.is_first and pace.steady > 0 and gap < WITHHELD
+            unreleased = self._unreleased.get(origin)
+            pace.steady = 0 if unreleased is None else unreleased.steady
+        pace.begins_stream = pace.is_first and pace.steady > 0 and gap < WITHHOLD
         pace.is_first = False
         if pace.steady >= STEADY:
             pace.is_known = True
@@ -228,12 +232,12 @@ class StalenessDetector:
         return CommandVerdict.WAIT
 
     def _time(self, pace: _Pace, origin: Session, qos: int, gap: float, now: float) -> None:
-        """Does it come at the pace of somebody who steers, and does not wait for an answer?"""
-        # Other messages may come between the two, and all of them without a pause.
+        """Count the gap if it is one of steering, and if the client does not wait for an answer."""
+        # Other messages may have come in between, without a gap.
         is_steady = gap >= BURST and _peer_status(origin).flowing < gap
         pace.steady = pace.steady + 1 if is_steady else 0
         if qos and pace.steady and now > pace.withheld_until:
-            # It may have waited for what it was sent meanwhile.
+            # The client may have waited for an acknowledgement that it was sent meanwhile.
             pace.steady = 1
             self._withhold(pace, origin, now)
         if pace.steady >= STEADY and origin.link is not None:
@@ -244,100 +248,106 @@ class StalenessDetector:
         if before is not None:
             self._drop(before, origin, QUEUED)
         pace = self._paces[origin] = _Pace(now)
-        if self._expected and origin.client_id in self._expected:
-            del self._expected[origin.client_id]
-            # Of who left in the midst of driving even a single one is from then, most likely.
+        if self._expected_replays and origin.client_id in self._expected_replays:
+            del self._expected_replays[origin.client_id]
+            # Most likely even a single command is from before the client left while driving.
             pace.is_queue = origin.age <= oldest
         pace.is_waiting = not pace.is_queue
         return CommandVerdict.WAIT if pace.is_waiting else CommandVerdict.REFUSE
 
     def _withhold(self, pace: _Pace, origin: Session, now: float) -> None:
         if origin.link is not None and now > pace.withheld_until + TRY_AGAIN:
-            pace.withheld_until = now + WITHHELD
-            origin.link.withhold(WITHHELD)
+            pace.withheld_until = now + WITHHOLD
+            origin.link.withhold(WITHHOLD)
 
     def waiting_time(self, origin: Session, oldest: float) -> float:
-        """Seconds that a first command waits: until then the next of a queue would have come."""
+        """Seconds to hold a first command: by then the next one of a queue would have come."""
         return min(WAIT + 2 * _peer_status(origin).round_trip, oldest)
 
-    def look(self, origin: Session, oldest: float, now: float, number: int = -1) -> None:
-        """A command of QoS 2 has come that is not released yet: only now its pace can be told, and
-        whether it was held in here. The number is its own, once for all its routes."""
-        coming = self._coming.get(origin)
-        if coming is None or not coming.number == number >= 0:
-            self._come(coming, origin, oldest, now)
-            self._coming[origin].number = number
-        if _is_held(origin, oldest):  # also where it is the first of its connection
+    def observe_unreleased(
+        self, origin: Session, oldest: float, now: float, number: int = -1
+    ) -> None:
+        """Record a command of QoS 2 that has come and is not released yet.
+
+        Only now its pace can be measured, and whether it was unread for too long. `number`
+        identifies the message, which may have several routes.
+        """
+        unreleased = self._unreleased.get(origin)
+        if unreleased is None or not unreleased.number == number >= 0:
+            self._observe(unreleased, origin, oldest, now)
+            self._unreleased[origin].number = number
+        if _is_delayed(origin, oldest):  # also if it is the first of its connection
             pace = self._paces.get(origin)
             is_known = pace is not None and pace.longest <= oldest
             self._judge(pace if is_known else None, origin, 2, oldest, now)
 
-    def _come(self, coming: _Pace | None, origin: Session, oldest: float, now: float) -> None:
-        if coming is None or max(now - coming.last, coming.longest) > oldest:
-            # For a route with a longer `oldest` it may have gone on.
-            self._coming[origin] = _Pace(now)
+    def _observe(
+        self, unreleased: _Pace | None, origin: Session, oldest: float, now: float
+    ) -> None:
+        if unreleased is None or max(now - unreleased.last, unreleased.longest) > oldest:
+            # For a route with a longer `oldest` the stream may have gone on.
+            self._unreleased[origin] = _Pace(now)
         else:
-            gap, coming.last = now - coming.last, now
-            coming.longest = max(coming.longest, gap)
-            if coming.steady < STEADY or gap < BURST:
-                self._time(coming, origin, 2, gap, now)
+            gap, unreleased.last = now - unreleased.last, now
+            unreleased.longest = max(unreleased.longest, gap)
+            if unreleased.steady < STEADY or gap < BURST:
+                self._time(unreleased, origin, 2, gap, now)
         pace = self._paces.get(origin)
         if pace is not None and pace.is_waiting:
-            # Its release may be withheld for longer than the first one waits.
+            # Its release may be withheld for longer than the first one is held.
             pace.is_queue, pace.is_waiting = True, False
-            begins = self._coming[origin].steady > 0 and now - pace.last < WITHHELD
-            self._drop(pace, origin, BEGINS if begins else QUEUED)
+            begins_stream = self._unreleased[origin].steady > 0 and now - pace.last < WITHHOLD
+            self._drop(pace, origin, STREAM_BEGINS if begins_stream else QUEUED)
 
-    def is_old(self, origin: Session, now: float) -> None:
-        """A command has come that is known to be old: the next ones were queued behind it."""
+    def mark_stale(self, origin: Session, now: float) -> None:
+        """A command has come that is known to be stale: the next ones were queued behind it."""
         pace = self._paces.get(origin)
         if pace is not None:
             self._drop(pace, origin, "what came behind it is old")
-        self._coming.pop(origin, None)
+        self._unreleased.pop(origin, None)
         self._paces[origin] = _Pace(now, is_queue=True)
 
-    def waits(self, origin: Session, holder: PendingCommands) -> None:
-        """A first command waits there."""
+    def add_pending(self, origin: Session, holder: PendingCommands) -> None:
+        """The route holds a first command of the client."""
         self._paces[origin].holders.append(holder)
 
     def _drop(self, pace: _Pace, origin: Session, why: str) -> None:
         holders, pace.holders = pace.holders, []
         for holder in holders:
-            holder.drop_waiting(origin, why)
+            holder.drop_pending(origin, why)
 
-    def waited(self, origin: Session, holder: PendingCommands) -> None:
-        """The command that waits there has none behind it, or waits no longer."""
+    def remove_pending(self, origin: Session, holder: PendingCommands) -> None:
+        """The command that the route holds has none behind it, or is held no longer."""
         pace = self._paces.get(origin)
         if pace is not None:
             pace.holders = [other for other in pace.holders if other is not holder]
             pace.is_waiting = pace.is_waiting and bool(pace.holders)
 
-    def expect(self, client_id: str) -> None:
-        """The client left in the midst of driving, and may have queued what it commanded since."""
-        self._expected[client_id] = None
-        if len(self._expected) > EXPECTED:
-            self._expected.popitem(last=False)
+    def expect_replay(self, client_id: str) -> None:
+        """The client left while driving, and may have queued its commands since."""
+        self._expected_replays[client_id] = None
+        if len(self._expected_replays) > EXPECTED:
+            self._expected_replays.popitem(last=False)
 
-    def departed(self, session: Session) -> None:
-        """Its connection has ended: the next one is a beginning."""
+    def on_departed(self, session: Session) -> None:
+        """The session's connection has ended: on the next one the evidence begins anew."""
         self._paces.pop(session, None)
-        self._coming.pop(session, None)
+        self._unreleased.pop(session, None)
 
 
 def _peer_status(origin: Session) -> PeerStatus:
     return LOCAL_PEER if origin.link is None else origin.link.peer_status()
 
 
-def _is_held(origin: Session, oldest: float) -> bool:
-    """Whether what it sends now may have been in here for too long, before it was read."""
+def _is_delayed(origin: Session, oldest: float) -> bool:
+    """Whether what it sends now may have been unread in the appliance for too long."""
     return _peer_status(origin).held > oldest
 
 
-def said_age(properties: Properties | None, now: float) -> float | None:
-    """How old a message is by its `sent-at`, in seconds, `now` being since 1970; None when it says
-    nothing.
+def stated_age(properties: Properties | None, now: float) -> float | None:
+    """The age of a message by its `sent-at`, in seconds; None without one. `now` is since 1970.
 
-    ValueError: what it says is nonsense, or in the future.
+    Raises ValueError when it cannot be parsed, or is in the future.
     """
     made_at = sent_at(properties)
     if made_at is None:
@@ -350,9 +360,9 @@ def said_age(properties: Properties | None, now: float) -> float | None:
 
 
 def sent_at(properties: Properties | None) -> float | None:
-    """When its client made the message, in seconds since 1970; None when it does not say.
+    """When its client made the message, in seconds since 1970; None when that is not stated.
 
-    That is RFC 3339, or a number. ValueError: it is neither, or there are two of them.
+    The property is RFC 3339, or a number. Raises ValueError for anything else, and for two of them.
     """
     pairs = (properties or {}).get(Property.USER_PROPERTY)
     said = [
@@ -377,7 +387,7 @@ def sent_at(properties: Properties | None) -> float | None:
 
 
 class _NoZoneError(ValueError):
-    """A date and a time that could be anywhere."""
+    """A date and a time without a time zone."""
 
 
 def _seconds(text: str) -> float:

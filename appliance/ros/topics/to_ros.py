@@ -1,4 +1,4 @@
-"""A topic from MQTT to ROS."""
+"""Carries one topic from MQTT to ROS."""
 
 from __future__ import annotations
 
@@ -23,31 +23,36 @@ from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
 from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
 from appliance.ros.topics.staleness import StalenessDetector
 
-#: Characters of a reason that a client is told.
+#: Reasons that are sent to clients are cut to so many characters.
 REASON_LENGTH = 500
 
 
 class RuleViolationError(ConversionError):
-    """A message that could be converted, and that the route's rules do not let through."""
+    """A message was converted, but violates the route's rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class ToRosContext:
-    """What a flow to ROS needs: the loop, a way to it from any thread, the broker, who commands
-    which ROS topic alone, whose turn it is to have a large message converted, and what is known of
-    how clients' commands come."""
+    """What all flows to ROS share.
+
+    `entries` call back on the loop's thread, `post` does so from any thread. `conversions` queues
+    large messages.
+    """
 
     entries: Entries
     post: Callable[..., None]
     broker: Broker
     leases: Leases
-    turns: ConversionQueue
-    arrivals: StalenessDetector
+    conversions: ConversionQueue
+    staleness: StalenessDetector
 
 
 class ToRos(Flow):
-    """From MQTT to ROS: a publisher. `receive`, `fail` and what a Guard has are for the loop's
-    thread."""
+    """A flow from MQTT to ROS: a ROS publisher.
+
+    `enter`, `leave`, `receive`, `fail` and the methods of a broker's Guard are for the loop's
+    thread, all else for the ROS thread.
+    """
 
     direction = "to_ros"
     absence = "no node subscribes to it, which would tell its type; the route can name it"
@@ -58,16 +63,16 @@ class ToRos(Flow):
         ros: str,
         converters: Converters,
         log: LogFunction,
-        around: ToRosContext,
+        context: ToRosContext,
     ) -> None:
         super().__init__(route, ros, converters, log)
-        self._around = around
+        self._context = context
         self._is_left = True
         self.echo: EchoFilter | None = None
         #: The topic's name on ROS, where a remapping gives it another.
         self._name = ros
         self._lease = Lease(ros)
-        #: Replaced as one, because the loop's thread reads it.
+        #: How to convert, and where to publish; replaced as a whole, as the loop's thread reads it.
         self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
 
     def __str__(self) -> str:
@@ -78,7 +83,7 @@ class ToRos(Flow):
         if found or self.is_matched:
             return found
         if self.settings.type is None and self.settings.to == "both":
-            return node.publishers(self.ros)  # whoever is there knows the type
+            return node.publishers(self.ros)  # they have the type, too
         return found
 
     def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
@@ -93,7 +98,7 @@ class ToRos(Flow):
         name = node.resolve(self.ros)
         if name != self._name:
             self._name = name
-            self._around.post(self._share_lease)
+            self._context.post(self._share_lease)
         before, self._out = self._out, (unpack, publisher)
         if before is not None:
             before[1].destroy()
@@ -111,25 +116,25 @@ class ToRos(Flow):
 
     @property
     def takes_retained(self) -> bool:
-        """Whether retained messages from before the route are wanted."""
+        """Whether the route takes messages that were retained before it subscribed."""
         rules = self.settings.rules
         return rules is not None and rules.take_retained
 
     def enter(self, before: ToRos | None) -> None:
-        """Messages are going to be received from now on; until now `before` has had them."""
+        """Messages are received from now on; until now `before` has received them."""
         self._is_left = False
         self._share_lease()
-        broker = self._around.broker
-        # Also when anybody may command: the topic is then known as one that no answer goes to.
+        broker = self._context.broker
+        # Also without rules: the topic is then known as one that no response is published on.
         broker.guards.setdefault(self.mqtt, []).append(self)
         broker.guards_changed()
 
     def leave(self) -> None:
-        """None will be received any more; may be called twice."""
+        """No messages are received any more; may be called twice."""
         if self._is_left:
             return
         self._is_left = True
-        broker = self._around.broker
+        broker = self._context.broker
         guards = broker.guards[self.mqtt]
         guards.remove(self)
         if not guards:
@@ -139,14 +144,14 @@ class ToRos(Flow):
     def receive(
         self, message: Message, retain: bool, origin: Session | None, number: int
     ) -> PublishRejection | None:
-        """A message from MQTT, of that session, which came with that number; returns what is wrong
-        with it, which is told.
+        """Convert a message from MQTT and publish it on ROS; a rejection is logged and returned.
 
-        With `retain` it is from before the route: it may be an old command, and does not reach ROS.
+        `origin` is the session that published it, `number` the staleness detector's. With `retain`
+        the message was retained before the route: it may be an old command, and does not reach ROS.
         """
         if retain:
             return None
-        if self._lease.is_overtaken(number, origin):  # while it waited for its turn
+        if self._lease.is_overtaken(number, origin):  # while it was queued
             self.counters.expired += 1
             self._log_uncarried(f"was not published: {OVERTAKEN}", self.counters.expired)
             return None
@@ -158,7 +163,7 @@ class ToRos(Flow):
         )
 
     def _convert(self, message: Message, origin: Session | None) -> bytes | PublishRejection:
-        """The message's CDR, or what is wrong with it, which is told."""
+        """The message as CDR, or its rejection, which is logged."""
         out = self._out
         if out is None:
             return self._fail_and_reject(message, f"was refused: {self._why_not()}")
@@ -175,7 +180,7 @@ class ToRos(Flow):
     def _publish(
         self, cdr: bytes, message: Message, origin: Session | None, number: int
     ) -> PublishRejection | None:
-        """Publish on ROS what the message was converted to; returns why that failed."""
+        """Publish the converted message on ROS; returns a rejection if that fails."""
         out = self._out
         if out is None:
             return self._fail_and_reject(message, f"was refused: {self._why_not()}")
@@ -185,8 +190,8 @@ class ToRos(Flow):
             out[1].publish(cdr)
         except BusError as error:
             return self._fail_and_reject(message, f"could not be published: {error}")
-        finally:  # who says stop is not driven on, also when ROS does not take it
-            self._lease.said(cdr, number, origin, self._around.entries.time())
+        finally:  # a stop overtakes earlier commands although ROS has not taken it
+            self._lease.on_published(cdr, number, origin, self._context.entries.time())
         self.counters.messages += 1
         self.counters.bytes += len(message.payload)
         return None
@@ -213,30 +218,30 @@ class ToRos(Flow):
         return rejection
 
     def fault(self, message: Message, error: Exception) -> PublishRejection:
-        """What the client is told when it is the appliance that failed, which is reported."""
-        self._around.broker.faults.caught("bridge.receive", error, self)
+        """Reject a message because of a fault of the appliance, which is reported."""
+        self._context.broker.faults.caught("bridge.receive", error, self)
         self.counters.errors += 1
         return self.reject(message, "could not be carried: see the log")
 
-    # Who may publish: a Guard of the broker's
+    # A Guard of the broker: who may publish
 
     def decide(self, session: Session) -> Decision:
         """Whether the session may publish a command now."""
         return self._lease.decide(session)
 
     def announced(self, message: Message, session: Session) -> None:
-        """A message of QoS 2 has come: where there are rules, its time may say something."""
+        """A message of QoS 2 has come that is not released yet; command rules need its time."""
 
     def inspect(self, message: Message, session: Session) -> PublishRejection | None:
-        """Whether a message of QoS 2 can be converted; of a large one that is found out when it is
-        its turn, unless that is now."""
-        turns = self._around.turns
+        """Reject a message of QoS 2 that cannot be converted. A large one is examined only if no
+        other conversion is going on; otherwise it is in its turn."""
+        conversions = self._context.conversions
         if size_of(message.payload) <= LITTLE:
             cdr = self._convert(message, session)
-        elif turns.is_busy:
+        elif conversions.is_busy:
             return None
         else:
-            cdr = turns.now(partial(self._convert, message, session)) or b""
+            cdr = conversions.now(partial(self._convert, message, session)) or b""
         return cdr if isinstance(cdr, PublishRejection) else None
 
     def refused(self, session: Session) -> None:
@@ -245,14 +250,14 @@ class ToRos(Flow):
             self.counters.refused += 1
 
     def _share_lease(self) -> None:
-        """What else goes to the topic, by whatever route and name, has the same lease."""
-        self._lease = self._around.leases.of(self._name)
-        self._around.broker.guards_changed()
+        """Share the lease with all flows to the topic, by whatever route and name."""
+        self._lease = self._context.leases.of(self._name)
+        self._context.broker.guards_changed()
 
     def _read(
         self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
     ) -> bytes:
-        """The message's CDR. Raises ConversionError, also for what says to be something else."""
+        """The message as CDR. Raises ConversionError, also if its properties state another type."""
         properties = message.properties
         if properties is None:
             return convert(message.payload)

@@ -43,7 +43,7 @@ from appliance.ros.topics.staleness import (
     EXPECTED,
     STEADY,
     WAIT,
-    WITHHELD,
+    WITHHOLD,
     CommandVerdict,
     StalenessDetector,
     sent_at,
@@ -391,7 +391,7 @@ async def test_who_rests_before_it_drives_is_stopped_as_early(harness, disconnec
     driver.wire.connection = PeerStatus(silence=0.0)
     driver.steer()
     driver.steer(b"{}")
-    await until(lambda: flow._timer.when() > flow._heard_at + 500)
+    await until(lambda: flow._timer.when() > flow._commanded_at + 500)
     driver.steer()
     await until(lambda: harness.counters().stops == 1)
     assert harness.robot.received == [twist(0.5), STOP, twist(0.5), STOP]
@@ -401,7 +401,7 @@ async def test_who_rests_before_it_drives_is_stopped_as_early(harness, disconnec
 async def test_a_lease_that_ends_before_the_silence_is_too_long_is_seen_in_time(harness):
     """The timer was set for a command that nobody has the lease for: a retained one."""
     harness.start(CommandRules(exclusive=True, lease=AFTER, on_silence=OnSilence(600)))
-    harness.commands._commanded(twist(0.5), None)
+    harness.commands._on_commanded(twist(0.5), None)
     driver = Driver(harness.broker, "a")
     driver.steer()
     assert harness.commands.commanding == "a"
@@ -415,7 +415,7 @@ async def test_the_timer_is_for_what_is_due_first(harness, lease):
     driver = Driver(harness.broker, "a")
     driver.steer()
     flow = harness.commands
-    assert flow._timer.when() == flow._heard_at + min(lease, AFTER)
+    assert flow._timer.when() == flow._commanded_at + min(lease, AFTER)
     # Steady driving sets no timer for each command.
     timer = flow._timer
     driver.steer()
@@ -425,8 +425,8 @@ async def test_the_timer_is_for_what_is_due_first(harness, lease):
 @pytest.fixture
 def impatient(monkeypatch):
     """Who is asked for an answer has less time for it."""
-    monkeypatch.setattr(commands, "ANSWERED", 0.3)
-    monkeypatch.setattr(commands, "LOOK_AGAIN", 0.02)
+    monkeypatch.setattr(commands, "PROBE_TIMEOUT", 0.3)
+    monkeypatch.setattr(commands, "PROBE_INTERVAL", 0.02)
 
 
 async def test_who_falls_silent_with_its_connection_is_disconnected(harness, impatient):
@@ -459,7 +459,7 @@ async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_an
         await until(lambda: driver.wire.probed)
         driver.wire.probed = False
         driver.wire.connection = PeerStatus(silence=0.0)
-        await until(lambda: not harness.commands._asked)
+        await until(lambda: not harness.commands._probed)
         await asyncio.sleep(0.4)
         assert harness.robot.received == [twist(0.5), STOP] * round_
     assert not driver.wire.closed
@@ -952,7 +952,7 @@ class Sender:
         self.client_id = client_id
         self.age = 0.0
         self.qos = qos
-        self.arrivals = StalenessDetector()
+        self.staleness = StalenessDetector()
         self.now = 100.0
         self.moved = []
         self.held = None
@@ -960,7 +960,7 @@ class Sender:
 
     def _pass_to(self, now):
         if self.held is not None and now >= self.due:
-            self.arrivals.waited(self, self)
+            self.staleness.remove_pending(self, self)
             self.moved.append(self.held)
             self.held = None
         self.now = now
@@ -970,14 +970,14 @@ class Sender:
         self._pass_to(self.now + after)
         what = self.now if what is None else what
         if self.qos == 2:
-            self.arrivals.look(self, self.OLDEST, self.now)
-        verdict = self.arrivals.judge(self, self.qos, self.OLDEST, self.now)
+            self.staleness.observe_unreleased(self, self.OLDEST, self.now)
+        verdict = self.staleness.judge(self, self.qos, self.OLDEST, self.now)
         self.held = None
         if verdict is CommandVerdict.CARRY_OUT:
             self.moved.append(what)
         elif verdict is CommandVerdict.WAIT:
             self.held = what
-            self.due = self.now + self.arrivals.waiting_time(self, self.OLDEST)
+            self.due = self.now + self.staleness.waiting_time(self, self.OLDEST)
         return verdict
 
     def rest(self, seconds):
@@ -1079,7 +1079,7 @@ class TestArrivals:
 
     def test_a_long_queue_behind_what_is_known_to_be_old(self, qos):
         sender = Sender(qos)
-        sender.arrivals.is_old(sender, sender.now)
+        sender.staleness.mark_stale(sender, sender.now)
         for _ in range(60_000):
             sender.say(0.002)
         assert sender.moved == []
@@ -1166,17 +1166,17 @@ def test_the_flush_of_a_queue_is_slowed_by_little():
         withheld += now
     assert sender.moved == []
     assert withheld < 0.2 * (sender.now - begun)
-    assert WITHHELD > 0.1  # what is made at 10 Hz comes within it
+    assert WITHHOLD > 0.1  # what is made at 10 Hz comes within it
     assert STEADY == 2
 
 
 def test_who_left_while_it_drove():
     sender = Sender()
-    sender.arrivals.expect("a")
+    sender.staleness.expect_replay("a")
     sender.say(0, "old")
     sender.rest(0.4)
-    sender.arrivals.departed(sender)
-    sender.arrivals.expect("a")
+    sender.staleness.on_departed(sender)
+    sender.staleness.expect_replay("a")
     sender.age = 12
     sender.say(0, "new")
     sender.rest(1)
@@ -1184,10 +1184,10 @@ def test_who_left_while_it_drove():
 
 
 def test_clients_whose_return_is_expected_are_bounded():
-    arrivals = StalenessDetector()
+    staleness = StalenessDetector()
     for number in range(2 * EXPECTED):
-        arrivals.expect(str(number))
-    assert len(arrivals._expected) == EXPECTED
+        staleness.expect_replay(str(number))
+    assert len(staleness._expected_replays) == EXPECTED
 
 
 def said(*texts):
@@ -1320,7 +1320,7 @@ async def test_a_single_command_and_a_cut(harness):
     assert harness.robot.received == []
     assert harness.counters().expired == 1
     assert harness.broker.accounting.queued_bytes == before
-    assert harness.commands._arrivals._paces == {}
+    assert harness.commands._staleness._paces == {}
 
 
 def start_two(harness, mqtt="r2d2/arm"):
@@ -1805,12 +1805,12 @@ async def test_who_has_the_lease_keeps_it_with_a_stop(harness):
     harness.start(CommandRules(exclusive=True, lease=60, on_silence=OnSilence(60)))
     driver = Driver(harness.broker, "a")
     driver.steer()
-    before = harness.commands._lease.heard_at
+    before = harness.commands._lease.commanded_at
     await asyncio.sleep(0.001)
     driver.steer(b"{}")
     assert harness.robot.received == [twist(0.5), STOP]
     assert harness.commands.commanding == "a"
-    assert harness.commands._lease.heard_at > before
+    assert harness.commands._lease.commanded_at > before
 
 
 async def test_sent_at_tells_a_new_one_from_an_old_one_in_any_burst(harness):
@@ -2181,13 +2181,13 @@ def test_what_is_known_by_a_long_expire_is_not_known_by_a_short_one(presses):
     lights = 10.0
     for _ in range(presses):
         sender.now += 1.2
-        sender.arrivals.judge(sender, 0, lights, sender.now)
+        sender.staleness.judge(sender, 0, lights, sender.now)
     for _ in range(6):
         sender.say(0.05)
     assert sender.moved
     sender.moved.clear()
     sender.now += 3
-    sender.arrivals.judge(sender, 0, lights, sender.now)
+    sender.staleness.judge(sender, 0, lights, sender.now)
     for _ in range(20):
         sender.say(0, "old")
     sender.rest(1)
@@ -2215,8 +2215,8 @@ def test_a_qos_2_command_of_two_routes_is_looked_at_once():
     for number in range(6):
         sender.now += 0.05
         for _ in range(2):
-            sender.arrivals.look(sender, sender.OLDEST, sender.now, number)
-        verdicts.append(sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, number))
+            sender.staleness.observe_unreleased(sender, sender.OLDEST, sender.now, number)
+        verdicts.append(sender.staleness.judge(sender, 2, sender.OLDEST, sender.now, number))
     assert verdicts[2:] == [CommandVerdict.CARRY_OUT] * 4
 
 
@@ -2336,8 +2336,8 @@ def test_the_pace_of_qos_2_of_a_long_expire_is_not_that_of_a_short_one(lights):
     sender.moved.clear()
     sender.now += 3
     for _ in range(lights):
-        sender.arrivals.look(sender, 10.0, sender.now)
-        sender.arrivals.judge(sender, 2, 10.0, sender.now)
+        sender.staleness.observe_unreleased(sender, 10.0, sender.now)
+        sender.staleness.judge(sender, 2, 10.0, sender.now)
     for _ in range(40):
         withheld = sum(sender.link.withheld)
         sender.link.withheld.clear()
@@ -2407,7 +2407,7 @@ async def test_a_stop_that_is_not_only_repeated_overtakes(harness, monkeypatch, 
     if before == "a pause":
         stopper.say(REPEATED)
         with monkeypatch.context() as patch:
-            patch.setattr(lease, "WITHIN", -1.0)
+            patch.setattr(lease, "REPEAT_WITHIN", -1.0)
             stopper.say()
     elif before == "a few":
         stopper.say(REPEATED - 2)
@@ -2429,15 +2429,15 @@ async def test_a_stop_that_is_not_only_repeated_overtakes(harness, monkeypatch, 
 
 
 def test_what_is_known_of_stops_is_bounded(monkeypatch):
-    monkeypatch.setattr(lease, "CLIENTS", 2)
+    monkeypatch.setattr(lease, "MAX_CLIENTS", 2)
     shared = lease.Lease("/cmd_vel")
-    shared.join(AnyStops())
+    shared.add_route(AnyStops())
     clients = [Sender(client_id=name) for name in "abc"]
     number = 0
     for client in clients:
         for _ in range(REPEATED + 1):
             number += 1
-            shared.said(STOP, number, client, 0.0)
+            shared.on_published(STOP, number, client, 0.0)
     assert len(shared._stops) == 2
     # What is forgotten has overtaken what came before it all the same.
     assert shared.is_overtaken(REPEATED, clients[0])
@@ -2453,7 +2453,7 @@ class AnyStops:
     def watch(self):
         """It has nothing to look at."""
 
-    def stops(self, cdr):
+    def is_stop_message(self, cdr):
         return True
 
 
@@ -2529,14 +2529,14 @@ def test_what_was_held_is_old_also_for_the_route_with_the_shorter_expire(qos):
     lights = 10.0
     for _ in range(4):
         sender.now += 1.2
-        sender.arrivals.judge(sender, qos, lights, sender.now)
+        sender.staleness.judge(sender, qos, lights, sender.now)
     sender.link.held = 3.0
     sender.now += 0.4
     if qos == 2:
-        sender.arrivals.look(sender, sender.OLDEST, sender.now, 1)
+        sender.staleness.observe_unreleased(sender, sender.OLDEST, sender.now, 1)
         sender.link.held = 0.0
         sender.now += 0.2  # until its PUBREL
-    verdict = sender.arrivals.judge(sender, qos, sender.OLDEST, sender.now, 1)
+    verdict = sender.staleness.judge(sender, qos, sender.OLDEST, sender.now, 1)
     assert verdict is CommandVerdict.REFUSE
 
 
@@ -2549,11 +2549,11 @@ def test_what_was_held_is_old_for_one_of_two_routes(qos, first):
     sender.link.held = 3.0
     if qos == 2:
         for oldest in order:
-            sender.arrivals.look(sender, oldest, sender.now, 1)
+            sender.staleness.observe_unreleased(sender, oldest, sender.now, 1)
         sender.link.held = 0.0
         sender.now += 0.05
     verdicts = {
-        oldest: sender.arrivals.judge(sender, qos, oldest, sender.now, 1) for oldest in order
+        oldest: sender.staleness.judge(sender, qos, oldest, sender.now, 1) for oldest in order
     }
     assert verdicts[sender.OLDEST] is CommandVerdict.REFUSE
 
@@ -2565,10 +2565,10 @@ def test_a_qos_2_command_that_was_held_behind_others_that_were():
     sender.link.held = 3.0
     for _ in range(3):
         sender.now += 1.2
-        sender.arrivals.judge(sender, 0, lights, sender.now)
+        sender.staleness.judge(sender, 0, lights, sender.now)
     sender.now += 0.4
-    sender.arrivals.look(sender, sender.OLDEST, sender.now, 1)
+    sender.staleness.observe_unreleased(sender, sender.OLDEST, sender.now, 1)
     sender.link.held = 0.0
     sender.now += 0.2
-    verdict = sender.arrivals.judge(sender, 2, sender.OLDEST, sender.now, 1)
+    verdict = sender.staleness.judge(sender, 2, sender.OLDEST, sender.now, 1)
     assert verdict is CommandVerdict.REFUSE
