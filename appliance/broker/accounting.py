@@ -43,7 +43,7 @@ class Accounting:
     half_queue: int = field(init=False)
     memory: int = field(init=False)
     #: Below this use, in bytes, no quota of a user can be exceeded, so that none is looked up.
-    plenty: int = field(init=False)
+    unrestricted_memory: int = field(init=False)
     #: What each user may hold.
     quotas: Quotas = field(init=False)
     #: Bytes that a connected client may hold when others have taken all the memory.
@@ -54,10 +54,10 @@ class Accounting:
     may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
     #: A clock, in seconds, that stops while the clients could do nothing because the broker was
     #: busy or the computer was loaded.
-    spare: Callable[[], float] = field(init=False)
+    client_time: Callable[[], float] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.spare = lambda: self.now
+        self.client_time = lambda: self.now
         self.use(self.limits)
 
     def use(self, limits: Limits) -> None:
@@ -69,7 +69,7 @@ class Accounting:
         self.memory = limits.memory * 7 // 8
         self.reserve = limits.memory // 8 // limits.connections
         self.quotas = Quotas(limits, self.memory, self.store.size)
-        self.plenty = min(self.quotas.memory.lent, self.quotas.memory.most)
+        self.unrestricted_memory = min(self.quotas.memory.lent, self.quotas.memory.most)
 
     def fits(self, account: Account, size: int) -> bool:
         """Whether the account may take `size` more bytes of memory."""

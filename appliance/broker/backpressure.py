@@ -95,7 +95,7 @@ class Congestion:
         self._a_message = PATIENCE / accounting.limits.queue_messages
         self._a_byte = PATIENCE / accounting.limits.queue_bytes
         self._allowance = Allowance(PATIENCE)
-        self._updated_at = accounting.spare()
+        self._updated_at = accounting.client_time()
         self._earned = 0.0  # since `_updated_at`
         self._reader_time = 0.0
         #: Packet ids that wait for the flush, and for a batch of the store.
@@ -155,7 +155,7 @@ class Congestion:
     def _settle(self) -> None:
         """Account for the time up to now."""
         # Time in which the broker served others is not the reader's fault.
-        now, idle = self._accounting.spare(), 0.0
+        now, idle = self._accounting.client_time(), 0.0
         if self._has_unacknowledged or self._accounting.failing:
             idle = now - self._updated_at
             self._reader_time += idle
@@ -198,7 +198,7 @@ class Congestion:
 
     def resume(self) -> None:
         """The reader has reconnected; what was left of its allowance still applies."""
-        self._updated_at = self._accounting.spare()
+        self._updated_at = self._accounting.client_time()
         self._earned = 0.0
         self._unwritten.clear()
         self._held_back.clear()

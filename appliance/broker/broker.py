@@ -51,7 +51,7 @@ from appliance.mqtt.topics import check_filter, parse_shared
 log = logging.getLogger(__name__)
 
 #: Seconds that a QoS 2 exchange may take before its message counts as delayed.
-LATE = 0.1
+DELAYED_AFTER = 0.1
 
 #: Receivers that are checked for room for one unit of cost.
 CHECKS_PER_COST_UNIT = 4
@@ -750,7 +750,7 @@ class Broker:
         """
         self.counters.cost += HELD_COST
         message, full, _ = held
-        if age > LATE:
+        if age > DELAYED_AFTER:
             message = DelayedMessage(message, age + message.age)
         if self.accounting.has_expired(message):
             return

@@ -20,7 +20,7 @@ from appliance.broker.backpressure import (
     Allowance,
     Congestion,
 )
-from appliance.broker.broker import HELD_COST, LATE, Broker
+from appliance.broker.broker import DELAYED_AFTER, HELD_COST, Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.handshake import (
     Agreement,
@@ -81,7 +81,7 @@ FAILURE_COST = 50
 #: Seconds that a publisher waits at a time for decisions on what others may receive, and the share
 #: of its time that it waits in the long run: too short to make a command old, so that subscribers
 #: cannot stop a publisher.
-RIGHTS_PATIENCE = LATE / 2
+RIGHTS_PATIENCE = DELAYED_AFTER / 2
 RIGHTS_SHARE = 0.1
 
 #: The shortest time, in seconds, until a waiting message is checked again.
@@ -190,10 +190,10 @@ class ClientHandler:
         cost = counters.cost + COST_PER_TURN
         inflow = self.inflow
         if inflow.is_watched:
-            inflow.came(data, now)
+            inflow.chunk_received(data, now)
         try:
             events: Iterable[Event]
-            if inflow.unfinished and now - inflow.unfinished > LATE:
+            if inflow.unfinished and now - inflow.unfinished > DELAYED_AFTER:
                 events = self._completing(data, cost)
             elif self._behind:
                 events = self._passing(data, cost)
@@ -454,7 +454,7 @@ class ClientHandler:
 
     def _is_old(self) -> bool:
         """Whether the packet has waited so long that its message counts as delayed."""
-        return self._accounting.now - self._arrived_at > LATE
+        return self._accounting.now - self._arrived_at > DELAYED_AFTER
 
     def _age(self) -> float:
         """The age of the message being processed; infinity if it may have waited unread."""
@@ -520,7 +520,7 @@ class ClientHandler:
             self._behind_size < accounting.queue_bytes
             and isinstance(self._behind[-1][0], tuple | Publish)
             and (
-                accounting.queued_bytes + grown <= accounting.plenty
+                accounting.queued_bytes + grown <= accounting.unrestricted_memory
                 or accounting.fits(self.account, grown)
             )
         )

@@ -18,9 +18,9 @@ from __future__ import annotations
 import math
 
 #: The shortest pause, in seconds; to this is added the time in which a slow network, of 10 Mbit/s,
-#: transfers the next chunk: A_BYTE seconds per byte.
+#: transfers the next chunk: SECONDS_PER_BYTE seconds per byte.
 PAUSE = 0.004
-A_BYTE = 0.8e-6
+SECONDS_PER_BYTE = 0.8e-6
 
 #: The shortest pause after the connection was not read for longer than this: buffered input then
 #: arrives soon.
@@ -40,7 +40,7 @@ CATCHING_UP = 5.0
 #: To this is added so many times two round trips and PAUSE_BEHIND: TCP starts slowly.
 FLIGHTS = 10
 
-#: The longest interval between two calls of `look`, in seconds.
+#: The longest interval between two calls of `check`, in seconds.
 RARELY = 1.0
 
 #: The size of the smallest PUBLISH, in bytes.
@@ -95,11 +95,11 @@ class Inflow:
         self._received = 0
         self._was_full = False
         self._most = 0.0
-        #: The bytes received until the last `look`, and the least seconds until the next.
+        #: The bytes received until the last `check`, and the least seconds until the next.
         self._seen = 0
         self._interval = PAUSE_BEHIND
 
-    def came(self, data: bytes, now: float) -> None:
+    def chunk_received(self, data: bytes, now: float) -> None:
         """A chunk has arrived."""
         # Ignore acknowledgements, pings, and the empty chunk that continues with buffered input.
         if len(data) < SHORTEST or (not self.unfinished and _acknowledges(data)):
@@ -108,11 +108,11 @@ class Inflow:
         is_held = self._held_since and now - self._held_since > PAUSE  # not since this chunk
         is_behind = self._resumed > self.last and self._held > PAUSE_BEHIND
         pause = PAUSE_BEHIND if is_behind else PAUSE
-        if gap > pause + len(data) * A_BYTE and not self.unfinished and not is_held:
+        if gap > pause + len(data) * SECONDS_PER_BYTE and not self.unfinished and not is_held:
             self.began = now
         self.last = now
 
-    def not_read(self, now: float) -> None:
+    def reading_paused(self, now: float) -> None:
         """The connection is not read from now on."""
         if not self._held_since:
             self._held_since = now
@@ -120,7 +120,7 @@ class Inflow:
                 self._has_caught_up()
             self._caught_up = 0.0
 
-    def read(self, now: float) -> None:
+    def reading_resumed(self, now: float) -> None:
         """The connection is read again."""
         if self._held_since:
             pause = now - self._held_since
@@ -132,7 +132,7 @@ class Inflow:
                 self._measured_since = 0.0
                 self._interval = PAUSE_BEHIND
 
-    def look(
+    def check(
         self, now: float, *, unread: bool, full: bool, received: int, round_trip: float
     ) -> float:
         """Check whether the client has caught up; returns seconds until the next check, or 0.

@@ -40,7 +40,7 @@ class Delivery(NamedTuple):
 
 #: Retained messages that are sent or skipped for new subscriptions in one turn of the event loop:
 #: some milliseconds, then it is the turn of other clients.
-REPLAYED_A_TURN = 512
+REPLAYED_PER_TURN = 512
 
 #: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
 #: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
@@ -170,7 +170,7 @@ class Session:
         #: Retained messages of new subscriptions, by filter; they are sent before newer messages.
         #: Each is looked up when it can be sent, so that a slow client's replay takes no memory.
         self.replays: dict[str, Iterator[Delivery | None]] = {}
-        self.replays_left = REPLAYED_A_TURN
+        self.replays_left = REPLAYED_PER_TURN
         #: QoS 0 messages for a slow client, oldest first: the latest of each topic or, if the limit
         #: `keep` is set, that many messages, by number.
         self.latest: dict[str | int, Delivery] = {}
@@ -243,7 +243,7 @@ class Session:
         size = message.size
         if (
             self.bytes + size <= accounting.half_queue
-            and accounting.queued_bytes + size <= accounting.plenty
+            and accounting.queued_bytes + size <= accounting.unrestricted_memory
         ) or self._fits_tightly(size):
             if (
                 link is not None
@@ -346,7 +346,7 @@ class Session:
 
     def take_turn(self) -> None:
         """Send what is queued, in a new turn: other clients have had theirs in between."""
-        self.replays_left = REPLAYED_A_TURN
+        self.replays_left = REPLAYED_PER_TURN
         self.pump()
 
     def pump(self) -> None:
@@ -786,7 +786,7 @@ class Session:
             return True
         is_little = self.bytes + size <= accounting.half_queue
         return not (
-            is_little and accounting.queued_bytes + size <= accounting.plenty
+            is_little and accounting.queued_bytes + size <= accounting.unrestricted_memory
         ) and not self.fits(size)
 
     def _is_crowded(self) -> bool:

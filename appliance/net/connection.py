@@ -507,12 +507,12 @@ class ClientConnection:
 
     def input_paused(self) -> None:
         """Received bytes wait, here or in a layer below."""
-        self._client.inflow.not_read(self._loop.time())
+        self._client.inflow.reading_paused(self._loop.time())
 
     def input_resumed(self) -> None:
         """Nothing that was received waits any more."""
         inflow = self._client.inflow
-        inflow.read(self._loop.time())
+        inflow.reading_resumed(self._loop.time())
         if inflow.is_behind:
             self._check_caught_up()
 
@@ -524,7 +524,7 @@ class ClientConnection:
         if self._transport.get_extra_info("has_unread"):
             known = known._replace(unread=True)
         inflow = self._client.inflow
-        seconds = inflow.look(self._loop.time(), **known._asdict())
+        seconds = inflow.check(self._loop.time(), **known._asdict())
         if seconds:
             self._schedule_look(seconds)
 

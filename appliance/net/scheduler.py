@@ -116,7 +116,7 @@ class Scheduler:
         certificates: CertificatePolicy | None = None,
     ) -> None:
         self.broker = broker
-        self._spare = broker.accounting.spare = SpareClock()
+        self._spare = broker.accounting.client_time = SpareClock()
         self.certificates = certificates
         self.authenticate = authenticate
         self.exchange = exchange

@@ -502,7 +502,7 @@ def test_who_recovers_is_waited_for_again(join: Join, broker: Broker):
 
 def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: Broker):
     """With many floods at a time each reader gets its part of the processor only."""
-    broker.accounting.spare = lambda: 0.05 * broker.now
+    broker.accounting.client_time = lambda: 0.05 * broker.now
     reader = join("reader", version=4)
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4), ["a"], COUNT)
@@ -515,7 +515,7 @@ def test_time_in_which_the_broker_works_is_not_the_readers(join: Join, broker: B
 def test_a_computer_under_load_is_not_the_readers_fault(join: Join, broker: Broker, load: int):
     """Where the broker has to wait for the processor, the reader has to as well."""
     clock = SpareClock()
-    broker.accounting.spare = lambda: clock.grow(
+    broker.accounting.client_time = lambda: clock.grow(
         1 + broker.now, 0.1 * broker.now, load * 0.1 * broker.now, 0
     )
     reader = join("reader", version=4)
@@ -528,7 +528,7 @@ def test_a_computer_under_load_is_not_the_readers_fault(join: Join, broker: Brok
 
 def test_readers_that_conspire_cannot_stop_a_publisher(join: Join, broker: Broker):
     """Whatever they invent, to be waited for without end: each message gives it time back."""
-    broker.accounting.spare = lambda: 0.0  # and the time of none of them is counted
+    broker.accounting.client_time = lambda: 0.0  # and the time of none of them is counted
     reader = join("reader", version=4)
     reader.subscribe("a", 1)
     publisher = Actor(join("publisher", version=4), ["a"], ALL)
@@ -716,7 +716,7 @@ def test_what_waits_no_more_is_counted_for_nobody(join: Join, broker: Broker):
 def test_what_waits_takes_no_memory_that_there_is_not(waiting: Peer, broker: Broker):
     """Nobody is disconnected for it: what does not fit is not read."""
     accounting = broker.accounting
-    accounting.plenty = accounting.queued_bytes
+    accounting.unrestricted_memory = accounting.queued_bytes
     accounting.quotas.memory = Quota.of(accounting.queued_bytes + 50_000, None)
     for number in range(100):
         waiting.send(Publish("b", bytes(1000), 1, False, False, 10_001 + number))

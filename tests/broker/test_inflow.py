@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from appliance.broker.inflow import A_BYTE, CATCHING_UP, LITTLE, PAUSE, PAUSE_BEHIND, Inflow
+from appliance.broker.inflow import (
+    CATCHING_UP,
+    LITTLE,
+    PAUSE,
+    PAUSE_BEHIND,
+    SECONDS_PER_BYTE,
+    Inflow,
+)
 
 COMMAND = b"0" * 60
 
@@ -27,13 +34,13 @@ class Sending:
 
     def hear(self, after, data=COMMAND):
         self.now += after
-        self.came(data, self.now)
+        self.chunk_received(data, self.now)
 
     def age(self, *, has_unread=False):
         return self.held(self.now, has_unread=has_unread)
 
     def see(self, *, unread=False, full=False, received=0, round_trip=0.0):
-        return self.look(
+        return self.check(
             self.now, unread=unread, full=full, received=received, round_trip=round_trip
         )
 
@@ -64,7 +71,7 @@ def test_nor_one_that_the_next_bytes_took_to_come():
     record = bytes(16384)
     inflow = Sending()
     for _ in range(10):
-        inflow.hear(len(record) * A_BYTE, record)
+        inflow.hear(len(record) * SECONDS_PER_BYTE, record)
     assert inflow.flowing(inflow.now) > 0.1
     inflow.hear(0.05, record)
     assert inflow.flowing(inflow.now) == 0
@@ -81,11 +88,11 @@ def test_acknowledgements_neither_end_a_pause_nor_fill_it(data):
 
 def test_what_waited_while_nobody_read():
     inflow = Sending()
-    inflow.not_read(inflow.now)
-    inflow.not_read(inflow.now + 1)
+    inflow.reading_paused(inflow.now)
+    inflow.reading_paused(inflow.now + 1)
     assert inflow.held(inflow.now + 2, has_unread=False) == 2.0
     inflow.now += 3
-    inflow.read(inflow.now)
+    inflow.reading_resumed(inflow.now)
     inflow.hear(PAUSE_BEHIND)  # the loop had something else to do, meanwhile
     assert inflow.age(has_unread=True) == 3.0
     inflow.hear(0.001)
@@ -99,9 +106,9 @@ def test_what_waited_while_nobody_read():
 def test_many_short_times_are_a_long_one_until_it_has_caught_up():
     inflow = Sending()
     for _ in range(10):
-        inflow.not_read(inflow.now)
+        inflow.reading_paused(inflow.now)
         inflow.now += 0.1
-        inflow.read(inflow.now)
+        inflow.reading_resumed(inflow.now)
         inflow.hear(0.002)
         inflow.age(has_unread=True)
     assert inflow.age(has_unread=True) == pytest.approx(1)
@@ -112,9 +119,9 @@ def test_a_moment_in_which_it_was_not_read_leaves_its_pauses_as_they_are():
     inflow = Sending()
     for _ in range(100):
         inflow.now += 0.001
-        inflow.not_read(inflow.now)
+        inflow.reading_paused(inflow.now)
         inflow.now += 0.001
-        inflow.read(inflow.now)
+        inflow.reading_resumed(inflow.now)
         inflow.hear(2 * PAUSE)
         assert inflow.flowing(inflow.now) == 0
         inflow.hear(0.001)
@@ -125,11 +132,11 @@ def test_a_moment_in_which_it_was_not_read_leaves_its_pauses_as_they_are():
 def test_who_pauses_has_nothing_left_of_before():
     inflow = Sending()
     for _ in range(100):
-        inflow.not_read(inflow.now)  # for the rest of the round, by a large chunk of its own
+        inflow.reading_paused(inflow.now)  # for the rest of the round, by a large chunk of its own
         inflow.hear(0, bytes(500))
         assert inflow.flowing(inflow.now) == 0
         inflow.now += 0.01
-        inflow.read(inflow.now)
+        inflow.reading_resumed(inflow.now)
         assert inflow.see(unread=True) == PAUSE_BEHIND
         assert inflow.age(has_unread=True) == pytest.approx(0.01)
         inflow.now += PAUSE_BEHIND
@@ -140,9 +147,9 @@ def test_who_pauses_has_nothing_left_of_before():
 def test_no_work_of_ours_is_a_pause_of_its_own():
     """There is more of what it has said before than is read in one go."""
     inflow = Sending()
-    inflow.not_read(inflow.now)
+    inflow.reading_paused(inflow.now)
     inflow.now += 1
-    inflow.read(inflow.now)
+    inflow.reading_resumed(inflow.now)
     for n in range(9):
         assert inflow.see(unread=True, received=n + 1) == PAUSE_BEHIND
         inflow.hear(3 * PAUSE_BEHIND)
@@ -155,9 +162,9 @@ def test_no_work_of_ours_is_a_pause_of_its_own():
 @pytest.mark.parametrize("round_trip", [0.005, 0.03, 0.1, 1.0])
 def test_what_it_kept_back_comes_a_round_trip_after_it_is_read_again(round_trip):
     inflow = Sending()
-    inflow.not_read(inflow.now)
+    inflow.reading_paused(inflow.now)
     inflow.now += 1
-    inflow.read(inflow.now)
+    inflow.reading_resumed(inflow.now)
     received = 60_000  # what the system had kept
     pause = inflow.see(unread=True, full=True, received=received, round_trip=round_trip)
     assert pause == PAUSE_BEHIND
@@ -184,10 +191,10 @@ def test_what_it_kept_back_comes_a_round_trip_after_it_is_read_again(round_trip)
 def test_who_has_not_caught_up_before_it_is_not_read_again_has_it_all_before_it():
     inflow = Sending()
     for _ in range(3):
-        inflow.not_read(inflow.now)
+        inflow.reading_paused(inflow.now)
         inflow.now += 0.3
         assert inflow.see(full=True) == 0  # nothing to be seen while it is not read
-        inflow.read(inflow.now)
+        inflow.reading_resumed(inflow.now)
         inflow.see(unread=True, full=True, round_trip=0.1)
         inflow.hear(0, bytes(60_000))
         inflow.now += 0.1
@@ -205,9 +212,9 @@ class Streaming(Sending):
         self.__dict__.update(received=0, looks_at=0.0)
 
     def pause(self, seconds, *, full=True):
-        self.not_read(self.now)
+        self.reading_paused(self.now)
         self.now += seconds
-        self.read(self.now)
+        self.reading_resumed(self.now)
         self.look_now(unread=True, full=full)
 
     def look_now(self, **seen):
@@ -266,9 +273,9 @@ def test_what_takes_long_to_catch_up_does_so_until_the_end():
 def test_half_a_frame_is_looked_for_ever_more_rarely(watched):
     inflow = Sending()
     inflow.is_watched = watched
-    inflow.not_read(inflow.now)
+    inflow.reading_paused(inflow.now)
     inflow.now += 0.1
-    inflow.read(inflow.now)
+    inflow.reading_resumed(inflow.now)
     looks, begun = 0, inflow.now
     while inflow.now < begun + 60:
         inflow.now += inflow.see(unread=True, received=50)

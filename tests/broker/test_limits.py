@@ -12,7 +12,7 @@ from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.message import Message
 from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.rate_limited_log import BURST, INTERVAL
-from appliance.broker.session import REPLAYED_A_TURN, subscription_size
+from appliance.broker.session import REPLAYED_PER_TURN, subscription_size
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.connection import UNAUTHENTICATED_PAIRS
 from appliance.mqtt.packets import (
@@ -212,13 +212,13 @@ def take_turns(broker: Broker, peer: Peer, most: int = 1000) -> list[int]:
 
 def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
     publisher = join("publisher")
-    count = 3 * REPLAYED_A_TURN + 5
+    count = 3 * REPLAYED_PER_TURN + 5
     for number in range(count):
         publisher.publish(f"r/{number}", b"%d" % number, retain=True)
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
     heard = subscriber.payloads()
-    assert 0.9 * REPLAYED_A_TURN < len(heard) <= REPLAYED_A_TURN
+    assert 0.9 * REPLAYED_PER_TURN < len(heard) <= REPLAYED_PER_TURN
     take_turns(broker, subscriber)
     assert len(heard + subscriber.payloads()) == count
 
@@ -226,14 +226,14 @@ def test_many_retained_messages_come_in_turns(join: Join, broker: Broker):
 def test_what_may_not_be_seen_takes_turns_too(join: Join, broker: Broker, access: FakeAccess):
     access.deny("user", Action.RECEIVE, "r/+")
     publisher = join("publisher")
-    for number in range(REPLAYED_A_TURN + 5):
+    for number in range(REPLAYED_PER_TURN + 5):
         publisher.publish(f"r/{number}", b"", 0)
         message = Message(f"r/{number}", b"x", retain=True)
         broker.retained.keep(message, broker.accounting.accounts.inside)
     subscriber = join("subscriber")
     subscriber.subscribe("r/#")
     assert subscriber.payloads() == [] and subscriber.transport.laters == 1
-    for number in range(REPLAYED_A_TURN + 5):
+    for number in range(REPLAYED_PER_TURN + 5):
         broker.retained.delete(f"r/{number}")
 
 
