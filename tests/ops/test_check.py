@@ -100,7 +100,7 @@ def test_calls(here: Path, section: str, route: dict[str, Any], text: str) -> No
     assert all(text in each.text and "_Request" not in each.text for each in findings), findings
 
 
-def test_without_ros_it_says_what_was_not_looked_at(
+def test_without_ros_it_says_what_was_not_checked(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ros2, "available", lambda: (False, "there is no ROS 2 here"))

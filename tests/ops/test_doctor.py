@@ -64,7 +64,7 @@ def snapshot(directory: Path) -> dict[str, tuple[int, int, int]]:
 # All of it
 
 
-def test_everything_is_looked_at_and_nothing_changed(
+def test_everything_is_examined_and_nothing_changed(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = snapshot(here)
@@ -117,7 +117,7 @@ def test_one_part_that_fails_leaves_the_others_their_say(
     monkeypatch.setattr(examination, "clock", clock)
     found = list(examine(here / "appliance.yaml"))
     texts = [each.text for each in found if each.subject == "clock"]
-    assert texts == ["ticks", "could not be looked at: RuntimeError: a gear broke"]
+    assert texts == ["ticks", "could not be examined: RuntimeError: a gear broke"]
     assert found[-1].subject == "ROS"
 
 
@@ -297,7 +297,7 @@ def test_domains(here: Path, monkeypatch: pytest.MonkeyPatch, domain: str, level
     assert finding.level == level and "nodes of this computer only" in finding.text
 
 
-def test_it_looks_with_the_environment_of_the_running_one(
+def test_it_has_the_environment_of_the_running_one(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A domain of its own, which is in /etc/default/appliance, is not in root's shell."""
@@ -326,11 +326,11 @@ def test_the_running_one_may_be_seen_after_others(here: Path) -> None:
     seen_by = SimpleNamespace(
         name="/me", nodes=lambda: ["/me", "/peer"], topics=dict, elsewhere=set
     )
-    seen = ros._Seen(seen_by, "/appliance")  # type: ignore[arg-type]
-    seen.look()
+    seen = ros._Discovered(seen_by, "/appliance")  # type: ignore[arg-type]
+    seen.update()
     assert not seen._is_done.is_set()
     seen_by.nodes = lambda: ["/me", "/appliance", "/peer"]
-    seen.look()
+    seen.update()
     assert seen._is_done.is_set()
 
 
@@ -338,11 +338,11 @@ def test_another_node_of_the_same_name() -> None:
     seen_by = SimpleNamespace(
         name="/me", nodes=lambda: ["/me", "/appliance"], topics=dict, elsewhere=set
     )
-    seen = ros._Seen(seen_by, "/appliance")  # type: ignore[arg-type]
-    seen.look()
+    seen = ros._Discovered(seen_by, "/appliance")  # type: ignore[arg-type]
+    seen.update()
     assert not seen.has_twin
     seen_by.nodes = lambda: ["/me", "/appliance", "/appliance"]
-    seen.look()
+    seen.update()
     assert seen.has_twin
 
 
@@ -420,6 +420,6 @@ def test_nodes_of_other_computers_are_named(here: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(ros, "Ros2Node", node)
     monkeypatch.setattr(ros, "LEAST_PATIENCE", 0.0)
-    seen, elsewhere = ros._look(write(here, bridge={}), None)
+    seen, elsewhere = ros._discover(write(here, bridge={}), None)
     assert seen.level == "ok" and "2 (/far, /near)" in seen.text
     assert elsewhere.level == "warning" and "1 (/far)" in elsewhere.text

@@ -1,4 +1,4 @@
-"""`appliance check`: reads everything that `run` would use, says what it finds, changes nothing."""
+"""`appliance check`: reads everything that `run` would use, reports findings, changes nothing."""
 
 from appliance.ops.check.settings import check
 from appliance.ops.finding import Finding

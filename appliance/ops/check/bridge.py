@@ -1,4 +1,4 @@
-"""What the bridge is told: types, fields, stop messages and limits, held against what is installed.
+"""Checks the bridge's settings: types, fields, stop messages and limits, against what is installed.
 
 Nothing is started, and no ROS has to run: types are imported, or read from their definitions.
 """
@@ -28,19 +28,19 @@ from appliance.ros.topics.rules import CommandRules
 
 
 def bridge(settings: Settings) -> Iterator[Finding]:
-    """What there is to say of the bridge and its routes."""
-    said = settings.bridge
-    if said.bus == "none":
+    """Findings about the bridge and its routes."""
+    section = settings.bridge
+    if section.bus == "none":
         yield Finding("ok", "bridge", "off: a broker alone")
         return
-    is_ros1 = said.bus == "ros1"
+    is_ros1 = section.bus == "ros1"
     is_available, reason = (ros1.available if is_ros1 else ros2.available)()
     if not is_available:
         text = f"{reason}; the broker runs without, and what routes say was not checked here"
         yield Finding("warning", "bridge", text)
     else:
-        called = (*said.services, *said.actions, *said.parameters)
-        routes = sum(not route.is_exclusion for route in (*said.topics, *called))
+        called = (*section.services, *section.actions, *section.parameters)
+        routes = sum(not route.is_exclusion for route in (*section.topics, *called))
         found = ros1.found() if is_ros1 else installation.find()
         yield Finding("ok", "bridge", f"{found}; routes: {routes}")
     if is_ros1:
@@ -58,13 +58,13 @@ def bridge(settings: Settings) -> Iterator[Finding]:
 
 
 def _bus(settings: Settings) -> Iterator[Finding]:
-    """Who else is on it."""
-    said, subject = settings.bridge.discovery, "bridge.discovery"
+    """Findings about which other nodes can be on the bus."""
+    scope, subject = settings.bridge.discovery, "bridge.discovery"
     environment = dict(os.environ)
-    unheeded = discovery.use(said, environment)
-    if unheeded:
-        yield Finding("warning", subject, unheeded)
-    if said == "localhost" or (said == "environment" and discovery.is_local(environment)):
+    ignored = discovery.use(scope, environment)
+    if ignored:
+        yield Finding("warning", subject, ignored)
+    if scope == "localhost" or (scope == "environment" and discovery.is_local(environment)):
         yield Finding("ok", subject, "ROS nodes of this computer only")
     elif discovery.is_secured(environment):
         yield Finding("ok", subject, "ROS nodes that have keys, by SROS 2")
@@ -83,21 +83,21 @@ def _topics(routes: list[TopicSettings]) -> Iterator[Finding]:
             continue
 
         subject = ", ".join(route.names)
-        told = list(_looked_at(subject, type_name, functools.partial(converters.get, type_name)))
-        if not told:  # that there is none would be told by each
-            for look in _looks(route, type_name, converters):
-                told += _looked_at(subject, type_name, look)
-        yield from dict.fromkeys(told)
-        if route.rules is not None and not told:
+        errors = list(_try(subject, type_name, functools.partial(converters.get, type_name)))
+        if not errors:  # without the type, each check would report that it is missing
+            for check in _checks(route, type_name, converters):
+                errors += _try(subject, type_name, check)
+        yield from dict.fromkeys(errors)
+        if route.rules is not None and not errors:
             text = stop_message(route.rules, converters.get(type_name))
             if text:
                 yield Finding("warning", f"route {subject}", text)
 
 
-def _looks(
+def _checks(
     route: TopicSettings, type_name: str, converters: Converters
 ) -> Iterator[Callable[[], object]]:
-    """What raises an error for a mistake in the route, each for one."""
+    """Functions each of which raises an error for one kind of mistake in the route."""
     encoding = ENCODINGS[route.encoding]
     if encoding.serialization is None or route.rules is not None:
         for field in route.fields:
@@ -121,7 +121,7 @@ def _calls(routes: CallRoutes) -> Iterator[Finding]:
         if type_name is None:
             continue
 
-        def look_at_service(
+        def check_service(
             type_name: str = type_name, on_error: str | None = service.on_error
         ) -> None:
             ros2.import_service(type_name)
@@ -131,21 +131,22 @@ def _calls(routes: CallRoutes) -> Iterator[Finding]:
                 except ConversionError as error:
                     raise ConversionError("on_error", str(error)) from None
 
-        yield from _looked_at(", ".join(service.names), type_name, look_at_service)
+        yield from _try(", ".join(service.names), type_name, check_service)
     for action in routes.actions:
         if action.type is not None:
-            look = functools.partial(ros2.import_service, f"{action.type}_SendGoal")
-            yield from _looked_at(", ".join(action.names), action.type, look)
+            check = functools.partial(ros2.import_service, f"{action.type}_SendGoal")
+            yield from _try(", ".join(action.names), action.type, check)
 
 
-def _looked_at(subject: str, type_name: str, look: Callable[[], object]) -> Iterator[Finding]:
+def _try(subject: str, type_name: str, check: Callable[[], object]) -> Iterator[Finding]:
+    """The error of a check as a finding."""
     try:
-        look()
+        check()
     except UnknownTypeError as error:
         package = type_name.partition("/")[0]
-        told = re.sub(rf"({re.escape(type_name)})(_SendGoal)?_Request", r"\1", str(error))
-        text = f"{told}{_did_you_mean(type_name)}"
-        # What is not installed here may be where it runs.
+        problem = re.sub(rf"({re.escape(type_name)})(_SendGoal)?_Request", r"\1", str(error))
+        text = f"{problem}{_did_you_mean(type_name)}"
+        # A package that is not installed here may be installed where the appliance runs.
         is_here = package in ros2.interfaces()
         yield Finding("error" if is_here else "warning", f"route {subject}", text)
     except ConversionError as error:

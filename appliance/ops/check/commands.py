@@ -1,4 +1,4 @@
-"""What of routes to ROS would let the robot drive on, where nobody can have meant it."""
+"""Checks routes to ROS for what would let the robot drive on although nobody can have meant it."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from appliance.ros.payload.converter import ConversionError, Converter
 from appliance.ros.topics.commands import check_rules
 from appliance.ros.topics.rules import CommandRules
 
-#: Messages that are a velocity: the robot drives on with the last one, and zero stops it.
+#: Message types that are a velocity: the robot drives on with the last one until zero stops it.
 _VELOCITIES = {"Twist", "TwistStamped", "AckermannDrive", "AckermannDriveStamped"}
-#: Those of them that say how it gets to its speed, too.
+#: Those of them whose other fields are no velocities: acceleration and steering.
 _BY_SPEED = {"AckermannDrive", "AckermannDriveStamped"}
-#: What the others have fields of, whose numbers are all velocities.
+#: Fields of the others, in which every number is a velocity.
 _TWIST = {"linear", "angular", "twist"}
 _VELOCITY_TOPIC = "cmd_vel"
 
-#: Seconds of a driver's silence, or of a command's age, that are long for a robot that moves.
+#: Seconds of a client's silence, or of a command's age, that are long for a robot that moves.
 _LONG = 10.0
 
 _EXAMPLE = "on_silence: {after: 500 ms}"
 
 
 def commands(settings: Settings) -> Iterator[Finding]:
-    """As far as that can be said without the types."""
+    """Findings about routes that can be made without their message types."""
     for route in settings.bridge.topics:
         if route.is_exclusion or route.to == "mqtt":
             continue
@@ -50,7 +50,7 @@ def commands(settings: Settings) -> Iterator[Finding]:
 
 
 def stop_message(rules: CommandRules, converter: Converter) -> str:
-    """What the route's own limits have against its stop message; empty for nothing."""
+    """Why the route's own limits change or reject its stop message; empty when they do not."""
     if rules.on_silence is None:
         return ""
     try:
@@ -84,10 +84,10 @@ def _long(route: TopicRoute) -> Iterator[tuple[str, float]]:
 
 
 def _driving_stop(route: TopicRoute, stop: object, subject: str) -> Iterator[Finding]:
-    """What is against the stop message of what drives a robot."""
+    """A finding if the stop message of a route that drives the robot is not standstill."""
     name = "" if route.type is None else route.type.rpartition("/")[2]
     if name in _BY_SPEED:
-        # How hard it brakes, and where the wheels point meanwhile, is no motion.
+        # How hard it brakes and where the wheels point is no motion.
         drive = stop.get("drive") if isinstance(stop, dict) and "Stamped" in name else stop
         speed = drive.get("speed") if isinstance(drive, dict) else None
         if _is_motion(speed):
@@ -100,7 +100,7 @@ def _driving_stop(route: TopicRoute, stop: object, subject: str) -> Iterator[Fin
 
 
 def _is_motion(value: object) -> bool:
-    """Whether there is a number in it that is not 0, beside its header."""
+    """Whether the value has a number other than 0, outside of its header."""
     if isinstance(value, dict):
         return any(_is_motion(part) for name, part in value.items() if name != "header")
     if isinstance(value, list):

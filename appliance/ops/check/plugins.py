@@ -1,4 +1,4 @@
-"""Whether a plugin takes the settings that it is given."""
+"""Checks the settings of plugins, with the plugins' own checks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from appliance.plugins import PluginSettingsError, check_plugin_settings
 
 
 def plugin_settings(path: str, settings: Mapping[str, Any]) -> Finding:
-    """What there is to say of a plugin whose module is there."""
+    """A finding about the settings of a plugin that is installed."""
     try:
         check_plugin_settings(path, settings)
     except PluginSettingsError as error:

@@ -1,4 +1,4 @@
-"""What the rules say that nobody can have meant, and who may command what is bridged to ROS."""
+"""Checks the access rules: what nobody can have meant, and who may send to routes to ROS."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from appliance.ops.finding import Finding
 
 _PLACEHOLDER = re.compile(r"\{[^/]*\}|%[A-Za-z]")
 
-#: As many names as anybody reads.
+#: Names in one finding.
 _SHOWN = 5
 
 
 def rights(settings: Settings, acl: Acl, users: list[str] | None) -> Iterator[Finding]:
-    """What there is to say of the rules; `users` is None where the users file cannot be read."""
+    """Findings about the rules; `users` is None when the users file cannot be read."""
     for rule in acl.rules:
-        text = _unmeant(rule)
+        text = _mistake(rule)
         if text:
             yield Finding("warning", f"{rule.file}:{rule.line}", text)
     broker = settings.broker
@@ -31,7 +31,8 @@ def rights(settings: Settings, acl: Acl, users: list[str] | None) -> Iterator[Fi
                 yield _writers(acl, users, route.names[0], route.topic(settings.robot), settings)
 
 
-def _unmeant(rule: Rule) -> str:
+def _mistake(rule: Rule) -> str:
+    """Why a placeholder in the rule's filter has no effect; empty when there is none like that."""
     for level in rule.filter.split("/"):
         if rule.pattern and level in ("%c", "%u"):
             continue
@@ -63,7 +64,7 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
 
 
 def _written(topic: str, robot: str) -> str:
-    """As a line of the file has it, in which the robot's name need not stand."""
+    """The topic as a line of the rules has it, with `{robot}` for the robot's name."""
     return "{robot}" + topic.removeprefix(robot) if topic.startswith(f"{robot}/") else topic
 
 

@@ -1,4 +1,4 @@
-"""What settings name: listeners, users, rules, certificates, store, plugins and the bridge."""
+"""Checks what the settings refer to: listeners, users, rules, certificates, store, plugins."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from appliance.store.inspection import summarise
 
 
 def check(settings: Settings) -> Iterator[Finding]:
-    """Everything there is to say about what these settings name, the good news included."""
+    """Findings about everything that the settings refer to, including those that are ok."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
     parts = [_listeners, _access, _store, _audit, _plugins, bridge]
     if any(listener.tls for listener in settings.broker.listeners):
@@ -37,7 +37,7 @@ def check(settings: Settings) -> Iterator[Finding]:
 
 @contextmanager
 def _warnings() -> Iterator[list[Finding]]:
-    """The warnings that are logged meanwhile, as `run` would log them, as findings."""
+    """Collects warnings that are logged within the block, as findings: `run` would log them too."""
     findings: list[Finding] = []
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: findings.append(  # type: ignore[method-assign]
@@ -100,7 +100,7 @@ def _access(settings: Settings) -> Iterator[Finding]:
         yield Finding("ok", str(broker.acl), f"rules: {len(rules.rules)}")
     if rules is not None:
         yield from rights(settings, rules, users)
-    others = broker.plugins or broker.tls.username_from != "none"  # they may know more
+    others = broker.plugins or broker.tls.username_from != "none"  # these may know more users
     if rules is not None and users is not None and not others:
         strangers = {rule.user: rule for rule in reversed(rules.rules) if rule.user not in users}
         for name, first in strangers.items():
@@ -123,12 +123,12 @@ def _store(settings: Settings) -> Iterator[Finding]:
         yield Finding("ok", str(store.path), "not there yet; the first start makes it")
     else:
         try:
-            kept = summarise(store.path)
+            stored = summarise(store.path)
         except StoreError as error:
             text = f"{error}; what can be read is kept at the next start, the file set aside"
             yield Finding("warning", "broker.store.path", text)
         else:
-            text = f"kept: sessions {len(kept.sessions)}, retained messages {kept.retained}"
+            text = f"kept: sessions {len(stored.sessions)}, retained messages {stored.retained}"
             yield Finding("ok", str(store.path), text)
 
 
@@ -169,7 +169,7 @@ def _certificates(settings: Settings) -> Iterator[Finding]:
 
 
 def _own_authority(path: Path, certificate: x509.Certificate, name: str) -> Iterator[Finding]:
-    """What is to be said of the CA that the clients are given, and of its key."""
+    """Findings about the CA that clients are given, and about its key."""
     try:
         is_issuer = certs.issued_by(certificate, certs.load_certificates(path)[0])
     except certs.CertificateError:

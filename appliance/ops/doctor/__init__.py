@@ -1,1 +1,1 @@
-"""`appliance doctor`: looks at everything that the appliance needs, and says what to do."""
+"""`appliance doctor`: examines everything that the appliance needs, and says what to do."""

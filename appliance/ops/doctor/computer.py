@@ -1,4 +1,4 @@
-"""The computer: its clock, its disk, its memory, how many files may be open."""
+"""Examines the computer: its clock, its disk, its memory, and its limit of open files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from appliance.host.clock import RELEASED, is_unset
 from appliance.net.listeners import OTHER_FILES
 from appliance.ops.finding import Finding
 
-#: What the appliance needs beside `broker.limits.memory`: Python, the libraries, ROS.
+#: Bytes that the appliance needs beside `broker.limits.memory`: Python, the libraries, ROS.
 BASE_MEMORY = 160 << 20
 
-#: Bytes of the disk below which little can be stored, and how many files more there must be room
-#: for: the database has three, the rest is for logs and what others write.
+#: Free bytes and inodes of a disk below which too little can be stored. The database has three
+#: files; the other inodes are for logs and for other programs.
 LEAST_DISK = 64 << 20
 LEAST_FILES = 100
 
@@ -37,7 +37,7 @@ _IN_MEMORY = ("tmpfs", "ramfs")
 
 
 def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Whether the computer knows what time it is, and goes on knowing."""
+    """Whether the clock is set, and whether something keeps it right."""
     now = datetime.now(timezone.utc)
     advice = "timedatectl set-ntp true, or set it by hand: date -s '2026-05-04 12:00'"
     if is_unset(now):
@@ -65,7 +65,7 @@ def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
 
 
 class _Timex(ctypes.Structure):
-    """The first fields of adjtimex(2)'s, and room for the rest."""
+    """The first fields of adjtimex(2)'s structure, and room for the rest."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -79,18 +79,18 @@ class _Timex(ctypes.Structure):
 
 
 def is_synchronised() -> bool | None:
-    """Whether something keeps the clock right, as the kernel was told; None when it cannot say."""
-    told = _Timex()
-    if ctypes.CDLL(None).adjtimex(ctypes.byref(told)) < 0:
+    """Whether the kernel says that the clock is synchronised; None when it cannot say."""
+    timex = _Timex()
+    if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) < 0:
         return None
-    return not told.status & _UNSYNCHRONISED
+    return not timex.status & _UNSYNCHRONISED
 
 
 # --- the disk ------------------------------------------------------------------------------------
 
 
 def disk(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Room for what is stored and logged."""
+    """Whether the disks have room for the store and the audit log."""
     store = settings.broker.store
     places = [("store", store.path, store.size)] if store.durability != "off" else []
     audit = settings.broker.audit
@@ -137,12 +137,12 @@ def _kind(folder: Path) -> str:
 
 
 def memory(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Whether there is what `broker.limits.memory` allows."""
+    """Whether there is as much memory as `broker.limits.memory` allows the broker to use."""
     wanted = settings.broker.limits.memory + BASE_MEMORY
     share = f"{format_size(settings.broker.limits.memory)} of broker.limits.memory"
     available = int(psutil.virtual_memory().available)
     if running is not None:
-        available += running["memory"]["process"]  # it has its own already
+        available += running["memory"]["process"]  # which is a part of what it needs
     text = f"{available // _MIB} MiB available; the appliance may use {wanted // _MIB} ({share})"
     if available < wanted:
         yield Finding("warning", "memory", text, "a smaller broker.limits.memory")
@@ -161,7 +161,7 @@ def memory(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findi
 
 
 def group_limit(pid: int, root: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes that the control groups of a process may use; None for no limit, or none known."""
+    """The least memory limit of the control groups of a process; None when there is none."""
     limits = []
     for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
@@ -181,7 +181,7 @@ def group_limit(pid: int, root: Path = Path("/sys/fs/cgroup")) -> int | None:
 
 
 def files(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Whether as many files may be open as there may be connections."""
+    """Whether the process may open as many files as there may be connections."""
     wanted = settings.broker.limits.connections + OTHER_FILES
     if running is not None:
         hard = _limit_of(running["pid"])
@@ -200,7 +200,7 @@ def files(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
 
 
 def _limit_of(pid: int) -> int:
-    """The hard limit of another process, which only its user and root may ask the kernel for."""
+    """The hard limit of another process, from a file that only its user and root may read."""
     for line in Path(f"/proc/{pid}/limits").read_text().splitlines():
         if line.startswith("Max open files"):
             hard = line.split()[4]

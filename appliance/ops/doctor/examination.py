@@ -1,4 +1,4 @@
-"""All that `appliance doctor` looks at, in its order."""
+"""All that `appliance doctor` examines, in its order."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from appliance.ops.doctor.secrets import certificates, permissions
 from appliance.ops.finding import Finding
 from appliance.ros.ros2.fastdds import LOST_IN_ROS
 
-#: Seconds that the running appliance has to answer.
+#: Seconds that the running appliance has to respond.
 PATIENCE = 5.0
 
-#: Says what it finds, given the settings and what the running appliance says of itself.
+#: A part of the examination; it is given the settings and the status of the running appliance.
 Part: TypeAlias = Callable[[Settings, "dict[str, Any] | None"], Iterator[Finding]]
 
 
 def examine(path: Path | None) -> Iterator[Finding]:
-    """Look at everything, and change nothing; the configuration may be missing or broken.
+    """Examine everything and change nothing; the configuration may be missing or invalid.
 
-    What takes longest comes last, so that each finding can be told as it is made.
+    What takes longest comes last, because each finding is shown as soon as it is made.
     """
     try:
         settings = config.load(path)
@@ -56,16 +56,16 @@ def examine(path: Path | None) -> Iterator[Finding]:
         try:
             yield from part(known, running)
         except Exception as error:
-            # What a computer is like nobody knows: the other parts have their say all the same.
-            text = f"could not be looked at: {type(error).__name__}: {error}"
+            # Computers differ in ways that nobody foresees; the other parts still run.
+            text = f"could not be examined: {type(error).__name__}: {error}"
             yield Finding("warning", part.__name__, text)
 
 
-def _running(told: dict[str, Any]) -> Iterator[Finding]:
-    text = f"{told['version']} is running, pid {told['pid']}, {told['clients']} clients"
+def _running(status: dict[str, Any]) -> Iterator[Finding]:
+    text = f"{status['version']} is running, pid {status['pid']}, {status['clients']} clients"
     yield Finding("ok", "appliance", text)
-    for warning in told["warnings"]:
+    for warning in status["warnings"]:
         yield Finding("warning", "appliance", warning)
-    for sick in told["routes"]["sick"]:
+    for sick in status["routes"]["sick"]:
         advice = LOST_IN_ROS if sick["lost"] else ""
         yield Finding("warning", f"route {sick['route']}", sick["problem"], advice)

@@ -1,4 +1,4 @@
-"""Where the appliance listens, or is to: free, ours, or taken by whom."""
+"""Examines the addresses of all listeners: whether they are free, or which program uses them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ANY = ("", "0.0.0.0", "::", "*")
 
 
 def ports(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Every listener; `running` is what the running appliance says of itself."""
+    """Findings about every listener; `running` is the status of the running appliance."""
     pid = None if running is None else int(running["pid"])
     listening = list(_listening())
     for listener in settings.broker.listeners:
@@ -34,7 +34,7 @@ def ports(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
 
 
 def _is_for_root(settings: Settings) -> bool:
-    """Whether root runs the appliance: the configuration of a service is its user's."""
+    """Whether the appliance runs as root: a service's configuration belongs to its own user."""
     if os.geteuid() != 0:
         return False
     file = settings.file
@@ -110,14 +110,14 @@ def _socket(subject: str, path: Path, running: dict[str, Any] | None) -> Finding
 
 
 def _listening() -> Iterator[tuple[str, int, int | None]]:
-    """Host, port and process of all TCP sockets that listen; None for one of another user."""
+    """Host, port and pid of all listening TCP sockets; the pid is None for those of other users."""
     for connection in psutil.net_connections("tcp"):
         if connection.status == psutil.CONN_LISTEN:
             yield connection.laddr.ip, connection.laddr.port, connection.pid
 
 
 def _is_here(host: str) -> bool:
-    """Whether that is an address of this computer; a name is taken for one."""
+    """Whether that is an address of this computer; host names are assumed to be."""
     if host in _ANY:
         return True
     try:

@@ -1,4 +1,4 @@
-"""ROS: which there is, and whether its nodes are seen from here."""
+"""Examines ROS: which ROS there is, and whether its nodes can be discovered from here."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from appliance.ros.ros2 import discovery, fastdds, installation
 from appliance.ros.ros2.discovery import OPEN, OPEN_ADVICE, TWIN, TWIN_ADVICE
 from appliance.ros.ros2.node import Ros2Node, available
 
-#: Seconds in which other nodes are looked for: most are seen in a tenth of one, some take three.
+#: Seconds for discovering other nodes: most are found in a tenth of a second, some take three.
 PATIENCE = 5.0
-#: The least, when some have been seen: how many there are is still to be said.
+#: Seconds to continue after the first node was found, to find the others.
 LEAST_PATIENCE = 1.0
 
-#: Where Fast DDS puts what nodes of one computer tell each other, and the least that it needs.
+#: Where Fast DDS exchanges messages between nodes of one computer, and the free bytes it needs.
 SHARED_MEMORY = Path("/dev/shm")
 LEAST_SHARED_MEMORY = 40 << 20
 
-#: The group that DDS finds its participants by, and seconds until what was sent has come.
+#: The multicast group of DDS discovery, and seconds to wait for a datagram to arrive.
 MULTICAST = "239.255.0.1"
 MULTICAST_PATIENCE = 0.5
 
 NODE = "appliance_doctor"
 
-#: Variables by which nodes find each other, or do not.
+#: Environment variables that affect discovery.
 _DISCOVERY = (
     "RMW_IMPLEMENTATION",
     "ROS_DOMAIN_ID",
@@ -49,7 +49,7 @@ _DISCOVERY = (
     "CYCLONEDDS_URI",
 )
 
-#: Topics that say nothing of what there is.
+#: Topics that every node has.
 _OF_EVERY_NODE = {"/parameter_events", "/rosout"}
 
 _MIB = 1 << 20
@@ -67,22 +67,22 @@ def ros(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]
     if adopted:
         text = f"as the appliance has it: {', '.join(adopted)}"
         yield Finding("ok", "ROS environment", text)
-    unheeded = discovery.use(settings.bridge.discovery, os.environ)
-    if unheeded:
-        yield Finding("warning", "ROS environment", unheeded)
+    ignored = discovery.use(settings.bridge.discovery, os.environ)
+    if ignored:
+        yield Finding("warning", "ROS environment", ignored)
     yield which_ros(is_needed=_has_routes(settings))
     yield from _discovery(settings)
     yield from shared_memory()
     yield from _networks()
     is_available, _ = available()
     if is_available:
-        yield from _look(settings, running)
+        yield from _discover(settings, running)
 
 
 def adopt_environment(settings: Settings, running: dict[str, Any] | None) -> list[str]:
-    """Take over what decides whom the appliance's node can see; returns it, as far as it differs.
+    """Set the variables that affect discovery as the appliance has them; returns what differed.
 
-    A root's shell has neither the service's variables nor, after `sudo`, those of its own user.
+    A root shell has neither the service's variables nor, after `sudo`, those of the user.
     """
     theirs: dict[str, str] = {}
     if running is None:
@@ -124,13 +124,13 @@ def which_ros(is_needed: bool) -> Finding:
 
 
 def _discovery(settings: Settings) -> Iterator[Finding]:
-    """By what nodes find each other, as far as settings say it."""
+    """Findings about discovery, from settings and environment variables."""
     environment = os.environ
     rmw = environment.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"
     domain = settings.bridge.domain_id
-    said = "bridge.domain_id" if domain is not None else "ROS_DOMAIN_ID"
+    source = "bridge.domain_id" if domain is not None else "ROS_DOMAIN_ID"
     number = str(domain) if domain is not None else environment.get("ROS_DOMAIN_ID") or "0"
-    text = f"{rmw}, domain {number} ({said}), {_range(environment)}"
+    text = f"{rmw}, domain {number} ({source}), {_range(environment)}"
     if not number.isdigit() or int(number) > 232:
         yield Finding("error", "ROS network", text, "a domain is a number from 0 to 232")
     elif int(number) > 101:
@@ -167,7 +167,7 @@ def shared_memory(folder: Path = SHARED_MEMORY) -> Iterator[Finding]:
 
 
 def _networks() -> Iterator[Finding]:
-    """Whether there are networks that carry what DDS sends to find others."""
+    """Findings about networks: whether they carry the multicast of DDS discovery."""
     states = psutil.net_if_stats()
     up = [name for name in states if states[name].isup]
     if "lo" in states and "lo" not in up:
@@ -191,33 +191,33 @@ def _networks() -> Iterator[Finding]:
 
 
 def _carries_multicast(address: str) -> bool:
-    """Whether what is sent to a group there comes back; nothing leaves this computer."""
+    """Whether a multicast datagram on that interface comes back; nothing leaves this computer."""
     own = socket.inet_aton(address)
     with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as hear,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speak,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
         suppress(OSError),
     ):
-        hear.bind(("", 0))
+        receiver.bind(("", 0))
         group = socket.inet_aton(MULTICAST) + own
-        hear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
-        hear.settimeout(MULTICAST_PATIENCE)
-        speak.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, own)
-        speak.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-        speak.sendto(b"appliance doctor", (MULTICAST, hear.getsockname()[1]))
-        return hear.recv(64) == b"appliance doctor"
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+        receiver.settimeout(MULTICAST_PATIENCE)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, own)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        sender.sendto(b"appliance doctor", (MULTICAST, receiver.getsockname()[1]))
+        return receiver.recv(64) == b"appliance doctor"
     return False
 
 
-def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """Be a node for a moment, and see who else is there."""
+def _discover(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
+    """Join as a node for a moment, and report which other nodes it discovers."""
     bridge = settings.bridge
     node = Ros2Node(NODE, bridge.namespace, bridge.domain_id)
     ours = None
     if running is not None and running["ros"].get("state") == "joined":
         ours = running["ros"]["node"]
-    seen = _Seen(node, ours)
-    node.start(seen.look, seen.failed)
+    seen = _Discovered(node, ours)
+    node.start(seen.update, seen.failed)
     try:
         seen.wait()
     finally:
@@ -251,23 +251,23 @@ def _look(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         yield Finding("warning", subject, text, OPEN_ADVICE)
 
 
-class _Seen:
-    """What a node sees; `look` and `failed` are called on its thread."""
+class _Discovered:
+    """What a node has discovered; `update` and `failed` are called on its thread."""
 
     def __init__(self, node: Ros2Node, ours: str | None) -> None:
-        """`ours` is the running appliance's node, which is waited for beside others."""
+        """`ours` is the running appliance's node, for which `wait` waits as well as for others."""
         self.nodes: set[str] = set()
         self.topics: set[str] = set()
-        #: Those of them on other computers.
+        #: Nodes on other computers or in containers.
         self.elsewhere: set[str] = set()
-        #: Whether there is another node that is called as the running appliance's.
+        #: Whether another node has the name of the running appliance's.
         self.has_twin = False
         self.problem = ""
         self._node = node
         self._ours = ours
         self._is_done = threading.Event()
 
-    def look(self) -> None:
+    def update(self) -> None:
         names = self._node.nodes()
         self.nodes = {name for name in names if name != self._node.name}
         self.has_twin = self._ours is not None and names.count(self._ours) > 1
@@ -281,6 +281,6 @@ class _Seen:
         self._is_done.set()
 
     def wait(self) -> None:
-        """Until somebody was seen, and a while longer for the rest."""
+        """Wait until a node was discovered, and a while longer for the others."""
         if self._is_done.wait(PATIENCE) and not self.problem:
             threading.Event().wait(LEAST_PATIENCE)

@@ -1,4 +1,4 @@
-"""ROS 1: which there is, whether its Master answers, and whose nodes that knows."""
+"""Examines ROS 1: which one there is, whether its Master responds, and which nodes that knows."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from appliance.ros.ros1.peers import Master
 
 NODE = "/appliance_doctor"
 
-#: The Master's own node, which is there whenever roscore is.
+#: The node that runs whenever roscore does.
 _ROSOUT = "/rosout"
 
 
 def ros1(running: dict[str, Any] | None, *, is_needed: bool) -> Iterator[Finding]:
-    """Without ROS 1, or its Master, the broker works alone: where routes need it is a problem."""
+    """Findings about ROS 1. Without it the broker works alone: with routes that is an error."""
     missing: Level = "error" if is_needed else "warning"
     is_available, reason = available()
     if not is_available:
@@ -32,7 +32,7 @@ def ros1(running: dict[str, Any] | None, *, is_needed: bool) -> Iterator[Finding
         python = f"{sys.version_info[0]}.{sys.version_info[1]}"
         yield Finding("ok", "ROS", f"{found()} (Python {python})")
     uri = master_uri()
-    said = "ROS_MASTER_URI" if os.environ.get("ROS_MASTER_URI") else "ROS_MASTER_URI is not set"
+    source = "ROS_MASTER_URI" if os.environ.get("ROS_MASTER_URI") else "ROS_MASTER_URI is not set"
     yield _address(uri)
     master = Master(uri, NODE)
     try:
@@ -41,14 +41,14 @@ def ros1(running: dict[str, Any] | None, *, is_needed: bool) -> Iterator[Finding
         advice = (
             "start roscore; if it is running, ROS_MASTER_URI is to say where: http://robot:11311"
         )
-        yield Finding(missing, "ROS Master", f"it does not answer: {error} ({said})", advice)
+        yield Finding(missing, "ROS Master", f"it does not answer: {error} ({source})", advice)
         return
-    yield Finding("ok", "ROS Master", f"{uri} answers ({said})")
+    yield Finding("ok", "ROS Master", f"{uri} answers ({source})")
     yield _nodes(graph, running)
 
 
 def _address(uri: str) -> Finding:
-    """The address that other nodes are told of this computer's."""
+    """A finding about the address that this computer announces to other nodes."""
     subject = "ROS network"
     variable = next((name for name in ("ROS_HOSTNAME", "ROS_IP") if os.environ.get(name)), "")
     own = os.environ[variable] if variable else socket.gethostname()
@@ -74,7 +74,7 @@ def _resolve(host: str) -> list[ipaddress.IPv4Address | ipaddress.IPv6Address]:
 
 
 def _nodes(graph: list[dict[str, list[str]]], running: dict[str, Any] | None) -> Finding:
-    """Who is there beside us, as the Master knows it."""
+    """A finding about the other nodes that the Master knows."""
     subject = "ROS nodes"
     nodes = {node for part in graph for nodes in part.values() for node in nodes}
     ours = None

@@ -1,4 +1,4 @@
-"""Keys, passwords and certificates: who can read them, and how long they are good for."""
+"""Examines keys, passwords and certificates: who can read them, and when they expire."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def permissions(settings: Settings, running: dict[str, Any] | None) -> Iterator[
         try:
             state = path.stat()
         except OSError:
-            continue  # missing ones are for `check` to tell
+            continue  # `check` reports missing files
         if state.st_mode & bits and not state.st_mode & 0o1000:
             found = True
             mode = f"mode {state.st_mode & 0o777:04o}"
@@ -49,7 +49,7 @@ def permissions(settings: Settings, running: dict[str, Any] | None) -> Iterator[
 
 
 def certificates(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
-    """How many days certificates and the revocation list are good for."""
+    """Findings about the expiry of certificates and of the revocation list."""
     files = tls_files(settings.broker)
     if not any(listener.tls for listener in settings.broker.listeners):
         return
