@@ -191,7 +191,7 @@ def test_big_endian() -> None:
         WideString(),
     ],
 )
-def test_a_count_that_lies(type_, count: str) -> None:
+def test_a_false_count_is_refused(type_, count: str) -> None:
     with pytest.raises(ConversionError, match=r"^data: truncated: it says to have"):
         of(type_).to_json(cdr(f"00 01 00 00 {count} 00 00 00 00"))
 
@@ -208,7 +208,7 @@ def _three(type_) -> bytes:
     return b'"","",""' if isinstance(type_, String) else b"{},{},{}" if type_ is EMPTY else b"1,2,3"
 
 
-def test_strings_as_they_come() -> None:
+def test_strings_that_are_not_well_formed() -> None:
     converter = of(String())
     # Without NUL; without anything; not UTF-8: as rclpy reads them.
     assert converter.to_json(cdr("00 01 00 00 03 00 00 00 61 62 63")) == b'{"data":"abc"}'
@@ -506,7 +506,7 @@ def test_hostile_json_is_quoted_short() -> None:
     )
 
 
-def test_python_values_that_are_none_of_json() -> None:
+def test_python_values_beyond_json() -> None:
     for type_, value in (
         (PRIMITIVES["int32"], 10**5000),
         (FLOAT64, 10**400),
@@ -617,7 +617,7 @@ def test_a_converter_is_compiled_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "1a", "a b", "a'", "a\n", "a\nb", "_a", "é", "a.b"])
-def test_a_field_that_is_no_name(name: str) -> None:
+def test_a_field_whose_name_is_no_identifier(name: str) -> None:
     """Names become part of generated code: nothing but a name may."""
     with pytest.raises(UnknownTypeError):
         Field(name, FLOAT64)
@@ -668,7 +668,7 @@ def test_a_field_that_ros_cannot_carry() -> None:
 # What is large, and what is handed on
 
 
-def test_cdr_is_handed_on_without_its_options():
+def test_checked_cdr_has_no_options():
     converter = Converters(load_description).get("std_msgs/msg/Float64")
     value = struct.pack("<d", 1.5)
     assert converter.checked(b"\0\1\0\3" + value) == b"\0\1\0\0" + value
@@ -690,7 +690,7 @@ def test_a_large_payload_must_be_exact():
         converter.from_json(b'{"poses":[' + b"{}," * 100_000 + b"{}]}")
 
 
-def test_text_that_rclpy_cannot_read_is_not_handed_on_in_cdr():
+def test_checked_cdr_has_no_text_that_rclpy_cannot_read():
     converter = Converters(load_description).get("test_msgs/msg/WStrings")
     cdr = converter.from_json(b'{"wstring_value": "ab"}')
     lone = cdr.replace(b"b\0\0\0", b"\x00\xd8\0\0", 1)
@@ -699,7 +699,7 @@ def test_text_that_rclpy_cannot_read_is_not_handed_on_in_cdr():
         converter.checked(lone)
 
 
-def test_text_in_cdr_keeps_to_its_bound():
+def test_checked_cdr_has_no_text_beyond_its_bound():
     converters = Converters(load_description)
     cdr = b"\0\1\0\0" + struct.pack("<I24s", 24, b"x" * 23)
     bounded = compile_converter(TypeDescription("a/msg/B", (Field("data", String(22)),)))
@@ -724,7 +724,7 @@ def test_what_can_make_messages_large(bulk, types):
     assert {converters.bulk(name.replace("/", "/msg/")) for name in types} == {bulk}
 
 
-def test_a_type_name_does_not_get_just_anything_imported(tmp_path, monkeypatch):
+def test_a_type_name_imports_only_message_packages(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "broken_msgs" / "msg").mkdir(parents=True)
     (tmp_path / "broken_msgs" / "msg" / "__init__.py").write_text("1 / 0")

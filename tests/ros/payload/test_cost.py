@@ -1,4 +1,4 @@
-"""What a message for ROS weighs, before it is decoded; and that nothing light is much work."""
+"""The cost of a message for ROS before it is decoded, and that cheap messages are little work."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ MAP = "nav_msgs/msg/OccupancyGrid"
 MOST = 0.2
 
 
-def weight(value, text=lambda text: 0):
+def cost(value, text=lambda text: 0):
     """The same, by definition."""
     if isinstance(value, dict):
         names = sum(1 + text(name) for name in value)
-        return CONTAINER_COST + names + sum(weight(item, text) for item in value.values())
+        return CONTAINER_COST + names + sum(cost(item, text) for item in value.values())
     if isinstance(value, list):
-        return CONTAINER_COST + sum(weight(item, text) for item in value)
+        return CONTAINER_COST + sum(cost(item, text) for item in value)
     if isinstance(value, str):
         return CONTAINER_COST + text(value)
     if isinstance(value, bytes):
         return CONTAINER_COST
     if isinstance(value, cbor2.CBORTag):
-        return TAG_COST + weight(value.value, text)
+        return TAG_COST + cost(value.value, text)
     return 1
 
 
@@ -78,19 +78,19 @@ for_cbor = st.recursive(
 
 
 @given(plain, st.integers(0, 2000))
-def test_json_weighs_what_is_in_it(value, most):
+def test_json_cost_counts_the_items(value, most):
     """Within 1 for each list and object: commas are counted, one less than there are values."""
     payload = json.dumps(value).encode()
-    exactly, near = weight(value), containers(value) + 1
+    exactly, near = cost(value), containers(value) + 1
     found = json_cost(payload, most)
     assert (found <= most) or exactly + near > most
     assert (found > most) or exactly - near <= most
 
 
 @given(for_cbor, st.integers(0, 2000))
-def test_cbor_weighs_what_is_in_it(value, most):
+def test_cbor_cost_counts_the_items(value, most):
     payload = cbor2.dumps(value)
-    exactly = weight(value, lambda text: len(text.encode()) // TEXT_BYTES_PER_ITEM)
+    exactly = cost(value, lambda text: len(text.encode()) // TEXT_BYTES_PER_ITEM)
     assert _walk_cbor(payload, 1 << 40) == exactly
     found = cbor_cost(payload, most)
     assert (found <= most) == (exactly <= most) or len(payload) * (
@@ -125,14 +125,14 @@ def test_cbor_of_every_form(payload, exactly):
     assert found == exactly
 
 
-def test_what_is_too_deep_is_no_message():
+def test_payloads_nested_too_deep_are_refused():
     unpack = unpacker(CONVERTERS.get(SEQUENCES), "cbor", "none", InputLimits())
     with pytest.raises(ConversionError, match="depth"):
         unpack(b"\x81" * 50_000 + b"\x00")
 
 
 def whole(field, items):
-    """All fields, so that the fast way is taken."""
+    """A value with all fields, which generated code converts."""
     converter = CONVERTERS.get(SEQUENCES)
     return converter.to_dict(converter.from_dict({})) | {field: items}
 
@@ -152,7 +152,7 @@ FIELDS = {
 
 
 def payloads():
-    """1 MiB, or 64 KiB of what is left out, of each shape."""
+    """Payloads of 1 MiB with all fields, and of 60 kB with missing ones, of each shape."""
     for field, of in FIELDS.items():
         one = item(field) if of is None else of
         for size, make in ((MIB, whole), (60_000, lambda name, items: {name: items})):
@@ -198,7 +198,7 @@ PAYLOADS = {name: (encoding, payload) for name, encoding, payload in payloads()}
 
 
 @pytest.mark.parametrize("name", PAYLOADS)
-def test_no_message_is_much_work(name):
+def test_the_costliest_payloads_are_converted_in_time(name):
     """1 MiB of the worst took 0.5 s of all others' time; typed arrays and decoded lists 0.7 s."""
     encoding, payload = PAYLOADS[name]
     unpack = unpacker(CONVERTERS.get(SEQUENCES), encoding, "none", InputLimits())
@@ -214,7 +214,7 @@ def test_no_message_is_much_work(name):
 @pytest.mark.parametrize(
     "name", [name for name in PAYLOADS if "60000" not in name and "pieces" not in name]
 )
-def test_what_is_much_work_is_refused_as_such(name):
+def test_payloads_over_the_limit_of_items_are_refused(name):
     encoding, payload = PAYLOADS[name]
     unpack = unpacker(CONVERTERS.get(SEQUENCES), encoding, "none", InputLimits())
     if name == "json commas in a text":
@@ -237,7 +237,7 @@ def test_large_maps_pass_in_every_encoding_that_copies_them():
         assert thread_time() - begun < MOST
 
 
-def test_typed_arrays_go_where_they_fit_and_where_they_can_be_converted():
+def test_typed_arrays_fill_fields_of_their_own_and_of_convertible_types():
     converter = CONVERTERS.get(SEQUENCES)
     tags = {"float64": (86, "d"), "float32": (85, "f"), "int16": (77, "h"), "uint8": (64, "B")}
     for name, (tag, code) in tags.items():
@@ -254,7 +254,7 @@ def test_typed_arrays_go_where_they_fit_and_where_they_can_be_converted():
                     assert from_cbor(converter, each) == expected, (name, field)
 
 
-def test_what_is_left_out_counts_too():
+def test_the_defaults_of_missing_fields_count():
     """A few bytes can stand for a large message: 20,000 empty objects took 0.1 s."""
     converter = CONVERTERS.get(SEQUENCES)
     with pytest.raises(TooLargeError, match=r"bridge\.limits\.items"):
@@ -262,7 +262,7 @@ def test_what_is_left_out_counts_too():
     converter.from_json(json.dumps({"basic_types_values": [{}] * 1000}).encode())
 
 
-def test_the_limit_is_the_user_s():
+def test_the_limit_of_items_is_configured():
     many = json.dumps(whole("string_values", ["a"] * 20_000)).encode()
     cdr = CONVERTERS.get(SEQUENCES)._encode(whole("string_values", ["a"] * 20_000))
     for encoding, payload in (("json", many), ("cdr", cdr)):

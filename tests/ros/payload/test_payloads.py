@@ -94,7 +94,7 @@ def test_typed_arrays_of_any_kind_are_taken(tag, code):
         (cbor2.dumps({"position": cbor2.CBORTag(86, [1])}), "not a byte string"),
     ],
 )
-def test_what_is_no_cbor_of_a_message_is_refused(payload, problem):
+def test_malformed_cbor_is_refused(payload, problem):
     with pytest.raises(ConversionError, match=problem):
         from_cbor(CONVERTERS.get(JOINTS), payload)
 
@@ -115,13 +115,13 @@ def test_what_is_no_cbor_of_a_message_is_refused(payload, problem):
         ([], ""),
     ],
 )
-def test_what_cbor_gets_wrong_is_named_by_its_path(value, path):
+def test_wrong_cbor_is_refused_with_the_path_of_the_field(value, path):
     with pytest.raises(ConversionError) as caught:
         from_cbor(CONVERTERS.get(ODOMETRY), cbor2.dumps(value))
     assert caught.value.path == path
 
 
-def test_cbor_decodes_no_more_than_it_is_given():
+def test_cbor_does_not_allocate_more_than_it_is_given():
     """Ten levels of references, each to ten of the level below, would be 10^10 items."""
     level = cbor2.dumps([1] * 10)
     for _ in range(9):
@@ -134,7 +134,7 @@ def test_cbor_decodes_no_more_than_it_is_given():
 
 
 @pytest.mark.parametrize("path", ["speed", "pose.pose.positions", "pose.covariance.x", "pose."])
-def test_a_field_that_there_is_not_is_refused_with_what_there_is(path):
+def test_an_unknown_field_is_refused_with_the_known_ones(path):
     with pytest.raises(UnknownTypeError, match="has no field"):
         select(load_description(ODOMETRY), [path])
 
@@ -162,7 +162,7 @@ async def test_a_wrong_field_leaves_the_topic_unbridged_and_says_why(harness):
 # pictures
 
 
-async def test_a_picture_goes_as_it_is_with_its_content_type(harness):
+async def test_a_picture_is_its_bytes_with_its_content_type(harness):
     harness.start(both("/camera", type=PICTURE, encoding="binary", keep=2))
     peer = harness.node.add_publisher("/camera", PICTURE)
     other = harness.node.add_subscriber("/camera", PICTURE)
@@ -209,7 +209,7 @@ async def test_compressed_both_ways(harness):
 
 
 @pytest.mark.parametrize("has_size", [True, False])
-def test_a_bomb_is_not_set_off(has_size):
+def test_a_decompression_bomb_is_refused(has_size):
     bomb = zstandard.ZstdCompressor(write_content_size=has_size).compress(bytes(50_000_000))
     assert len(bomb) < 5000
     unpack = unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(1_000_000))
@@ -227,7 +227,7 @@ def test_a_bomb_is_not_set_off(has_size):
         b"\x28\xb5\x2f\xfd" + b"\xff" * 40,
     ],
 )
-def test_what_is_no_zstd_is_refused(payload):
+def test_malformed_zstd_is_refused(payload):
     with pytest.raises(ConversionError):
         unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(1000))(payload)
 
@@ -255,7 +255,7 @@ def test_every_encoding_can_be_compressed(encoding):
         (b"\xa0", {Property.CONTENT_TYPE: "application/cbor"}, "the route takes json"),
     ],
 )
-async def test_what_says_to_be_something_else_does_not_reach_ros(
+async def test_a_payload_of_another_declared_type_does_not_reach_ros(
     harness, payload, properties, problem
 ):
     harness.start(to_ros("/chatter", type=STRING))
@@ -300,7 +300,7 @@ def test_the_schema_of_every_field():
         ("test_msgs/msg/BoundedPlainSequences", {"bool_values": [True] * 3}),
     ],
 )
-def test_a_schema_agrees_with_what_is_taken(type_name, value):
+def test_a_schema_agrees_with_what_the_converter_accepts(type_name, value):
     jsonschema = pytest.importorskip("jsonschema")
     converter = CONVERTERS.get(type_name)
     is_valid = jsonschema.Draft202012Validator(json_schema(converter.description)).is_valid(value)
@@ -312,7 +312,7 @@ def test_a_schema_agrees_with_what_is_taken(type_name, value):
         assert is_valid
 
 
-async def test_schemas_of_what_is_bridged_are_retained(harness):
+async def test_schemas_of_bridged_types_are_retained(harness):
     harness.start(to_ros("/chatter", type=STRING), to_ros("/cmd_vel", type=TWIST))
     await harness.settle()
     retained = harness.broker.retained
@@ -328,14 +328,14 @@ async def test_schemas_of_what_is_bridged_are_retained(harness):
 
 
 @pytest.mark.parametrize("name", ["routes", "skipped"])
-async def test_what_is_told_as_json_says_so(harness, name):
+async def test_json_of_the_bridge_has_its_content_type(harness, name):
     harness.start(to_ros("/chatter", type=STRING))
     await harness.settle()
     message = harness.broker.retained.get(f"r2d2/_appliance/{name}")
     assert message.properties == {Property.CONTENT_TYPE: "application/json"}
 
 
-async def test_schemas_from_before_a_crash_are_taken_back(harness):
+async def test_schemas_retained_before_a_crash_are_cleared(harness):
     topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
     harness.client.send(topic, b"{}", retain=True)
     harness.start(to_ros("/chatter", type=STRING))
@@ -347,7 +347,7 @@ async def test_schemas_from_before_a_crash_are_taken_back(harness):
 # the budget
 
 
-async def test_a_budget_of_bytes_is_kept_to(harness, monkeypatch):
+async def test_bytes_per_second_are_limited(harness, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("appliance.ros.topics.to_mqtt.monotonic", lambda: now[0])
     harness.start(to_mqtt("/chatter", encoding="cdr", bytes_per_second=10_000, keep=1000))
@@ -362,7 +362,7 @@ async def test_a_budget_of_bytes_is_kept_to(harness, monkeypatch):
     assert harness.status().throttled == 500 - len(harness.client.payloads("r2d2/chatter"))
 
 
-def test_what_is_too_large_is_not_converted():
+def test_payloads_over_the_size_limit_are_not_converted():
     text = unpacker(CONVERTERS.get(STRING), "json", "none", InputLimits(100))
     assert text(b'{"data": "x"}' + b" " * 87) == string("x")
     with pytest.raises(ConversionError, match=r"it has 101 bytes, at most 100 .*limits.payload"):
@@ -372,7 +372,7 @@ def test_what_is_too_large_is_not_converted():
         unpacker(CONVERTERS.get(STRING), "json", "zstd", InputLimits(100))(small)
 
 
-async def test_what_takes_long_ends_the_turn_of_its_sender(harness):
+async def test_a_slow_conversion_ends_the_turn_of_its_sender(harness):
     """However few bytes it is: others are served in between."""
     harness.start(both("/chatter", type=STRING, compression="zstd"))
     counters = harness.broker.counters

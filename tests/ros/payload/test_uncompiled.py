@@ -85,7 +85,7 @@ def test_a_name_is_no_path(workspace, name):
     assert uncompiled.find_definition(name) is None
 
 
-def test_calls_say_why_they_cannot_be(workspace, tmp_path):
+def test_calls_need_compiled_support_and_say_so(workspace, tmp_path):
     folder = tmp_path / "share/rover_msgs/srv"
     folder.mkdir(parents=True)
     (folder / "Park.srv").write_text("---\nbool parked\n")

@@ -74,7 +74,7 @@ def test_many_messages_come_in_order_and_none_is_lost(
         assert found == [str(number) for number in range(499)]
 
 
-def test_what_is_latched_is_retained(robot: Node, appliance: Ros1Appliance) -> None:
+def test_messages_of_latched_publishers_are_retained(robot: Node, appliance: Ros1Appliance) -> None:
     def is_retained() -> bool:
         with Mqtt(appliance, "r2d2/robot/map") as client:
             message = client.next("r2d2/robot/map")
@@ -97,7 +97,7 @@ def test_a_type_that_is_installed_nowhere(robot: Node, appliance: Ros1Appliance)
         assert json.loads(client.next(schema).payload)["title"] == "own_msgs/msg/Own"
 
 
-def test_ros_bytes_as_they_are_and_no_echo(robot: Node, appliance: Ros1Appliance) -> None:
+def test_ros1_encoding_passes_bytes_without_an_echo(robot: Node, appliance: Ros1Appliance) -> None:
     data = bytes.fromhex(str(robot.do("bytes", "/raw/text", "std_msgs/String", "a\0b é")))
     assert data == b"\x06\0\0\0a\0b \xc3\xa9"
     with Mqtt(appliance, "r2d2/raw/text", "r2d2/both") as client:
@@ -131,7 +131,7 @@ def test_ros_bytes_as_they_are_and_no_echo(robot: Node, appliance: Ros1Appliance
     appliance.wait_for_log("r2d2/both → /both: a message cannot be converted: data: truncated")
 
 
-def test_commands_are_held_to_their_rules(robot: Node, appliance: Ros1Appliance) -> None:
+def test_commands_follow_the_rules_of_their_route(robot: Node, appliance: Ros1Appliance) -> None:
     robot.do("hear", "/cmd_vel", "geometry_msgs/Twist")
     with Mqtt(appliance) as driver, Mqtt(appliance) as other:
 

@@ -58,7 +58,7 @@ def test_a_service_that_fails_stays(robot: Node, appliance: Ros1Appliance) -> No
     assert len(appliance.wait_for_log("/robot/fail can be called")) == 1
 
 
-def test_what_is_too_large_goes_nowhere(robot: Node, appliance: Ros1Appliance) -> None:
+def test_payloads_over_the_size_limit_are_refused(robot: Node, appliance: Ros1Appliance) -> None:
     large = b'{"data": "' + bytes(70_000).replace(b"\0", b"x") + b'"}'
     with Mqtt(appliance) as client:
         code, text = error(client.ask("r2d2/robot/switch/_call", large))
@@ -164,7 +164,7 @@ def test_commands_that_call(world: World, robot: Node, appliance: Ros1Appliance,
     assert reach("param", "get", "/", "speed") == (0, "2.0\n")
 
 
-def test_commands_that_tell_how_it_is(robot: Node, appliance: Ros1Appliance, run: Run) -> None:
+def test_commands_that_report_the_status(robot: Node, appliance: Ros1Appliance, run: Run) -> None:
     code, text = run("check")
     assert code == 0 and "bridge: ROS 1 in /" in text, text
     code, text = run("status")

@@ -46,7 +46,7 @@ async def test_a_fault_in_a_task_is_counted_and_the_next_is_done(
     escaped.clear()
 
 
-async def test_a_message_is_taken_behind_one_that_failed(
+async def test_a_message_behind_one_that_failed_is_delivered(
     node: Ros1Node, faults: Faults, escaped: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
@@ -61,7 +61,7 @@ async def test_a_message_is_taken_behind_one_that_failed(
     escaped.clear()
 
 
-async def test_who_asks_is_answered_when_its_request_fails(
+async def test_a_caller_gets_an_error_when_its_request_fails(
     node: Ros1Node, faults: Faults, escaped: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class ServiceError(Exception):

@@ -43,7 +43,7 @@ def is_used(port: int, process: psutil.Process) -> bool:
     return any(found.laddr.port == port for found in process.net_connections("inet"))
 
 
-def test_a_caller_that_says_nothing_keeps_nobody_away(
+def test_a_silent_peer_does_not_block_others(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
     with Mqtt(appliance) as client, ExitStack() as silent:
@@ -61,7 +61,7 @@ def test_a_caller_that_says_nothing_keeps_nobody_away(
 @pytest.mark.parametrize(
     "address", ["rosrpc://127.0.0.1:99999", "rosrpc://[x", f"rosrpc://{'a' * 80}:80", "rosrpc://"]
 )
-def test_a_service_whose_address_is_none_is_left_out(
+def test_a_service_with_a_malformed_address_is_skipped(
     world: World, robot: Node, appliance: Ros1Appliance, address: str
 ) -> None:
     before = appliance.log.count("there is no bridge to ROS")
@@ -76,7 +76,7 @@ def test_a_service_whose_address_is_none_is_left_out(
 
 
 @pytest.mark.parametrize("port", ["abc", -1, "9" * 30, [80], ""])
-def test_a_publisher_whose_port_is_none_is_left_out(port: object) -> None:
+def test_a_publisher_with_a_malformed_port_is_skipped(port: object) -> None:
     def told(*_: object) -> object:
         return [1, "", ["TCPROS", "127.0.0.1", port]]
 
@@ -94,7 +94,7 @@ def test_a_publisher_whose_port_is_none_is_left_out(port: object) -> None:
             thread.join()
 
 
-def test_it_joins_again_and_leaves_another_its_name(
+def test_the_node_joins_again_once_its_name_is_free(
     world: World, robot: Node, appliance: Ros1Appliance
 ) -> None:
     process = psutil.Process(appliance.pid)
@@ -141,7 +141,7 @@ print([each.__name__ for each in modules].count("rospy.core"))
 """
 
 
-def test_nothing_is_kept_of_the_rospy_before(world: World, python: Python) -> None:
+def test_an_unloaded_rospy_does_not_stay_in_memory(world: World, python: Python) -> None:
     environment = {**world.environment, "PYTHONPATH": python.path, "LD_LIBRARY_PATH": ""}
     command = [python.executable, "-c", JOIN_AGAIN]
     assert int(subprocess.check_output(command, env={**os.environ, **environment})) == 1

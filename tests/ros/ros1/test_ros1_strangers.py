@@ -150,7 +150,7 @@ def test_the_clock_and_a_topic_of_another_type(world: World, appliance: Ros1Appl
         end(robot)
 
 
-def test_another_of_the_same_name_leaves_the_first_in_peace(
+def test_a_second_node_of_the_same_name_does_not_end_the_first(
     world: World, appliance: Ros1Appliance, python: Python, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     second = Ros1Appliance(tmp_path_factory.mktemp("second"), python, world, BRIDGE)
@@ -162,7 +162,7 @@ def test_another_of_the_same_name_leaves_the_first_in_peace(
     assert "no bridge to ROS" not in appliance.log
 
 
-def test_what_is_too_large_is_passed_over(world: World, appliance: Ros1Appliance) -> None:
+def test_messages_over_the_size_limit_are_dropped(world: World, appliance: Ros1Appliance) -> None:
     process = psutil.Process(appliance.pid)
     before = process.memory_info().rss
 
@@ -182,7 +182,7 @@ def test_what_is_too_large_is_passed_over(world: World, appliance: Ros1Appliance
     assert process.memory_info().rss < before + MAX_MESSAGE_SIZE // 2
 
 
-def test_callers_with_a_header_of_4_gb(world: World, appliance: Ros1Appliance) -> None:
+def test_peers_that_announce_a_header_of_4_gb(world: World, appliance: Ros1Appliance) -> None:
     appliance.wait_for_log("/ask is offered")
     port = int(world.ask("lookupService", "/ask").rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), PATIENCE) as caller:
@@ -215,7 +215,7 @@ def test_a_node_whose_port_is_another_program_s(world: World, appliance: Ros1App
     assert "no bridge to ROS" not in appliance.log
 
 
-def test_a_parameter_that_cannot_be_told(world: World, appliance: Ros1Appliance) -> None:
+def test_a_parameter_that_xml_rpc_cannot_express(world: World, appliance: Ros1Appliance) -> None:
     connection = HTTPConnection("127.0.0.1", world.port, timeout=PATIENCE)
     values = ("string>/test", "string>/large", f"i8>{2**40}")
     params = "".join(f"<param><value><{v}</{v.partition('>')[0]}></value></param>" for v in values)
@@ -229,7 +229,7 @@ def test_a_parameter_that_cannot_be_told(world: World, appliance: Ros1Appliance)
         assert "r2d2/_param/large" not in {m.topic for m in client.received}
 
 
-def test_publishers_that_dawdle_neither_keep_others_away_nor_the_process(
+def test_slow_publishers_block_neither_others_nor_the_process(
     world: World, appliance: Ros1Appliance
 ) -> None:
     asked = [threading.Event() for _ in range(5)]

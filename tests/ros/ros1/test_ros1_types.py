@@ -43,7 +43,7 @@ def converter(text: str, now: int = 5_000_000_007):
     return compile_converter(describe("pkg/msg/It", text), lambda: now)
 
 
-def test_a_definition_with_all_that_there_is() -> None:
+def test_a_definition_with_every_kind_of_field() -> None:
     it = converter(STAMPED)
     given = {
         "header": {"seq": 1, "stamp": "now", "frame_id": "é"},
@@ -82,7 +82,7 @@ def test_a_definition_with_all_that_there_is() -> None:
             it.to_json(data[:size])
 
 
-def test_strings_may_have_any_character_and_end_with_none() -> None:
+def test_strings_may_have_any_character_and_have_no_terminator() -> None:
     it = converter("string data")
     assert from_text(it, b"a\0b") == b"\x03\0\0\0a\0b"
     assert it.to_json(b"\x03\0\0\0a\0b") == b'{"data":"a\\u0000b"}'
@@ -92,7 +92,7 @@ def test_strings_may_have_any_character_and_end_with_none() -> None:
         it.checked(b"\xff\xff\xff\xff")
 
 
-def test_a_message_of_nothing() -> None:
+def test_a_message_without_fields() -> None:
     it = converter("")
     assert it.from_json(b"{}") == b"" and it.to_json(b"") == b"{}"
     inside = converter(f"Nothing a\nuint8 b\n{RULE}MSG: pkg/Nothing\n")
@@ -130,7 +130,7 @@ def test_a_message_of_nothing() -> None:
         ),
     ],
 )
-def test_what_is_no_definition(text: str, problem: str) -> None:
+def test_malformed_definitions_are_refused(text: str, problem: str) -> None:
     with pytest.raises(UnknownTypeError, match=problem):
         describe("pkg/msg/It", text)
 
@@ -144,13 +144,13 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\1", b"\xff\xff\xff\xff", b"\2\0\0\0ab", b"\3\0\0\0a=b\1"])
-def test_what_is_no_header(data: bytes) -> None:
+def test_malformed_headers_are_refused(data: bytes) -> None:
     with pytest.raises(BusError):
         parse_header(data)
     assert parse_header(b"\5\0\0\0a=b=c\2\0\0\0d=") == {"a": "b=c", "d": ""}
 
 
-def test_an_echo_is_told_by_all_of_its_bytes() -> None:
+def test_an_echo_is_recognized_by_all_of_its_bytes() -> None:
     echo = EchoFilter(PACKED)
     echo.sent(b"\1\2\3\4")
     assert not echo.is_own(b"\0\2\3\4") and not echo.is_own(b"\1\2\3\4\0")

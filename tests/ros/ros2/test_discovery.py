@@ -54,7 +54,7 @@ def test_the_service_of_a_user_of_its_own_has_no_shared_memory():
         {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"},
     ],
 )
-def test_the_profile_goes_before_one_of_the_users_and_says_so(given, is_old, monkeypatch):
+def test_the_profile_overrides_the_users_and_reports_it(given, is_old, monkeypatch):
     """With that one, the bridge's sockets were open to the network."""
     monkeypatch.setattr(fastdds, "is_old", lambda: is_old)
     environment = dict(given)
@@ -68,7 +68,7 @@ def test_the_profile_goes_before_one_of_the_users_and_says_so(given, is_old, mon
     assert "<address>127.0.0.1</address>" in profile
 
 
-def test_the_profile_goes_before_one_in_the_working_directory():
+def test_the_profile_overrides_one_in_the_working_directory():
     Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
     environment = {}
     said = discovery.use("localhost", environment)
@@ -77,7 +77,7 @@ def test_the_profile_goes_before_one_in_the_working_directory():
     assert environment["SKIP_DEFAULT_XML_FILE"] == "1"
 
 
-def test_where_the_profile_cannot_be_used_it_is_ross_own_variable(monkeypatch):
+def test_without_the_profile_localhost_is_the_variable_of_ros(monkeypatch):
     given = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
     environment = dict(given)
     assert discovery.use("localhost", environment) == ""
@@ -101,7 +101,7 @@ def test_where_the_profile_cannot_be_used_it_is_ross_own_variable(monkeypatch):
         ("environment", {RANGE: "OFF", "ROS_STATIC_PEERS": "10.0.0.2"}, ""),
     ],
 )
-def test_the_key_goes_before_the_variables_and_says_so(wanted, given, told):
+def test_the_configuration_overrides_the_variables_and_reports_it(wanted, given, told):
     environment = dict(given)
     said = discovery.use(wanted, environment)
     assert told in said and bool(told) is bool(said)

@@ -46,7 +46,7 @@ def test_a_sourced_ros_is_found_by_pythonpath_or_by_its_prefix(tmp_path):
     assert find_sourced({"AMENT_PREFIX_PATH": f":{tmp_path}/nothing", "PYTHONPATH": ""}) is None
 
 
-def test_of_two_the_one_that_fits_is_found(tmp_path):
+def test_the_sourced_ros_of_the_same_python_is_preferred(tmp_path):
     other, fitting = source(tmp_path / "other", OTHER), source(tmp_path / "fitting")
     both = {"AMENT_PREFIX_PATH": ":".join(e["AMENT_PREFIX_PATH"] for e in (other, fitting))}
     found = find_sourced(both)
@@ -54,7 +54,7 @@ def test_of_two_the_one_that_fits_is_found(tmp_path):
     assert found.python == HERE
 
 
-def test_the_one_file_takes_a_sourced_ros_for_types_that_it_has_not(tmp_path, inside):
+def test_the_one_file_uses_a_sourced_ros_that_has_more_types(tmp_path, inside):
     same = source(tmp_path / "same")
     more = source(tmp_path / "more", packages=("std_msgs", "rover_msgs"))
     assert is_wanted(same) is None

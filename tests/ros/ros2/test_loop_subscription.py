@@ -111,7 +111,7 @@ async def test_small_messages_are_taken_on_the_loops_thread(taker, peer):
     assert taker.taken == [(here, string(f"{number:03d}")) for number in range(20)]
 
 
-async def test_large_ones_are_left_to_the_ros_thread_and_all_stay_in_order(taker, peer):
+async def test_large_messages_go_to_the_ros_thread_in_order(taker, peer):
     taker = taker(BYTES)
     await taker.advertised(peer)
     small, large = 10, LARGE + 1
@@ -130,7 +130,7 @@ async def test_large_ones_are_left_to_the_ros_thread_and_all_stay_in_order(taker
     assert names[back:] == [here] * 3 + [there] * 2
 
 
-async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_for(taker, peer):
+async def test_a_busy_loop_takes_batches_and_loses_nothing_that_the_queue_holds(taker, peer):
     taker = taker(depth=1000)
     await taker.advertised(peer)
     await peer.do_beside_a_busy_loop("publish", "/a", string("one").hex(), 300, 2000)
@@ -139,7 +139,7 @@ async def test_a_busy_loop_takes_in_lots_and_loses_nothing_that_there_is_room_fo
     assert taker.lost == 0
 
 
-async def test_others_have_their_turn_between_two_lots(taker, peer):
+async def test_other_callbacks_run_between_two_batches(taker, peer):
     taker = taker(depth=2000)
     await taker.advertised(peer)
     publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 1500, 10_000))
@@ -278,7 +278,7 @@ async def test_subscriptions_come_and_go_while_messages_come(harness, peer):
     assert open_files() == files
 
 
-async def test_the_ros_thread_takes_all_where_it_cannot_be_otherwise(monkeypatch, taker, peer):
+async def test_the_ros_thread_takes_all_where_the_loop_cannot(monkeypatch, taker, peer):
     def refuse(pointer):
         raise ros2_loop.UnavailableError("not here")
 

@@ -116,7 +116,7 @@ def test_two_nodes_with_services_of_one_name_and_different_types():
     assert node.services() == {"/x": ["std_srvs/srv/SetBool", "std_srvs/srv/Trigger"]}
 
 
-async def test_names_that_only_dds_takes_are_passed_over():
+async def test_names_that_only_dds_accepts_are_skipped():
     """Of another vendor's tools, or by a stranger: asking ROS about one ended the bridge."""
     node = ros2.Ros2Node()
     looked, failures = [], []
@@ -191,7 +191,7 @@ async def test_mqtt_to_ros(harness, peer):
     assert len(peer.received) > before
 
 
-async def test_who_subscribes_late_is_given_the_last_command_alone(harness, peer):
+async def test_a_late_subscriber_receives_only_the_last_command(harness, peer):
     harness.start(route("/mode", "ros", "text"))
     await peer.do("subscribe", "/mode", STRING, "reliable", "transient_local")
     await until(harness.bridged, "/mode")
@@ -337,7 +337,7 @@ async def test_images_pass_through_the_larger_shared_memory(harness):
 
 
 @pytest.mark.parametrize("takes_on_loop", [True, False])
-async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
+async def test_messages_that_the_middleware_loses_are_counted(peer, takes_on_loop):
     """Images that are larger than the shared memory of a publisher without our profile."""
     node, failures, taken, dropped, lost = ros2.Ros2Node(), [], [], [], []
     subscription = None
@@ -386,9 +386,7 @@ async def test_what_the_middleware_loses_is_counted(peer, takes_on_loop):
 
 
 @pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
-async def test_what_was_published_before_or_had_to_make_room_is_not_lost_by_the_middleware(
-    peer, reliability
-):
+async def test_early_and_dropped_messages_do_not_count_as_lost_by_the_middleware(peer, reliability):
     await peer.do("advertise", "/a", STRING, reliability)
     await peer.do("publish", "/a", string("early").hex(), 50, 10_000)
     node, failures, taken = ros2.Ros2Node(), [], []
@@ -482,7 +480,7 @@ async def test_start_and_stop_at_any_moment():
         assert time.monotonic() - started < wait + 5
 
 
-async def test_an_exception_in_a_look_ends_the_node_and_is_told():
+async def test_an_exception_in_a_poll_ends_the_node_and_is_reported():
     node = ros2.Ros2Node()
     failures = []
     node.start(lambda: 1 // 0, failures.append)
@@ -491,7 +489,7 @@ async def test_an_exception_in_a_look_ends_the_node_and_is_told():
     assert failures == ["ZeroDivisionError: integer division or modulo by zero"]
 
 
-async def test_a_wrong_node_name_is_told():
+async def test_a_wrong_node_name_is_reported():
     failures = []
     node = ros2.Ros2Node("not a name")
     node.start(lambda: None, failures.append)
@@ -521,7 +519,7 @@ def test_without_rclpy_one_line_says_so(monkeypatch):
 
 
 @pytest.mark.parametrize("domain", ["500", "233", "-1", "one"])
-def test_a_domain_that_there_is_not_is_told(monkeypatch, domain):
+def test_a_wrong_domain_is_reported(monkeypatch, domain):
     """Fast DDS would end the process, and the broker with it."""
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     failures = []
@@ -531,7 +529,7 @@ def test_a_domain_that_there_is_not_is_told(monkeypatch, domain):
     assert failures == [f"ROS_DOMAIN_ID is {domain}: a domain is a number from 0 to 232"]
 
 
-def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
+def test_a_missing_middleware_is_reported(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_nowhere_cpp")
     is_available, reason = ros2.available()
     assert not is_available
@@ -550,13 +548,13 @@ def test_a_middleware_that_is_not_installed_is_told(monkeypatch):
         {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
     ],
 )
-def test_the_users_own_settings_of_fast_dds_go_first(environment):
+def test_the_users_settings_of_fast_dds_take_precedence(environment):
     before = dict(environment)
     assert not fastdds.use_profile(environment)
     assert environment == before
 
 
-def test_fast_dds_2_has_a_variable_of_its_own_and_goes_nowhere_else(tmp_path, monkeypatch):
+def test_fast_dds_2_has_a_variable_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     (tmp_path / "share" / "fastrtps").mkdir(parents=True)
     environment = {"ROS_LOCALHOST_ONLY": "1"}
@@ -566,7 +564,7 @@ def test_fast_dds_2_has_a_variable_of_its_own_and_goes_nowhere_else(tmp_path, mo
     assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
 
 
-def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
+def test_a_profile_in_the_working_directory_takes_precedence(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     environment = {}
     assert fastdds.use_profile(environment)
@@ -575,7 +573,7 @@ def test_a_profile_in_the_working_directory_goes_first(tmp_path, monkeypatch):
     assert not fastdds.use_profile({})
 
 
-def test_where_fast_dds_does_not_know_the_variable_a_profile_says_it(tmp_path, monkeypatch):
+def test_an_old_fast_dds_gets_udp_by_a_profile(tmp_path, monkeypatch):
     environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
     assert not fastdds.use_profile(environment)
     (tmp_path / "fastrtps").mkdir()

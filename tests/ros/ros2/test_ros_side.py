@@ -83,7 +83,7 @@ async def test_messages_come_in_order_and_some_are_timed(start, peer):
     assert topic.size == 8
 
 
-async def test_what_was_latched_before_is_not_timed(start, peer):
+async def test_messages_latched_before_are_not_timed(start, peer):
     await peer.do("advertise", "/map", STRING, "reliable", "transient_local")
     await peer.do("publish", "/map", (b"\0\1\0\0\x04\0\0\0old\0").hex())
     await asyncio.sleep(0.2)
@@ -116,7 +116,7 @@ async def test_arguments_name_the_node_and_remap_topics(start, peer):
     assert peer.received[0][0] == "/elsewhere/b"
 
 
-async def test_wrong_arguments_are_told_and_mqtt_goes_on(start):
+async def test_wrong_arguments_are_reported_and_mqtt_goes_on(start):
     harness = start(route("/a", "mqtt", "text"), arguments=["-r", "not a remapping"])
     await until(lambda: harness.bridge.problem, "the problem")
     assert "not a remapping" in harness.bridge.problem
@@ -135,7 +135,7 @@ def test_latency_is_that_of_a_clock_that_was_set_meanwhile(monkeypatch):
             assert published_at == (now - age if is_timed else 0)
 
 
-async def test_the_doctor_sees_who_is_there(start, peer):
+async def test_the_doctor_sees_the_nodes(start, peer):
     settings = config.loads("bridge: {topics: []}", Path("appliance.yaml"))
     found = await asyncio.to_thread(lambda: list(doctor.ros(settings, None)))
     by_subject = {finding.subject: finding for finding in found}
@@ -235,7 +235,7 @@ async def test_a_network_that_comes_while_the_bus_is_joined_is_used(start, peer,
     assert houses[0].bridge.problem == "there was no network yet when it was joined, and is now"
 
 
-def test_how_far_one_can_be_heard(monkeypatch):
+def test_the_scope_of_the_network(monkeypatch):
     up, down = SimpleNamespace(isup=True), SimpleNamespace(isup=False)
     states = {"lo": up, "eth0": down}
     ends = {
@@ -276,7 +276,7 @@ async def test_time_is_the_simulations(start, peer, node):
     assert harness.node.now() == 1234 * 10**9 + 500
 
 
-async def test_the_appliance_tells_how_it_is_on_ros_on_mqtt_and_at_its_door(tmp_path, peer):
+async def test_the_appliance_reports_its_status_on_ros_on_mqtt_and_by_control(tmp_path, peer):
     appliance = ApplianceProcess(tmp_path, acl=f"user alice\ntopic {ROBOT}/#\n")
     settings = yaml.safe_load(appliance.config.read_text())
     settings["bridge"] = {
