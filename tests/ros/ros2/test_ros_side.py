@@ -144,10 +144,10 @@ async def test_the_doctor_sees_the_nodes(start, peer):
     harness = start()
     await until(lambda: harness.bridge.peers == 1, "the peer")
     running = {"ros": {"state": "joined", "node": "/appliance"}}
-    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    found = await asyncio.to_thread(lambda: list(doctor._discover(settings, running)))
     assert [finding.text.partition(",")[0] for finding in found] == ["seen: 1 (/peer)"]
     running["ros"]["node"] = "/elsewhere"
-    found = await asyncio.to_thread(lambda: list(doctor._look(settings, running)))
+    found = await asyncio.to_thread(lambda: list(doctor._discover(settings, running)))
     assert [finding.level for finding in found] == ["error"]
     assert "/elsewhere, is not seen" in found[0].text
 
