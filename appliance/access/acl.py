@@ -1,4 +1,4 @@
-"""What the rules of an ACL file decide: mosquitto's meaning, and SUBSCRIBE beyond."""
+"""The decisions of an ACL file: mosquitto's semantics, extended to SUBSCRIBE."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from appliance.mqtt.topics import check_filter, matches, overlaps, parse_shared
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
 
-# Rules of which it is quicker to look at each than to search for the right ones.
+# Up to so many rules a linear scan is faster than a search in the tree.
 _FEW: Final = 4
 
 # A level that no rule can name, as no filter may hold U+0000 [MQTT-4.7.3-2].
@@ -22,7 +22,7 @@ _FRESH: Final = "\0"
 
 _ONLY: Final = {Permission.READ: "gives read only", Permission.WRITE: "gives write only"}
 
-# What an action needs. To subscribe is to ask for what can be read.
+# The permission that an action needs; a subscription needs the right to read.
 _NEEDED: Final = {
     Action.PUBLISH: Permission.WRITE,
     Action.SUBSCRIBE: Permission.READ,
@@ -36,7 +36,7 @@ _VERBS: Final = {
 
 
 class _Level:
-    """A level of the filters of rules: those that end with it, and what comes below."""
+    """A node of the tree of filters: the rules that end here, and the levels below."""
 
     __slots__ = ("below", "places")
 
@@ -46,20 +46,20 @@ class _Level:
 
 
 class _Group:
-    """Rules in the order in which they count: what denies comes first.
+    """Rules in the order in which they apply: those that deny come first.
 
-    They are also a tree of their filters, so that of a long file only those few rules are looked at
-    that may say something about a topic: a decision must not take longer the more rules there are.
+    A tree of their filters finds the few rules that may match a topic, so that a decision does not
+    take longer the more rules there are.
     """
 
     def __init__(self, rules: Iterable[Rule] = ()) -> None:
-        self.rules = sorted(rules, key=lambda rule: not rule.denies)  # It keeps the order else.
+        self.rules = sorted(rules, key=lambda rule: not rule.denies)  # A stable sort.
         self._root = _Level()
         self._always: list[int] = []
         for place, rule in enumerate(self.rules):
             levels = rule.filter.split("/")
             named = rule.pattern and ("%c" in levels or "%u" in levels)
-            if named and rule.denies:  # With a name that cannot be put in it denies everything.
+            if named and rule.denies:  # With an unfit name it denies everything.
                 self._always.append(place)
                 continue
             level = self._root
@@ -69,7 +69,7 @@ class _Group:
             level.places.append(place)
 
     def about(self, filter: str) -> list[Rule]:
-        """At least all rules that may match some topic of `filter`, or the topic that it is."""
+        """A superset of the rules that match the topic, or some topic of the filter."""
         if len(self.rules) <= _FEW:
             return self.rules
         found = list(self._always)
@@ -102,10 +102,10 @@ class _Group:
 
 @dataclass(frozen=True, slots=True)
 class _Applied:
-    """A rule as it is for one client. `filter` is None when a name cannot be put into it.
+    """A rule applied to one client. `filter` is None when a name cannot be substituted in it.
 
-    A rule that allows then allows nothing, and one that denies denies everything: what it was to
-    protect cannot be told.
+    A rule that allows then allows nothing, and a rule that denies denies everything, because it is
+    unknown what it was to protect.
     """
 
     rule: Rule
@@ -127,9 +127,9 @@ class _Applied:
 
 @dataclass(frozen=True, slots=True)
 class ActionVerdict:
-    """What is decided about one action, by which rule, and why the rules before it were not it.
+    """The decision about one action, the rule that made it, and why earlier rules did not apply.
 
-    `rule` is None when no rule says anything: then it is refused.
+    `rule` is None when no rule applies, and the action is refused.
     """
 
     action: Action
@@ -141,7 +141,7 @@ class ActionVerdict:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What a client may do with a topic, or a filter, and why; printed as lines of text."""
+    """What a client may do with a topic, or with a filter, and why; `str` gives lines of text."""
 
     identity: Identity
     topic: str
@@ -161,11 +161,11 @@ class Explanation:
 
 
 class _Received:
-    """What was decided about clients that are to receive one topic.
+    """A cache of the decisions about receivers of one topic.
 
-    A message may be for thousands, and rules name a client only by a whole level of a topic. So
-    what is decided about one client of a user goes for all others of the user whose ids are no
-    level of the topic, and about one whose id cannot be put in for all of these.
+    A message may have thousands of receivers, and rules name a client only by a whole level of a
+    topic. So the decision about one client of a user applies to all its clients whose ids are not a
+    level of the topic, and separately to all whose ids cannot be substituted.
     """
 
     __slots__ = ("decisions", "levels", "topic")
@@ -173,22 +173,22 @@ class _Received:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.levels = frozenset(topic.split("/"))
-        #: By the user, and by whether the id cannot be put in.
+        #: By user, and by whether the client id cannot be substituted.
         self.decisions: dict[tuple[str | None, bool], Decision] = {}
 
 
 class Acl:
-    """The rules of an ACL file and of those that it includes. It never changes once loaded.
+    """The rules of an ACL file and its included files; immutable once loaded.
 
-    A client's own rules come first (those of its user, or of anonymous clients), then the
-    patterns; of both, those that deny come first. The first that matches and says something about
-    the action decides, and what none decides is refused.
+    A client's own rules come first (those of its user, or of anonymous clients), then the patterns;
+    within both, rules that deny come first. The first rule that matches and concerns the action
+    decides. Without one, the action is refused.
     """
 
     def __init__(
         self, name: str, rules: Iterable[Rule], files: frozenset[Path] = frozenset()
     ) -> None:
-        """`name` is what the file is called in reasons, `files` is it and what it includes."""
+        """`name` is the file's name in reasons, `files` are the file and its included files."""
         self._name = name
         self.files = files
         own: dict[str | None, list[Rule]] = {}
@@ -204,23 +204,23 @@ class Acl:
 
     @classmethod
     def load(cls, path: Path, robot: str) -> Acl:
-        """The rules of the file at `path`, `{robot}` replaced by `robot`.
+        """Load the file at `path`, with `{robot}` replaced by `robot`.
 
-        AccessFileError names all that is wrong, in included files too; ValueError when `robot`
-        cannot stand in a topic.
+        AccessFileError lists all errors, also in included files; ValueError when `robot` cannot be
+        part of a topic.
         """
         return cls(path.name, *read_rules(path, robot))
 
     @property
     def rules(self) -> list[Rule]:
-        """All rules: each user's, then the patterns, what denies before what allows."""
+        """All rules: each user's, then the patterns; in each group those that deny come first."""
         return [rule for group in (*self._own.values(), self._patterns) for rule in group.rules]
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the client may do this; `topic` is valid, and a filter for SUBSCRIBE.
 
-        A subscription is refused when no message could ever be delivered because of it. Of
-        `$share/group/filter` the filter counts.
+        A subscription is refused when it could never deliver a message. Of `$share/group/filter`
+        the filter is decided about.
         """
         if action is Action.RECEIVE:
             return self._decide_receive(identity, topic)
@@ -232,7 +232,7 @@ class Acl:
             received = self._received = _Received(topic)
         client_id = identity.client_id
         is_unfit = _changes_levels(client_id)
-        if not is_unfit and client_id in received.levels:  # a rule may name it
+        if not is_unfit and client_id in received.levels:  # a rule may name this client
             return self._decide(identity, Action.RECEIVE, topic)
         who = (identity.username, is_unfit)
         decision = received.decisions.get(who)
@@ -248,7 +248,7 @@ class Acl:
         return Decision(verdict.allowed, verdict.reason)
 
     def explain(self, identity: Identity, topic: str) -> Explanation:
-        """Why the client may or may not read, write and subscribe; of a filter only the last.
+        """Why the client may or may not read, write and subscribe; for a filter only subscribe.
 
         ValueError when `topic` is neither a valid topic nor a valid filter.
         """
@@ -322,9 +322,9 @@ class Acl:
         )
 
     def _applied(self, identity: Identity, about: str | None = None) -> Iterator[_Applied]:
-        """The rules for a client, in the order in which they count.
+        """The rules for a client, in the order in which they apply.
 
-        With `about`, a topic or filter, those that have nothing to do with it may be left out.
+        With `about`, a topic or filter, rules that cannot match it may be left out.
         """
         own = self._own.get(identity.username)
         if own is not None:
@@ -350,7 +350,7 @@ def _who(identity: Identity) -> str:
 
 
 def _substitute(filter: str, identity: Identity) -> str | None:
-    """The filter of a pattern for one client; None when a name in it would change its levels."""
+    """A pattern's filter for one client; None when a substituted name would change its levels."""
     if "%" not in filter:
         return filter
     names = {"%c": identity.client_id, "%u": identity.username}
@@ -365,16 +365,16 @@ def _substitute(filter: str, identity: Identity) -> str | None:
 
 
 def _changes_levels(name: str) -> bool:
-    """Whether it would change the levels of a filter that it is put into."""
+    """Whether substituting the name would change the levels of a filter."""
     return not name or "/" in name or "+" in name or "#" in name
 
 
 def _samples(a: str, b: str, depth: int) -> Iterator[str]:
-    """Topics for all that two overlapping filters share: one of each length up to `depth` levels.
+    """Sample topics that two overlapping filters share: one of each length up to `depth` levels.
 
-    What a wildcard stands for is a level that no rule names. So a rule that matches a sample does
-    so with wildcards, and matches all shared topics of that length; beyond the depth of the
-    deepest rule one length is like the other.
+    For a wildcard, a sample has a level that no rule names. So a rule that matches a sample does so
+    with wildcards, and matches all shared topics of that length. Beyond the depth of the deepest
+    rule all lengths are equivalent.
     """
     levels_a, levels_b = a.split("/"), b.split("/")
     open_ended = levels_a[-1] == levels_b[-1] == "#"

@@ -23,11 +23,11 @@ class QueueFullError(Exception):
 
 
 class HashingPool(Generic[T]):
-    """Runs checks in `workers` threads; `max_waiting` may wait for one. On the event loop.
+    """Runs checks in `workers` threads; at most `max_waiting` wait. Belongs to the event loop.
 
-    Each lane has its turn, whatever waits in the others. When no more may wait, who comes takes
-    the place of the last in the longest lane, if that is longer than its own: a flood from one
-    address keeps nobody else out.
+    The queues are served round-robin. When no more may wait, a new check replaces the last one of
+    the longest queue, if that is longer than its own: a flood from one address keeps nobody else
+    out.
     """
 
     def __init__(self, workers: int, max_waiting: int) -> None:
@@ -48,10 +48,10 @@ class HashingPool(Generic[T]):
         return not (self._running or self._waiting)
 
     async def run(self, queue: bytes, check: Callable[[], T]) -> T:
-        """The result of the check, which must not raise.
+        """Run the check and return its result; it must not raise.
 
         Raises:
-            BusyError: it was not its turn, and others need the place.
+            QueueFullError: there was no room for it, or it had to make room.
             CancelledError: `close` was called.
         """
         if self._closed:

@@ -1,4 +1,4 @@
-"""The users file: `user:hash`, one a line, as mosquitto's password file."""
+"""The users file: one `user:hash` a line, as in mosquitto's password file."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from appliance.access.problems import AccessFileError, FileProblem, read_text
 _log = logging.getLogger(__name__)
 
 # OWASP's parameters for argon2id (Password Storage Cheat Sheet): a robot's computer is small, and
-# every login that waits takes this memory.
+# each password that is being hashed takes this memory.
 _MEMORY_KIB: Final = 19 * 1024
 _PASSES: Final = 2
 _LANES: Final = 1
 _HASHER: Final = argon2.PasswordHasher(_PASSES, _MEMORY_KIB, _LANES)
 
-# Checked when there is nothing else to check, so that an unknown user takes as long as a known
-# one. Nobody knows a password that gives 32 zero bytes.
+# Checked for an unknown user, so that it takes as long as a known one. No known password hashes to
+# 32 zero bytes.
 _DECOY: Final = (
     f"$argon2id$v=19$m={_MEMORY_KIB},t={_PASSES},p={_LANES}$" + "A" * 22 + "$" + "A" * 43
 )
 
-# A stored hash may not make one login take all the memory, or minutes: a slip of the pen in the
-# file would stop the robot from being reached.
+# Limits on the cost of a stored hash: a typing error in the file could otherwise make one login
+# take all memory, or minutes, so that nobody could reach the robot.
 _MAX_MEMORY_KIB: Final = 1024 * 1024
 _MAX_PASSES: Final = 64
 _MAX_LANES: Final = 16
@@ -64,7 +64,7 @@ _KINDS: Final = {
 
 
 def check_username(username: str) -> None:
-    """Raises a ValueError that says why `username` cannot be a user's name in the users file."""
+    """Raise a ValueError that says why `username` cannot be in the users file."""
     if not username:
         raise ValueError("a user name must not be empty")
     if len(username.encode("utf-8", "surrogatepass")) > _MAX_USERNAME:
@@ -80,7 +80,7 @@ def check_username(username: str) -> None:
 
 
 def check_password(stored: str, password: bytes) -> bool:
-    """Whether `password` is the one that `stored`, a hash of any kind we read, was made of."""
+    """Whether `password` matches `stored`, a hash of any supported kind."""
     if stored.startswith("$argon2id$"):
         try:
             return _HASHER.verify(stored, password)
@@ -100,23 +100,23 @@ def check_password(stored: str, password: bytes) -> bool:
 class Passwords:
     """The users and their password hashes, as read from a users file and changed since.
 
-    `set` and `remove` change the memory; `save` brings these changes, and no others, into the
-    file, so that what another process has written there meanwhile stays. Any thread may verify.
+    `set` and `remove` change the memory. `save` applies these changes, and no others, to the file,
+    so that what another process has written meanwhile is preserved. Any thread may verify.
     """
 
     def __init__(self, path: Path) -> None:
-        """No users yet; the file at `path` is neither read nor written."""
+        """Create it without users; the file at `path` is neither read nor written."""
         self.path = path
         self._hashes: dict[str, str] = {}
         self._changes: dict[str, str | None] = {}
         self._verifiers: dict[str, scram.Verifier] = {}
-        # Their iterations and salt sizes: what a decoy has to look like.
+        # Iterations and salt sizes of the verifiers, for decoys that look like them.
         self._shapes: set[tuple[int, int]] = set()
         self._rehashing = threading.Lock()
 
     @classmethod
     def load(cls, path: Path) -> Passwords:
-        """The users of the file at `path`; AccessFileError names every line that is wrong."""
+        """Load the file at `path`; AccessFileError lists every line with an error."""
         self = cls(path)
         text = read_text(path, "add a first user with: appliance user add NAME")
         self._hashes = _parse(path, text)
@@ -139,23 +139,23 @@ class Passwords:
         return self._hashes.get(username)
 
     def kind_of(self, username: str) -> str:
-        """How a user's password is kept, in a word; KeyError when there is none of this name."""
+        """The kind of a user's hash, in a word; KeyError when there is no such user."""
         stored = self._hashes[username]
         return next(kind for start, kind in _KINDS.items() if stored.startswith(start))
 
     def verifier(self, username: str) -> scram.Verifier:
-        """What SCRAM-SHA-256 proves the user's password against.
+        """The SCRAM-SHA-256 verifier of a user.
 
-        For an unknown user, and for one whose password is kept otherwise, it is a decoy that
-        nobody can tell from a real one, and that no proof fits.
+        For an unknown user, and for one with another kind of hash, it is a decoy that cannot be
+        distinguished from a real one, and that no proof fits.
         """
         reason = f"unknown user {username!r}"
         if username in self._hashes:
             reason = (
-                f"the password of user {username!r} is not kept for {scram.METHOD}; set it with: "
+                f"the password of user {username!r} is not stored for {scram.METHOD}; set it with: "
                 f"appliance user passwd {username} --scram"
             )
-        # It is made for everyone: not even the time tells who is a user.
+        # Made for everyone, so that the time does not reveal who is a user.
         decoy = scram.decoy(username, self._shapes, reason)
         return self._verifiers.get(username, decoy)
 
@@ -167,15 +167,15 @@ class Passwords:
         """The user's hash if this is its password, else None.
 
         Takes tens of milliseconds of CPU, as long for an unknown user as for a wrong password. A
-        hash of mosquitto's is then replaced by argon2id in memory and in the file; that the file
-        cannot be written is logged, and the login is good all the same.
+        hash of mosquitto's is then replaced by argon2id in memory and in the file. If the file
+        cannot be written, that is logged, and the login succeeds all the same.
         """
         stored = self._hashes.get(username)
         is_argon2id = stored is not None and stored.startswith("$argon2id$")
         is_scram = username in self._verifiers
         if stored is None or not check_password(stored, password):
-            # A wrong password must not tell by its time whether the user exists: each costs one
-            # hash of either slow kind that the file has, mosquitto's being quick.
+            # The time must not reveal whether the user exists: each wrong password costs one hash
+            # of each slow kind that the file has (mosquitto's are quick).
             if not is_argon2id:
                 check_password(_DECOY, password)
             if self._shapes and not is_scram:
@@ -186,10 +186,10 @@ class Passwords:
         return self._rehash(username, stored, password)
 
     def set(self, username: str, password: str | bytes, for_scram: bool | None = None) -> None:
-        """Adds a user or changes its password; ValueError says what is wrong with either.
+        """Add a user or change its password; ValueError says what is wrong with either.
 
-        `for_scram` has the password kept for SCRAM-SHA-256, and otherwise as argon2id; None means
-        as it is kept now, and argon2id for a new user.
+        `for_scram` stores the password for SCRAM-SHA-256, False as argon2id; None means as it is
+        stored now, and argon2id for a new user.
         """
         check_username(username)
         if not password:
@@ -201,16 +201,16 @@ class Passwords:
         self._read_verifiers()
 
     def remove(self, username: str) -> None:
-        """Removes a user; KeyError when there is none of this name."""
+        """Remove a user; KeyError when there is no such user."""
         del self._hashes[username]
         self._changes[username] = None
         self._read_verifiers()
 
     def save(self) -> None:
-        """Brings what was set and removed into the file: all or nothing, and safe on disk.
+        """Apply the changes to the file, atomically and synced to disk.
 
-        The file is made with mode 0600; one that is there keeps its owner, its comments and its
-        group's right to read. AccessFileError when it cannot be written.
+        A new file has mode 0600; an existing one keeps its owner, its comments and its group's
+        right to read. AccessFileError when it cannot be written.
         """
         try:
             _rewrite(self.path, self._changes)
@@ -242,7 +242,7 @@ class Passwords:
             except (OSError, AccessFileError) as error:
                 _log.warning("the new hash of user %r is not saved: %s", username, error)
             else:
-                _log.info("the password of user %r is kept as argon2id from now on", username)
+                _log.info("the password of user %r is stored as argon2id from now on", username)
         return new
 
 
@@ -288,7 +288,7 @@ def _parse(path: Path, text: str) -> dict[str, str]:
 
 
 def _entry(line: str) -> tuple[str, str, str] | None:
-    """User, colon and hash of a line; None for an empty line and a comment."""
+    """The user, colon and hash of a line; None for an empty line and a comment."""
     line = line.rstrip(" \t\r")
     if not line or line[0] == "#":
         return None
@@ -296,7 +296,7 @@ def _entry(line: str) -> tuple[str, str, str] | None:
 
 
 def _check_hash(stored: str, username: str) -> None:
-    """Raises a ValueError that says why `stored` is no hash we read, and never shows it."""
+    """Raise a ValueError that says why the hash is not supported, without showing it."""
     advice = f"set a password with: appliance user passwd {username}"
     argon2id = _ARGON2ID.fullmatch(stored)
     if argon2id:
@@ -341,9 +341,9 @@ def _is_digest(salt: str, digest: str) -> bool:
 
 
 def _rewrite(path: Path, changes: Mapping[str, str | None], only_if: str | None = None) -> None:
-    """Replaces, adds and (None) removes users in the file, leaving all other lines as they are.
+    """Replace, add and (None) remove users in the file; all other lines stay as they are.
 
-    With `only_if` a user is replaced only where its hash still is that one.
+    With `only_if`, a user is replaced only if its hash still is that one.
     """
     path = path.resolve()  # Of a symbolic link the file is replaced, not the link.
     with _locked(path.parent):
@@ -373,21 +373,21 @@ def _rewrite(path: Path, changes: Mapping[str, str | None], only_if: str | None 
 
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Holds off other processes that rewrite a file of this directory.
+    """Lock out other processes that rewrite a file of this directory.
 
-    The lock is on the directory because the file itself is replaced by another one.
+    The lock is on the directory because the file itself is replaced.
     """
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
-        os.fsync(descriptor)  # The new name is on disk, too.
+        os.fsync(descriptor)  # Makes the new name durable.
     finally:
         os.close(descriptor)
 
 
 def _replace(path: Path, text: str, status: os.stat_result | None) -> None:
-    """Writes a file beside `path` and puts it in its place once it is safe on disk."""
+    """Write a temporary file and rename it to `path` once it is synced to disk."""
     descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:

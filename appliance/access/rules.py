@@ -1,4 +1,4 @@
-"""The lines of an ACL file: mosquitto's grammar, and `include` and `{robot}` beyond."""
+"""The parser of ACL files: mosquitto's grammar, extended by `include` and `{robot}`."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from appliance.mqtt.topics import check_filter, check_topic
 
 _log = logging.getLogger(__name__)
 
-# What C's isspace() takes for white space, and mosquitto trims. Python's strip() takes more.
+# The white space of C's isspace(), which mosquitto trims. Python's strip() trims more.
 _BLANK: Final = " \t\n\v\f\r"
 _KEYWORDS: Final = ("topic", "pattern", "user", "include")
 
-# Bounds of what one file of rules, and all that it includes, can be: beyond these it is a mistake,
-# such as a log that was named in its place. A rule takes some 500 bytes of memory.
+# Limits of one file of rules with its included files: beyond these it is a mistake, such as the
+# path of a log file. A rule takes some 500 bytes of memory.
 _MAX_SIZE: Final = 4 * 1024 * 1024
 _MAX_RULES: Final = 100_000
 _MAX_DEPTH: Final = 16
 
-# Mistakes that are told of: nobody reads more of them.
+# The most errors that are reported: nobody reads more of them.
 _MAX_PROBLEMS: Final = 100
 
 _TOO_MANY: Final = (
@@ -36,7 +36,7 @@ _TOO_MANY: Final = (
 
 
 class Permission(Flag):
-    """What a rule gives; DENY takes."""
+    """What a rule permits."""
 
     DENY = 0
     READ = 1
@@ -72,11 +72,11 @@ class Rule:
 
     @property
     def denies(self) -> bool:
-        """Whether it takes, and does not give."""
+        """Whether the rule denies access."""
         return self.permission is Permission.DENY
 
     def gives(self, permission: Permission) -> bool:
-        """Whether it gives this, READ or WRITE."""
+        """Whether the rule gives this permission, READ or WRITE."""
         return self.permission is permission or self.permission is Permission.READWRITE
 
     def __str__(self) -> str:
@@ -84,11 +84,10 @@ class Rule:
 
 
 def read_rules(path: Path, robot: str) -> tuple[list[Rule], frozenset[Path]]:
-    """The rules of the file at `path` and of those that it includes, `{robot}` replaced.
+    """The rules of the file at `path` and of its included files, and the set of these files.
 
-    Returns these files as well.
-
-    AccessFileError names all that is wrong; ValueError when `robot` cannot stand in a topic.
+    `{robot}` is replaced. AccessFileError lists all errors; ValueError when `robot` cannot be part
+    of a topic.
     """
     check_topic(robot)
     reader = _AclReader(path.parent, robot)
@@ -99,7 +98,7 @@ def read_rules(path: Path, robot: str) -> tuple[list[Rule], frozenset[Path]]:
 
 
 class _LineError(ValueError):
-    """What is wrong in a line, and in which column, from 0."""
+    """An error in a line, and its column, from 0."""
 
     def __init__(self, column: int, message: str) -> None:
         super().__init__(message)
@@ -108,12 +107,12 @@ class _LineError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A line that says something: a rule, the user that the next ones are for, or a file."""
+    """A line with a rule, with the user of the following rules, or with an included file."""
 
     number: int
     keyword: str
     rest: str
-    #: Where `rest` begins, from 0.
+    #: The column of `rest`, from 0.
     column: int
     permission: Permission = Permission.DENY
     filter: str = ""
@@ -121,23 +120,23 @@ class _Line:
 
 
 class _AclReader:
-    """Reads an ACL file and those that it includes: all rules, and all that is wrong."""
+    """Reads an ACL file and its included files: collects all rules, and all errors."""
 
     def __init__(self, directory: Path, robot: str) -> None:
-        """File names of rules are as seen from `directory`."""
+        """File names in rules are relative to `directory`."""
         self.problems: list[FileProblem] = []
         self.files: set[Path] = set()
         self._directory = directory
         self._robot = robot
         self._reported: set[FileProblem] = set()
         self._lines: dict[Path, list[_Line | FileProblem]] = {}
-        #: By file, line and user, so that nothing counts twice however often it is included.
+        #: By file, line and user, so that a rule counts once however often it is included.
         self._rules: dict[tuple[Path, int, str | None], Rule] = {}
         self._read: set[tuple[Path, str | None]] = set()
 
     @property
     def rules(self) -> list[Rule]:
-        """The rules in the order in which they were found."""
+        """The rules in the order in which they were read."""
         return list(self._rules.values())
 
     def read(
@@ -147,11 +146,11 @@ class _AclReader:
         including: tuple[Path, ...] = (),
         via: tuple[str, ...] = (),
     ) -> None:
-        """Reads the file at `path`, for `user` up to its own first `user` line.
+        """Read the file at `path`, for `user` up to its own first `user` line.
 
-        That is how a file of rules is a group: each user that it is included for has its rules.
-        The file that includes it goes on with the user that it had. `including` are the files that
-        led here, and `via` the lines.
+        This makes a file of rules a group: each user for whom it is included has its rules. The
+        including file then continues with its own user. `including` are the files of the chain of
+        includes, and `via` their lines.
         """
         self.files.add(path)
         file = path.resolve()
@@ -179,7 +178,7 @@ class _AclReader:
         return str(path.relative_to(self._directory) if below else path)
 
     def _report(self, problem: FileProblem) -> None:
-        # A group's file is gone through for each of its users.
+        # A group's file is read for each of its users.
         if problem not in self._reported and len(self._reported) < _MAX_PROBLEMS:
             self._reported.add(problem)
             self.problems.append(problem)
@@ -226,7 +225,7 @@ class _AclReader:
         self.read(included, user, including, via)
 
     def _parse(self, path: Path, file: Path) -> list[_Line | FileProblem]:
-        """The lines of a file, looked at once, however often it is included."""
+        """The lines of a file, parsed once however often it is included."""
         if file in self._lines:
             return self._lines[file]
         lines = self._lines[file] = []
@@ -304,7 +303,7 @@ def _skip(line: str, column: int) -> int:
 def _check_keyword(keyword: str, column: int) -> None:
     if keyword in _KEYWORDS:
         return
-    if "\t" in keyword:  # mosquitto takes no tab for a space either.
+    if "\t" in keyword:  # mosquitto does not take a tab for a space either.
         raise _LineError(column + keyword.index("\t"), "a tab; put spaces between the words")
     if keyword.startswith("#"):
         raise _LineError(column, "a comment begins in the first column")
