@@ -1,4 +1,4 @@
-"""Topics: what the ACL file and all of amqtt's topic plugins allow."""
+"""Access to topics: what the ACL file and all of amqtt's topic plugins allow."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ from appliance.plugins.threads import Threads, blocks
 
 log = logging.getLogger(__name__)
 
-#: Seconds for which an older verdict holds while they are asked.
+#: Seconds for which an expired verdict is used while the plugins are asked anew.
 STALE_VERDICT_LIFETIME = 600.0
-#: Questions to such plugins at one time, in all and of one client.
+#: Pending questions to the plugins: in all, and about one client.
 MAX_QUERIES = 64
 MAX_CLIENT_QUERIES = 8
-#: And of one user's clients together.
+#: And about all clients of one user.
 MAX_USER_QUERIES = 16
-#: Seconds between two looks at whether those who could not ask for want of room can now.
+#: Seconds after which questions are tried again for which there was no room.
 ROOM_CHECK_INTERVAL = 0.25
 
-#: The answer of a plugin that has none without waiting.
+#: Stands for the answer of a plugin that has to wait first.
 _WOULD_BLOCK: Final = object()
 
 
 class PluginAccess:
     """The broker's `Access`: what the files allow and no topic plugin refuses.
 
-    The broker decides at once, and amqtt's topic plugins are coroutines. Those that never wait for
-    anything (rules in the configuration, a token) are run on the spot. From the first time that
-    one has to wait (HTTP, SQL, LDAP), all are asked in the background: a SUBSCRIBE or PUBLISH that
-    is asked about for the first time, and what its client sends behind it, waits for the answer, up
-    to `timeout`; then it is refused, and the answer holds for the next try. Later one
-    that is older than `answers` says, or from before the files were read again, holds while they
-    are asked anew, for 10 minutes at most.
+    The broker decides synchronously, and amqtt's topic plugins are coroutines. Plugins that never
+    wait for anything (rules in the configuration, a token) are run to the end at once. As soon as
+    one has to wait (HTTP, SQL, LDAP), all are asked in the background. The first SUBSCRIBE or
+    PUBLISH with a new question, and what its client sends after it, waits for the answer, up to
+    `timeout`; then it is refused, and the answer is cached for the next try. A cached answer that
+    has expired, or is older than the last reload of the files, is used while the plugins are asked
+    anew, for 10 minutes at most.
 
-    What already waits for a client is checked again when such an answer turns to no, or when the
-    files are read again.
+    Messages that are queued for a client are checked again when such an answer turns to no, or when
+    the files are read again.
     """
 
     def __init__(
@@ -76,14 +76,14 @@ class PluginAccess:
         self._is_blocking = False
         self._verdicts: OrderedDict[AccessQuery, tuple[Decision, float, int]] = OrderedDict()
         self._asked: dict[AccessQuery, asyncio.Task[None]] = {}
-        #: Who waits for the answer to each of them, and who for room to ask, in their order.
+        #: Callbacks that wait for the answer to each question, and those that wait for room to ask.
         self._waiting: dict[AccessQuery, dict[Callable[[], None], None]] = {}
         self._waiting_for_room: dict[Callable[[], None], None] = {}
         self._room_timer: asyncio.TimerHandle | None = None
 
     @property
     def epoch(self) -> int:
-        """Grows with the files' epoch, and when plugins are to be asked again."""
+        """Grows with the files' epoch, and when cached decisions become invalid."""
         return self._files.epoch + self._epoch
 
     @epoch.setter
@@ -128,17 +128,17 @@ class PluginAccess:
 
     def _wake_waiting_for_room(self) -> None:
         self._room_timer = None
-        line, self._waiting_for_room = self._waiting_for_room, {}
-        for wake in line:
+        waiting, self._waiting_for_room = self._waiting_for_room, {}
+        for wake in waiting:
             self._broker.faults.run("plugins.wake", wake, otherwise=None)
 
     def changed(self) -> None:
-        """Let what was decided be decided again."""
+        """Invalidate decisions that the broker has cached."""
         self._epoch += 1
         self._broker.router.changed()
 
     def close(self) -> None:
-        """Ask no more."""
+        """Cancel all questions."""
         for asking in self._asked.values():
             asking.cancel()
         self._waiting.clear()
@@ -147,7 +147,7 @@ class PluginAccess:
             self._room_timer.cancel()
 
     def _ask_now(self, identity: Identity, action: Action, topic: str) -> tuple[bool, str]:
-        """Whether the plugins could answer on the spot, and which one refuses."""
+        """Whether all plugins answered without waiting, and the name of the one that refuses."""
         session = self._sessions.of_identity(identity)
         for plugin in self._plugins._topic_plugins:
             try:
@@ -155,8 +155,8 @@ class PluginAccess:
                     _WOULD_BLOCK if blocks(plugin) else _answer_now(plugin, session, action, topic)
                 )
             except Exception:
-                # Whatever it was, the lack of a task perhaps: it is asked again in one, and what
-                # it raises there is told.
+                # Whatever it was, perhaps the lack of a task: it is asked again in a task, and what
+                # it raises there is logged.
                 return False, ""
             if answer is _WOULD_BLOCK:
                 self._is_blocking = True
@@ -172,9 +172,9 @@ class PluginAccess:
         return True, ""
 
     def _verdict(self, query: AccessQuery) -> Decision:
-        """What the plugins last said; they are asked when that is long ago."""
-        decision, said_at, epoch = self._verdicts.get(query, (None, 0.0, 0))
-        age = asyncio.get_running_loop().time() - said_at
+        """The plugins' cached verdict; they are asked anew when it has expired."""
+        decision, decided_at, epoch = self._verdicts.get(query, (None, 0.0, 0))
+        age = asyncio.get_running_loop().time() - decided_at
         is_old = (
             decision is None
             or age > self.answers.topic_lifetime(allowed=decision.allowed)
@@ -190,14 +190,14 @@ class PluginAccess:
         return decision
 
     def _has_room(self, identity: Identity) -> bool:
-        """Whether there may be one more question about this client."""
+        """Whether one more question about this client is allowed."""
         if len(self._asked) >= MAX_QUERIES:
             return False
         clients = [asked[0] for asked in self._asked if asked[0].username == identity.username]
         return len(clients) < MAX_USER_QUERIES and clients.count(identity) < MAX_CLIENT_QUERIES
 
     async def _ask(self, query: AccessQuery) -> None:
-        """Ask all topic plugins and keep what they say."""
+        """Ask all topic plugins and cache the verdict."""
         identity, action, topic = query
         session = self._sessions.of_identity(identity)
         try:
@@ -216,7 +216,7 @@ class PluginAccess:
         finally:
             del self._asked[query]
         try:
-            self._keep(query, decision)
+            self._cache(query, decision)
         finally:
             for wake in self._waiting.pop(query, {}):
                 self._broker.faults.run("plugins.wake", wake, otherwise=None)
@@ -229,7 +229,7 @@ class PluginAccess:
         asked = (self._threads.call(plugin, "topic_filtering", arguments) for plugin in plugins)
         return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
 
-    def _keep(self, query: AccessQuery, decision: Decision) -> None:
+    def _cache(self, query: AccessQuery, decision: Decision) -> None:
         before, _, _ = self._verdicts.pop(query, (None, 0.0, 0))
         now = asyncio.get_running_loop().time()
         self._verdicts[query] = decision, now, self._files.epoch
@@ -252,6 +252,6 @@ def _answer_now(
         asked.send(None)
     except StopIteration as answer:
         return answer.value
-    with contextlib.suppress(RuntimeError):  # it goes on waiting while it is cleaning up
+    with contextlib.suppress(RuntimeError):  # it awaits something during its clean-up
         asked.close()
     return _WOULD_BLOCK

@@ -1,4 +1,4 @@
-"""Sessions and retained messages as amqtt's plugins see them: made when they are looked at."""
+"""Views of sessions and retained messages for amqtt's plugins, created on access."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from appliance.mqtt.packets import Connect
 
 
 class UnclaimedIdentity(Identity):
-    """Owner of a session that a plugin made for a client that never came.
+    """The owner of a session that a plugin has created for a client that is not there.
 
     The first client that logs in with its id becomes its owner.
     """
@@ -29,7 +29,7 @@ class UnclaimedIdentity(Identity):
 
 
 def _split(address: str) -> tuple[str, int]:
-    """A connection's host and port; of a Unix socket its path and the connection's number."""
+    """The host and port of a connection; of a Unix socket the path and the connection's number."""
     host, _, port = address.rpartition(":")
     return host.strip("[]"), int(port)
 
@@ -37,7 +37,7 @@ def _split(address: str) -> tuple[str, int]:
 def view_of_login(
     connect: Connect, address: str, password: str | None, ssl_object: ssl.SSLObject | None
 ) -> AmqttSession:
-    """The session that plugins are shown before it is known whether the client may come in."""
+    """The session object that plugins are shown for a login that is not decided yet."""
     login = AmqttSession()
     login.client_id = connect.client_id
     login.username = connect.username
@@ -46,7 +46,7 @@ def view_of_login(
     login.ssl_object = ssl_object
     login.keep_alive = connect.keep_alive
     login.clean_session = connect.clean_start
-    if connect.version == V5:  # amqtt means by it what 3.1.1 does: that nothing is kept
+    if connect.version == V5:  # amqtt means 3.1.1's: nothing is stored
         login.clean_session = not (connect.properties or {}).get(Property.SESSION_EXPIRY_INTERVAL)
     login.will_qos, login.will_retain = 0, False
     if connect.will is not None:
@@ -57,7 +57,7 @@ def view_of_login(
 
 
 def _view_of(session: Session) -> AmqttSession:
-    """A session as amqtt has it, of one whose login plugins have not seen."""
+    """The view of a session whose login plugins have not seen."""
     view = AmqttSession()
     view.client_id = session.client_id
     view.username = session.identity.username if session.identity else None
@@ -73,9 +73,9 @@ def _view_of(session: Session) -> AmqttSession:
 
 
 class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
-    """The sessions of all network clients by client id, each with no protocol handler.
+    """The sessions of all network clients by client id, each without a protocol handler.
 
-    amqtt's objects are large (24 KB), so they are made when they are asked for.
+    amqtt's objects are large (24 KB), so they are created on access.
     """
 
     def __init__(self, broker: Broker) -> None:
@@ -90,11 +90,11 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
         return self.of(session), None
 
     def __setitem__(self, client_id: str, session: object) -> None:
-        """BrokerContext puts here what `create_offline_session` made; it is here already."""
+        """Ignored: BrokerContext sets what `create_offline_session` has created here already."""
 
     def __iter__(self) -> Iterator[str]:
         for client_id in list(self._broker.sessions):
-            if client_id in self:  # others may end while plugins go through them
+            if client_id in self:  # sessions may end during the iteration
                 yield client_id
 
     def __contains__(self, client_id: object) -> bool:
@@ -105,12 +105,12 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
         return sum(1 for _ in self)
 
     def of(self, session: Session) -> AmqttSession:
-        """amqtt's object of the session: its last login as plugins saw it, brought up to date."""
+        """amqtt's object of the session: the last login that plugins saw, updated."""
         known = self._known.get(session.client_id)
         before = known[1] if known is not None and known[0] is session else None
         view = self._claim_login(session) or before or _view_of(session)
         if view is not before:
-            if before is not None:  # a session continued: what plugins noted in it stays
+            if before is not None:  # the session is resumed: the plugins' attributes stay
                 view.parent = 1
                 view.attributes = before.attributes | view.attributes
             self._known[session.client_id] = session, view
@@ -122,10 +122,10 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
         return view
 
     def _claim_login(self, session: Session) -> AmqttSession | None:
-        """What plugins saw of the login behind the session's connection, once."""
+        """Take the stored login of the session's connection, if there is one."""
         link, identity = session.link, session.identity
         login = self._logins.pop(link.transport.address, None) if isinstance(link, Output) else None
-        # An address can be used again; who it is cannot be mistaken.
+        # An address may have been reused by another client.
         if (
             login is None
             or identity is None
@@ -137,7 +137,7 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
         return login
 
     def of_identity(self, identity: Identity) -> AmqttSession:
-        """amqtt's object of the client's session, also of one that is just ending."""
+        """amqtt's object of the client's session, also while it is ending."""
         session = self._broker.sessions.get(identity.client_id)
         if session is not None and session.identity == identity:
             return self.of(session)
@@ -149,11 +149,11 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
         return view
 
     def remember_login(self, address: str, login: AmqttSession) -> None:
-        """The client at the address may come in: this is what plugins know of it."""
+        """Store what plugins saw of the login of the client at this address."""
         self._logins[address] = login
 
     def purge(self) -> None:
-        """Forget the objects of sessions and connections that have ended."""
+        """Remove the objects of sessions and connections that have ended."""
         for client_id, (session, _) in list(self._known.items()):
             if self._broker.sessions.get(client_id) is not session:
                 del self._known[client_id]
@@ -164,12 +164,12 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
 
 
 def retained_message(source: AmqttSession | None, message: Message) -> RetainedApplicationMessage:
-    """A retained message as amqtt has it, with the session that published it, if known."""
+    """amqtt's object of a retained message, with the publisher's session if known."""
     return RetainedApplicationMessage(source, message.topic, message.payload, message.qos)
 
 
 class RetainedMessages(MutableMapping[str, RetainedApplicationMessage]):
-    """The retained messages by topic. What is put here is told to no plugin."""
+    """The retained messages by topic. Changes made here fire no events."""
 
     def __init__(self, broker: Broker, retain: Callable[[str, bytes, int | None], None]) -> None:
         self._broker = broker

@@ -1,4 +1,4 @@
-"""The frame itself: amqtt's broker with our data path in the place of its own."""
+"""The frame: an `amqtt.broker.Broker` with our data path in the place of its own."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ from appliance.plugins.threads import Threads
 log = logging.getLogger(__name__)
 
 
-#: Nothing of a login is remembered unless that is asked for.
+#: The default: no answer is cached.
 _ANSWERS = CachePolicy(keep=0.0, keep_refusals=0.0)
 
 
 class FileRules(Access, Protocol):
-    """The users file and the ACL file, as far as the plugins stand beside them."""
+    """The users file and the ACL file, as far as plugins need them."""
 
     @property
     def throttle(self) -> Throttle:
-        """How long logins have to wait because others were wrong."""
+        """The login throttle."""
 
 
 def plugin_kinds(plugins: Iterable[str]) -> tuple[bool, bool]:
-    """Whether some of the plugins authenticate clients, and whether some rule topics.
+    """Whether a plugin authenticates clients, and whether one decides about topics.
 
     Raises:
         PluginSettingsError: there is no such plugin.
@@ -78,10 +78,11 @@ def configuration(
     connections: int,
     plugins: Mapping[str, Mapping[str, Any]],
 ) -> BrokerConfig:
-    """amqtt's configuration object of ours; a listener is its address and whether it has TLS.
+    """amqtt's configuration object for our settings; a listener is its address, and whether it has
+    TLS.
 
-    Only the plugins given are loaded, none of amqtt's default ones. Certificates are left out:
-    they are our listeners' business.
+    Only the given plugins are loaded, none of amqtt's default ones. Certificates are left out, as
+    our own listeners have them.
     """
     config = BrokerConfig(
         listeners={"default": ListenerConfig(bind=None)},
@@ -94,10 +95,10 @@ def configuration(
 
 
 def check_plugin_settings(path: str, settings: Mapping[str, Any]) -> None:
-    """Whether a plugin takes these settings. Nothing is started, and no value is told.
+    """Check that a plugin takes these settings. Nothing is started, and no value is revealed.
 
     Raises:
-        PluginSettingsError: there is no such plugin, or its settings are others.
+        PluginSettingsError: there is no such plugin, or it does not take these settings.
     """
     try:
         kind = import_string(path)
@@ -121,20 +122,20 @@ def check_plugin_settings(path: str, settings: Mapping[str, Any]) -> None:
             "is needed" if isinstance(error, MissingValueError) else "has a value of a wrong type"
         )
         raise PluginSettingsError(f"{error.field_path} {what}") from None
-    except Exception as error:  # a plugin may look at its settings itself
-        told = f"does not take its settings ({type(error).__name__})"
-        raise PluginSettingsError(told) from None
+    except Exception as error:  # a plugin may check its settings itself
+        reason = f"does not take its settings ({type(error).__name__})"
+        raise PluginSettingsError(reason) from None
 
 
 def _typed(path: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings, with the members of enumerations that the plugin wants for their names.
+    """The settings, with values converted to the enumerations that the plugin declares.
 
-    amqtt takes nothing else for them, which a file cannot hold.
+    amqtt accepts only members of an enumeration, which a file cannot contain.
     """
     typed = dict(settings)
     try:
         kinds = get_type_hints(getattr(import_string(path), "Config", None))
-    except (ImportError, NameError, TypeError):  # amqtt says better what is wrong with it
+    except (ImportError, NameError, TypeError):  # amqtt reports the error better
         return typed
     for key, value in settings.items():
         kind = kinds.get(key)
@@ -165,10 +166,10 @@ class ApplianceBroker(amqtt.broker.Broker):
         secrets: Iterable[str] = (),
         max_wait: float = PLUGIN_TIMEOUT,
     ) -> None:
-        """Loads the plugins; to be called on the event loop.
+        """Load the plugins; to be called on the event loop.
 
-        `secrets` are strings of their settings that are told to nobody; `max_wait` is how many
-        seconds a login may wait when others from its address were wrong.
+        `secrets` are strings of their settings that are masked in the log. `max_wait` is the most
+        seconds that a login may be delayed after wrong ones from its address.
 
         Raises:
             PluginSettingsError: one cannot be loaded.
@@ -208,14 +209,14 @@ class ApplianceBroker(amqtt.broker.Broker):
             answers,
             max_wait,
         )
-        # BrokerContext reads and writes these: they are windows on our broker.
+        # BrokerContext reads and writes these: they are views of our broker.
         self._sessions = cast(Any, self._views)
         self._retained_messages = cast(Any, RetainedMessages(broker, self._retain_quietly))
 
     # --- life cycle ----------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Start as amqtt's broker does: from new or stopped, with the events around it.
+        """Start as amqtt's broker does, when new or stopped, and fire the life-cycle events.
 
         Raises:
             BrokerError: it is running, or a start has failed.
@@ -248,11 +249,11 @@ class ApplianceBroker(amqtt.broker.Broker):
         )
 
     async def _start_listeners(self) -> None:
-        """Start our listeners in the place of amqtt's."""
+        """Start our listeners instead of amqtt's."""
         await self._listen()
 
     async def shutdown(self) -> None:
-        """Stop as amqtt's broker does; sessions and retained messages are kept.
+        """Stop as amqtt's broker does; sessions and retained messages stay.
 
         Raises:
             MachineError: it is not running.
@@ -288,7 +289,7 @@ class ApplianceBroker(amqtt.broker.Broker):
             self._guard.log_failure(f"an amqtt plugin at {what}", error)
 
     def _tick(self) -> None:
-        """Forget what has ended, and let topic plugins change their mind."""
+        """Remove views of what has ended, and let topic plugins change their answers."""
         self._views.purge()
         if self.plugins_manager._topic_plugins:
             self._access.changed()
@@ -309,7 +310,7 @@ class ApplianceBroker(amqtt.broker.Broker):
     async def internal_message_broadcast(
         self, topic: str, data: bytes, qos: int | None = None
     ) -> None:
-        """Publish on behalf of the broker; without `qos` each gets what its subscription says.
+        """Publish on behalf of the broker; without `qos` with the QoS of each subscription.
 
         Raises:
             BrokerError: the topic is not valid, or the broker is not running.
@@ -367,10 +368,10 @@ class ApplianceBroker(amqtt.broker.Broker):
         return int(code) if code <= ReasonCode.GRANTED_QOS_2 else 0x80
 
     def create_offline_session(self, client_id: str) -> tuple[BrokerProtocolHandler, AmqttSession]:
-        """Make a session for a client that is not there; the first to log in gets it.
+        """Create a session for a client that is not there; the first to log in becomes its owner.
 
         Raises:
-            BrokerError: it cannot be kept.
+            BrokerError: it would not outlive its connection, or cannot be created.
         """
         link = InsideLink()
         expiry = self.broker.limits.session_expiry
@@ -392,7 +393,7 @@ class ApplianceBroker(amqtt.broker.Broker):
 
     @contextlib.contextmanager
     def _unobserved(self) -> Iterator[None]:
-        """What plugins do themselves is not told to them."""
+        """Suppress events about what plugins do themselves."""
         observer, self.broker.observer = self.broker.observer, None
         try:
             yield

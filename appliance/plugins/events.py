@@ -24,11 +24,11 @@ from appliance.plugins.guard import PluginGuard
 
 log = logging.getLogger(__name__)
 
-#: Events, and bytes of payload in them, that wait for plugins.
+#: The most events, and bytes of payload in them, that wait for plugins.
 MAX_EVENTS = 10_000
 MAX_EVENT_BYTES = 64 * 1024 * 1024
 
-#: Seconds between two lines in the log about events that were too many.
+#: Seconds between two log lines about dropped events.
 LOST_LOG_INTERVAL = 60.0
 
 _LIFE_CYCLE = frozenset(
@@ -59,16 +59,16 @@ class PluginEvents:
         self._pending_bytes = 0
         self._lost = 0
         self._lost_logged_at = float("-inf")
-        #: What is being published, and by whom.
+        #: The message that is being published, and its publisher.
         self._published: tuple[Message, Session] | None = None
 
     @property
     def observes_clients(self) -> bool:
-        """Whether some plugin wants more than the four events of the life cycle."""
+        """Whether a plugin handles more than the four life-cycle events."""
         return not self._wanted <= _LIFE_CYCLE
 
     async def life_cycle(self, event: BrokerEvents) -> None:
-        """Fire the event and wait until the plugins are done with it, or take too long."""
+        """Fire the event and wait for its handlers, up to the time limit."""
         tasks = self._fire(event, 0, {})
         if tasks:
             _, late = await asyncio.wait(tasks, timeout=self._guard.timeout)
@@ -78,7 +78,7 @@ class PluginEvents:
                 )
 
     def connect_received(self, connect: Connect) -> None:
-        """A CONNECT came, from whom is not known yet."""
+        """A CONNECT was received, and is not authenticated yet."""
         if MQTTEvents.PACKET_RECEIVED not in self._wanted:
             return
         will = connect.will
@@ -94,21 +94,21 @@ class PluginEvents:
         self._notify(MQTTEvents.PACKET_RECEIVED, packet=packet)
 
     def connected(self, session: Session) -> None:
-        """A client is there."""
+        """A client has connected."""
         view = self._sessions.of(session)
         self._notify(
             BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=view
         )
 
     def disconnected(self, session: Session) -> None:
-        """A client is gone."""
+        """A client has disconnected."""
         view = self._sessions.of(session)
         self._notify(
             BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=view
         )
 
     def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
-        """A client subscribed."""
+        """A client has subscribed."""
         if session.identity is not None:
             self._notify(
                 BrokerEvents.CLIENT_SUBSCRIBED,
@@ -118,7 +118,7 @@ class PluginEvents:
             )
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
-        """A client unsubscribed."""
+        """A client has unsubscribed."""
         if session.identity is not None:
             self._notify(
                 BrokerEvents.CLIENT_UNSUBSCRIBED, client_id=session.client_id, topic=topic_filter
@@ -134,12 +134,12 @@ class PluginEvents:
             self._notify_message(session, message, allowed=True)
 
     def refused(self, session: Session, message: Message) -> None:
-        """A client's message goes nowhere, as it is not allowed; amqtt tells that it came."""
+        """A client's message is not allowed and dropped; amqtt fires that it was received."""
         if session.identity is not None and self._wants_messages:
             self._notify_message(session, message, allowed=False)
 
     def retained(self, message: Message) -> None:
-        """A message was retained, or, being empty, deleted."""
+        """A message was retained, or, if empty, deleted."""
         published, self._published = self._published, None
         if BrokerEvents.RETAINED_MESSAGE not in self._wanted or message.topic.startswith("$SYS/"):
             return
@@ -174,7 +174,7 @@ class PluginEvents:
             )
 
     def _notify(self, event: Events, size: int = 0, **arguments: object) -> None:
-        """Fire the event unless as many are waiting as may; `size` is in bytes of payload."""
+        """Fire the event, or drop it if too many are pending; `size` is its payload in bytes."""
         if event not in self._wanted:
             return
         if self._pending < MAX_EVENTS and self._pending_bytes + size <= MAX_EVENT_BYTES:
@@ -184,15 +184,15 @@ class PluginEvents:
         now = asyncio.get_running_loop().time()
         if now - self._lost_logged_at >= LOST_LOG_INTERVAL:
             self._lost_logged_at = now
-            log.warning("amqtt plugins are too slow: %d events were not told to them", self._lost)
+            log.warning("amqtt plugins are too slow: %d events were dropped", self._lost)
 
     def _fire(
         self, event: Events, size: int, arguments: dict[str, Any]
     ) -> list[asyncio.Future[Any]]:
-        """Let amqtt start the event's handlers; returns what they run in."""
+        """Let amqtt start the event's handlers; returns their tasks."""
         fired = self._plugins._fired_events
         before = len(fired)
-        # It is a coroutine only by its name, as long as it is not to wait for the handlers.
+        # This coroutine never suspends as long as it is not asked to wait for the handlers.
         with contextlib.suppress(StopIteration):
             self._plugins.fire_event(event, **arguments).send(None)
         tasks = fired[before:]

@@ -1,4 +1,4 @@
-"""What plugins may not do to the appliance: take forever, or break it with an exception."""
+"""Limits plugins: a time limit for each call, and exceptions that are logged, not raised."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from appliance.config.redaction import redacted
 
 log = logging.getLogger(__name__)
 
-#: Seconds that plugins get for an answer or for an event of the life cycle: less than the default
-#: of `broker.limits.connect_timeout`, so that a client that they keep waiting is told.
+#: Seconds that plugins have for an answer or for a life-cycle event: less than the default of
+#: `broker.limits.connect_timeout`, so that a client gets an answer when they hang.
 PLUGIN_TIMEOUT = 8.0
 
-#: Failures that are told apart, so that each is told once.
+#: Different failures that are logged with a traceback, once each.
 _FAILURES = 1000
 
 _T = TypeVar("_T")
 
 
 class PluginGuard:
-    """Limits the time that plugins take, in seconds, and tells their failures.
+    """Limits the time of plugins, in seconds, and logs their failures.
 
-    `secrets` are those of the plugins' settings: no failure is told with one of them in it.
+    `secrets` are those of the plugins' settings, which are masked in the log.
     """
 
     def __init__(self, timeout: float = PLUGIN_TIMEOUT, secrets: Iterable[str] = ()) -> None:
@@ -34,10 +34,10 @@ class PluginGuard:
         self._logged: set[tuple[str, str]] = set()
 
     async def run(self, work: Coroutine[Any, Any, _T]) -> _T:
-        """The result of the work.
+        """Await the work and return its result.
 
         Raises:
-            asyncio.TimeoutError: it took too long; it was cancelled, whether it heeds that or not.
+            asyncio.TimeoutError: it took too long. It was cancelled, but may ignore that.
         """
         task = asyncio.ensure_future(work)
         try:
@@ -49,9 +49,9 @@ class PluginGuard:
             task.cancel()
 
     def log_failure(self, what: str, error: BaseException, secrets: Iterable[str] = ()) -> None:
-        """Log that `what` failed, with the traceback, the first time that it did so there.
+        """Log that `what` failed; with the traceback at the first time for each place.
 
-        `secrets` are what the plugin was told and nobody else may read, such as a password.
+        `secrets` are further strings to mask, such as the client's password.
         """
         hidden = [*self.secrets, *secrets]
         last = traceback.extract_tb(error.__traceback__)[-1:]
@@ -61,9 +61,9 @@ class PluginGuard:
         else:
             self._logged.add(failure)
             text = "".join(traceback.format_exception(error)).rstrip()
-            log.error("%s failed; this is told once\n%s", what, redacted(text, hidden))
+            log.error("%s failed; this is logged once\n%s", what, redacted(text, hidden))
 
 
 def plugin_name(plugin: object) -> str:
-    """What a plugin is called in the log."""
+    """The name of a plugin in the log."""
     return type(plugin).__name__

@@ -1,4 +1,4 @@
-"""Logins that amqtt's plugins decide: in a bounded time, so many at once, none of them twice."""
+"""Logins that amqtt's plugins decide: with time limit, throttle and cache, and so many at once."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from appliance.plugins.threads import Threads
 
 log = logging.getLogger(__name__)
 
-#: Logins that plugins are asked about at one time; others wait, as long as they may.
+#: Logins that plugins are asked about at a time; others wait, within the time limit.
 MAX_LOGINS: Final = 64
 
-#: The line of guesses that they wait in, if they have to.
+#: The queue of the login throttle in which these logins wait, see `LoginThrottle`.
 QUEUE: Final = "plugins"
 
 _STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
@@ -45,23 +45,24 @@ _TRY_LATER: Final = Refusal(
 
 
 class Throttle(Protocol):
-    """How long a login has to wait because others were wrong."""
+    """The login throttle, see `appliance.access.throttle`."""
 
     def reserve(self, address: str, queue: str = "", max_wait: float = ...) -> float | None:
-        """Seconds until the next one from this address is due; None when that is too long."""
+        """Reserve the next check for this address; seconds until then, None when too many."""
 
     def user_delay(self, username: str) -> float:
-        """Seconds because of wrong ones for the same user."""
+        """Seconds that a login waits because of wrong ones for the same user."""
 
     def record_failure(self, address: str, username: str) -> None:
-        """One was wrong."""
+        """Count a wrong login."""
 
 
 @dataclass(frozen=True, slots=True)
 class CachePolicy:
-    """How long a yes and a no of plugins hold, in seconds, and how many are kept of each kind.
+    """How long acceptances and refusals of plugins are cached, in seconds, and how many of each
+    kind.
 
-    Topics are judged while messages wait: of them an answer holds a second at least.
+    Messages wait for answers about topics: these are cached for a second at least.
     """
 
     keep: float = 10.0
@@ -69,19 +70,19 @@ class CachePolicy:
     size: int = 4096
 
     def topic_lifetime(self, *, allowed: bool) -> float:
-        """Seconds after which plugins are asked again about a topic."""
+        """Seconds for which an answer about a topic is cached."""
         return max(1.0, self.keep if allowed else self.keep_refusals)
 
 
-#: What came of a login: who it is or why not, and what plugins noted in their session.
+#: The outcome of a login: who it is or why it is refused, and what plugins stored in their session.
 _Outcome: TypeAlias = "tuple[Identity | Refusal, dict[str, Any], bool | None]"
 
 
 class PluginLogins:
-    """Asks the plugins that authenticate, and remembers what they said for a short time.
+    """Asks the plugins that authenticate, and caches their answers for a short time.
 
-    Nothing is remembered across a change of the rules: `epoch` tells it. Plugins that say nothing
-    in time, or fail, are asked again the next time.
+    A change of the rules, visible by `epoch`, invalidates the cache. Timeouts and failures are not
+    cached.
     """
 
     def __init__(
@@ -125,11 +126,11 @@ class PluginLogins:
     async def authenticate(
         self, connect: Connect, address: str, tls: ssl.SSLObject | None
     ) -> tuple[Identity | Refusal, object]:
-        """Who the plugins say that it is, and the session object in which they noted things.
+        """Who the client is according to the plugins, and the session object that they were shown.
 
-        It comes in when at least one plugin says yes and none says no, under the user name that it
-        gave if a plugin vouches for it. With a yes of `AnonymousAuthPlugin` alone it is anonymous
-        for the ACL file.
+        It is admitted when at least one plugin accepts it and none refuses it: under the user name
+        that it gave if a plugin vouches for that, and as anonymous if only `AnonymousAuthPlugin`
+        accepts it.
         """
         try:
             text = None if connect.password is None else connect.password.decode()
@@ -146,7 +147,7 @@ class PluginLogins:
         tls: ssl.SSLObject | None,
         noted: object,
     ) -> None:
-        """Remember the login for its connection, and hand an unclaimed session to its owner."""
+        """Store the login for its connection, and hand an unclaimed session to its owner."""
         if self._events.observes_clients or self._plugins._topic_plugins:
             login = cast("AmqttSession | None", noted)
             if login is None:  # its password is none of the plugins' business
@@ -160,10 +161,10 @@ class PluginLogins:
             self._broker.rules_changed()
 
     async def ask(self, login: AmqttSession, address: str) -> Identity | Refusal:
-        """Who it is, or why it does not come in; what plugins noted is in `login` then.
+        """Who it is, or why it is refused; what plugins stored in their session is in `login` then.
 
         0x88 Server unavailable when they did not answer in time or failed, 0x89 Server busy when
-        too many from its address were wrong.
+        too many logins from its address were wrong.
         """
         key = self._digest(login)
         epoch = self._epoch()
@@ -174,7 +175,7 @@ class PluginLogins:
                 asking = asyncio.ensure_future(self._ask_throttled(login, address, key, epoch))
                 self._asking[key, epoch] = asking
                 asking.add_done_callback(lambda _: self._asking.pop((key, epoch), None))
-            # One that leaves does not cancel it for others who sent the same.
+            # Not awaited directly: a client that leaves must not cancel it for the same logins.
             await asyncio.wait([asking])
             if asking.cancelled():
                 return _STOPPING
@@ -185,7 +186,7 @@ class PluginLogins:
         return who
 
     def close(self) -> None:
-        """Ask no more."""
+        """Cancel all questions."""
         for asking in list(self._asking.values()):
             asking.cancel()
 
@@ -229,8 +230,8 @@ class PluginLogins:
         return Identity(login.username if vouched else None, login.client_id or "")
 
     async def _ask_all(self, login: AmqttSession) -> tuple[dict[Any, Any], bool]:
-        """What each plugin says, and whether one vouches for the user name."""
-        # In two parts: who vouches is not to be seen from mixed answers.
+        """Each plugin's answer, and whether one vouches for the user name."""
+        # In two groups: from mixed answers it cannot be seen who vouches.
         plugins: list[Any] = list(self._plugins._auth_plugins)
         demanding = [plugin for plugin in plugins if not isinstance(plugin, AnonymousAuthPlugin)]
         undemanding = [plugin for plugin in plugins if plugin not in demanding]
@@ -247,7 +248,7 @@ class PluginLogins:
         )
         return dict(zip(plugins, await asyncio.gather(*asked), strict=True))
 
-    # --- what they said ------------------------------------------------------------------------
+    # --- the cache -----------------------------------------------------------------------------
 
     def _cached(self, key: bytes, epoch: int) -> _Outcome | None:
         outcome, until, then = self._known.get(key, (None, 0.0, 0))
@@ -264,7 +265,7 @@ class PluginLogins:
             self._known.popitem(last=False)
 
     def _digest(self, login: AmqttSession) -> bytes:
-        """What makes two logins the same: all that plugins judge by, and the password not kept."""
+        """The cache key: a keyed hash of all that plugins judge by, so no password is stored."""
         tls = login.ssl_object
         certificate = tls.getpeercert(binary_form=True) if tls is not None else None
         parts = [

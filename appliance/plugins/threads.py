@@ -1,4 +1,4 @@
-"""Plugins that wait without `await`: each is called in a thread, not on the event loop."""
+"""Threads for plugins that block: each is called in its own thread, not on the event loop."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, Final, TypeAlias
 
-#: Those of amqtt that do: they hash passwords, or talk to a server, in one go.
+#: Plugins of amqtt that block: they hash passwords, or talk to a server, without `await`.
 _BLOCKING: Final = ("amqtt.plugins.authentication.FileAuthPlugin", "amqtt.contrib.ldap.")
 
 _Call: TypeAlias = "tuple[asyncio.Future[Any], Coroutine[Any, Any, Any]]"
 
 
 def blocks(plugin: object) -> bool:
-    """Whether calling the plugin would stop the event loop."""
+    """Whether calling the plugin would block the event loop."""
     kind = type(plugin)
     return f"{kind.__module__}.{kind.__qualname__}".startswith(_BLOCKING)
 
 
 class Threads:
-    """Calls plugins, each that blocks in its thread, one call after the other.
+    """Calls plugins; a blocking plugin is called in its own thread, one call at a time.
 
-    A plugin that never returns holds up its own callers only, who stop waiting when they like, and
-    not the end of the process.
+    A plugin that never returns blocks only its own callers, who have time limits, and not the end
+    of the process.
     """
 
     def __init__(self) -> None:
@@ -42,14 +42,14 @@ class Threads:
         return await thread.run(work)
 
     def close(self) -> None:
-        """Let the threads end when they are done with what they do."""
+        """End each thread after its current call."""
         for thread in self._threads.values():
             thread.close()
         self._threads.clear()
 
 
 class _Thread:
-    """One thread and the calls that wait for it."""
+    """One thread and its queue of calls."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.get_running_loop()

@@ -544,7 +544,9 @@ def test_strangers_and_users_of_other_kinds_look_like_users(access: FileAccess) 
     assert all(shown(access, user) == value for user, value in seen.items())
     # The right password of one whose hash is of another kind is as good as none.
     refusals = [ScramClient(user, "pencil").log_in(begin(access)) for user in ("old", "nobody")]
-    refused(refusals[0], "'old' is not stored for SCRAM-SHA-256; set it with: appliance user passwd")
+    refused(
+        refusals[0], "'old' is not stored for SCRAM-SHA-256; set it with: appliance user passwd"
+    )
     refused(refusals[1], "unknown user 'nobody'")
     wrong = ScramClient("user", "wrong").log_in(begin(access))
     assert isinstance(wrong, Refusal)
@@ -836,7 +838,7 @@ def test_a_refusal_is_the_same_for_everyone(robot: ApplianceProcess, dial: Dial)
 def test_the_log_says_who_was_refused_and_why(quiet_robot: ApplianceProcess) -> None:
     reasons = {
         ("user", "Pencil"): "wrong SCRAM-SHA-256 proof of user 'user'$",
-        ("alice", "x"): "the password of user 'alice' is not stored for SCRAM-SHA-256; set it with:",
+        ("alice", "x"): "the password of user 'alice' is not stored for SCRAM-SHA-256; set it",
         ("nobody", "x"): "unknown user 'nobody'$",
         ("no\nline", "x"): "SCRAM-SHA-256: a user name must not hold control characters",
     }
