@@ -21,44 +21,44 @@ from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock
 from appliance.store.inspection import summarise
-from store.house import House, difference, state
+from store.harness import Harness, difference, state
 
 NOBODY = pwd.getpwnam("nobody").pw_uid
 
 
 @pytest_asyncio.fixture
-async def house(tmp_path: Path) -> AsyncIterator[House]:
+async def harness(tmp_path: Path) -> AsyncIterator[Harness]:
     """One with twenty sessions, thirty messages for each of them, and ten that are retained."""
-    house = House(tmp_path / "first").start()
+    harness = Harness(tmp_path / "first").start()
     for number in range(20):
-        client = await house.join(f"client{number}", **lasting(5))
+        client = await harness.join(f"client{number}", **lasting(5))
         client.send(Subscribe(1, [Subscription("a/#", 1)]))
         client.lose()
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     for number in range(30):
         payload = b"%d" % number + bytes(500)
         publisher.send(Publish(f"a/{number % 10}", payload, 1, True, packet_id=number + 1))
     publisher.lose()
-    yield house
-    await house.stop()
+    yield harness
+    await harness.stop()
 
 
-def messages(house: House) -> int:
-    return sum(len(session.queue) for session in house.broker.sessions.values())
+def messages(harness: Harness) -> int:
+    return sum(len(session.queue) for session in harness.broker.sessions.values())
 
 
-async def test_only_its_user_may_read_it(house: House) -> None:
-    await house.written()
-    directory = house.path.parent
+async def test_only_its_user_may_read_it(harness: Harness) -> None:
+    await harness.written()
+    directory = harness.path.parent
     assert stat.S_IMODE(directory.stat().st_mode) == 0o700
     names = {path.name for path in directory.iterdir()}
     assert names == {"store.db", "store.db-wal", "store.db-shm", "store.db.lock"}
     assert {stat.S_IMODE(path.stat().st_mode) for path in directory.iterdir()} == {0o600}
 
 
-async def test_one_appliance_has_it(house: House) -> None:
+async def test_one_appliance_has_it(harness: Harness) -> None:
     with pytest.raises(StoreError, match=r"store\.db is in use by another appliance"):
-        SqliteStore(house.path).open()
+        SqliteStore(harness.path).open()
 
 
 @pytest.fixture
@@ -74,34 +74,34 @@ def open_folder() -> Iterator[Path]:
 @pytest.mark.parametrize("mode", [0o700, 0o755])
 async def test_one_of_another_user_is_told(mode: int, open_folder: Path) -> None:
     """As after `sudo appliance run`, once."""
-    house = House(open_folder).start()
-    await house.stop()
-    house.path.parent.chmod(mode)
+    harness = Harness(open_folder).start()
+    await harness.stop()
+    harness.path.parent.chmod(mode)
     os.seteuid(NOBODY)
     try:
         with pytest.raises(StoreError) as caught:
-            SqliteStore(house.path).open()
+            SqliteStore(harness.path).open()
     finally:
         os.seteuid(0)
     text = str(caught.value)
-    assert f"{house.path} belongs to root, and this runs as nobody" in text
-    assert f"sudo chown nobody {house.path.parent} {house.path}*" in text
+    assert f"{harness.path} belongs to root, and this runs as nobody" in text
+    assert f"sudo chown nobody {harness.path.parent} {harness.path}*" in text
 
 
-async def test_the_lock_is_let_go(house: House) -> None:
-    await house.stop()
-    second = House(house.path.parent.parent).start()
+async def test_the_lock_is_let_go(harness: Harness) -> None:
+    await harness.stop()
+    second = Harness(harness.path.parent.parent).start()
     await second.stop()
 
 
 async def test_an_older_database_is_migrated(
-    house: House, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    await house.written()
-    before = state(house.broker)
+    await harness.written()
+    before = state(harness.broker)
     more = "ALTER TABLE session ADD COLUMN colour TEXT;\nCREATE TABLE more (id INTEGER);\n"
     monkeypatch.setattr(schema, "MIGRATIONS", (*schema.MIGRATIONS, more))
-    twin = house.twin(tmp_path / "twin")
+    twin = harness.twin(tmp_path / "twin")
     assert not difference(before, state(twin.broker))
     await twin.join("new", **lasting(5))
     assert schema.version(sqlite3.connect(twin.path)) == len(schema.MIGRATIONS)
@@ -110,14 +110,14 @@ async def test_an_older_database_is_migrated(
 
 @pytest.mark.parametrize("is_stopped", [True, False])
 async def test_a_newer_version_that_does_not_start_leaves_it_to_the_older(
-    house: House, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_stopped: bool
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_stopped: bool
 ) -> None:
     """After a failed upgrade `appliance install` puts the version back that was there before."""
-    await house.written()
-    before = state(house.broker)
+    await harness.written()
+    before = state(harness.broker)
     with monkeypatch.context() as patch:
         patch.setattr(schema, "MIGRATIONS", (*schema.MIGRATIONS, "CREATE TABLE more (id INTEGER)"))
-        newer = house.twin(tmp_path / "newer")
+        newer = harness.twin(tmp_path / "newer")
         if is_stopped:  # a port is taken, for example; else it is killed
             await newer.stop()
     older = newer.twin(tmp_path / "older")
@@ -134,10 +134,10 @@ async def test_a_new_one_can_be_looked_at_before_anything_is_written(tmp_path: P
     assert summarise(store.path).sessions == []
 
 
-async def test_what_nobody_waits_for_is_written_at_the_stop(house: House, tmp_path: Path) -> None:
+async def test_a_lazy_change_is_committed_at_the_stop(harness: Harness, tmp_path: Path) -> None:
     """A retained message with QoS 0, for example, which comes just before it."""
-    await house.written()
-    twin = house.twin(tmp_path / "twin")
+    await harness.written()
+    twin = harness.twin(tmp_path / "twin")
     peer = twin.peer()
     peer.say_connect("sensor")
     peer.client.accept(peer.user)
@@ -152,25 +152,25 @@ async def test_what_nobody_waits_for_is_written_at_the_stop(house: House, tmp_pa
 
 
 async def test_a_newer_database_is_left_alone(
-    house: House, monkeypatch: pytest.MonkeyPatch
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    await house.stop()
+    await harness.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
-    before = house.path.read_bytes()
+    before = harness.path.read_bytes()
     with pytest.raises(StoreError, match=r"newer appliance \(version 4 .* knows 0\)"):
-        SqliteStore(house.path).open()
-    assert house.path.read_bytes() == before
+        SqliteStore(harness.path).open()
+    assert harness.path.read_bytes() == before
 
 
 @pytest.mark.parametrize("harm", HARMS)
 @pytest.mark.parametrize("seed", range(5))
-async def test_it_always_starts(house: House, tmp_path: Path, harm: str, seed: int) -> None:
-    await house.written()
-    copy = House(tmp_path / "copy")
-    twin = house.twin(tmp_path / "twin")
+async def test_it_always_starts(harness: Harness, tmp_path: Path, harm: str, seed: int) -> None:
+    await harness.written()
+    copy = Harness(tmp_path / "copy")
+    twin = harness.twin(tmp_path / "twin")
     copy.path.parent.mkdir(parents=True)
     for name in ("store.db", "store.db-wal"):
-        (copy.path.parent / name).write_bytes((house.path.parent / name).read_bytes())
+        (copy.path.parent / name).write_bytes((harness.path.parent / name).read_bytes())
     await twin.stop()
     HARMS[harm](copy.path, random.Random(seed))
     copy.start()
@@ -187,16 +187,16 @@ async def test_it_always_starts(house: House, tmp_path: Path, harm: str, seed: i
 
 
 async def test_what_can_be_read_of_a_damaged_one_is_saved(
-    house: House, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    harness: Harness, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    await house.written()
-    expected = messages(house)
-    await house.stop()  # all of it is in the database, nothing in the log
-    data = bytearray(house.path.read_bytes())
+    await harness.written()
+    expected = messages(harness)
+    await harness.stop()  # all of it is in the database, nothing in the log
+    data = bytearray(harness.path.read_bytes())
     middle = len(data) // 2 // 4096 * 4096
     data[middle : middle + 4096] = bytes(4096)
-    house.path.write_bytes(data)
-    second = House(tmp_path / "first").start()
+    harness.path.write_bytes(data)
+    second = Harness(tmp_path / "first").start()
     assert 0 < messages(second) < expected + 1
     assert len(second.broker.sessions) > 10
     (aside,) = second.path.parent.glob("store.db.damaged-*")
@@ -209,9 +209,9 @@ async def test_what_can_be_read_of_a_damaged_one_is_saved(
     await second.stop()
 
 
-async def test_rows_without_sense_are_left_out(house: House, tmp_path: Path) -> None:
-    await house.stop()
-    with sqlite3.connect(house.path) as connection:
+async def test_rows_without_sense_are_left_out(harness: Harness, tmp_path: Path) -> None:
+    await harness.stop()
+    with sqlite3.connect(harness.path) as connection:
         connection.execute("UPDATE owed SET qos = 7 WHERE id IN (SELECT id FROM owed LIMIT 1)")
         connection.execute(
             "INSERT INTO owed SELECT id + 1000000, 99999, message, qos, retain, "
@@ -222,11 +222,11 @@ async def test_rows_without_sense_are_left_out(house: House, tmp_path: Path) -> 
             "NULL, NULL, NULL, 'never')"
         )
     connection.close()
-    second = House(tmp_path / "first").start()
+    second = Harness(tmp_path / "first").start()
     assert messages(second) == 20 * 30 - 1
     await second.written()
     await second.stop()
-    with sqlite3.connect(house.path) as connection:
+    with sqlite3.connect(harness.path) as connection:
         for condition in (
             "owed WHERE qos = 7",
             "owed WHERE session = 99999",
@@ -238,32 +238,32 @@ async def test_rows_without_sense_are_left_out(house: House, tmp_path: Path) -> 
 
 
 async def test_what_is_too_much_for_it_is_refused(tmp_path: Path) -> None:
-    house = House(tmp_path, Limits(user=ALONE), size=1 << 20).start()
-    client = await house.join("client", **lasting(5))
+    harness = Harness(tmp_path, Limits(user=ALONE), size=1 << 20).start()
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 1)]))
     client.lose()
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     publisher.received()
     codes = []
     for number in range(1, 31):
         publisher.send(Publish("a", bytes(50_000), 1, packet_id=number))
-        await house.written()
+        await harness.written()
         codes += [packet.reason_code for packet in publisher.received()]
     assert codes == [0] * 20 + [0x97] * 10
-    await house.stop()
+    await harness.stop()
 
 
 async def test_what_is_too_old_is_dropped(tmp_path: Path) -> None:
     clock, boot = 1_800_000_000.0, "one"
-    house = House(tmp_path / "first", age=3600, wall=lambda: clock, boot=lambda: boot).start()
-    client = await house.join("client", **lasting(5))
+    harness = Harness(tmp_path / "first", age=3600, wall=lambda: clock, boot=lambda: boot).start()
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 1)]))
     client.lose()
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     publisher.send(Publish("a", b"old", 1, packet_id=1))
-    await house.written()
+    await harness.written()
     clock, boot = clock + 3000, "two"  # as after a restart
-    twin = house.twin(tmp_path / "twin")
+    twin = harness.twin(tmp_path / "twin")
     publisher = await twin.join("publisher")
     publisher.send(Publish("a", b"new", 1, packet_id=1))
     await twin.written()
@@ -276,7 +276,7 @@ async def test_what_is_too_old_is_dropped(tmp_path: Path) -> None:
     assert [delivery[0].payload for delivery in queue] == [b"new"]
     check_accounts(twin.broker)
     await twin.stop()
-    await house.stop()
+    await harness.stop()
 
 
 def test_a_lock_is_for_one(tmp_path: Path) -> None:

@@ -32,22 +32,22 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.store.inspection import summarise
-from store.house import House, difference, state
+from store.harness import Harness, difference, state
 
 #: By a clock that is right.
 YEAR_2030 = 1_900_000_000.0
 
 
 @pytest_asyncio.fixture
-async def house(tmp_path: Path) -> AsyncIterator[House]:
-    house = House(tmp_path / "first", Limits(inflight=4)).start()
-    yield house
-    await house.stop()
+async def harness(tmp_path: Path) -> AsyncIterator[Harness]:
+    harness = Harness(tmp_path / "first", Limits(inflight=4)).start()
+    yield harness
+    await harness.stop()
 
 
-async def restarted(house: House, directory: Path) -> House:
-    await house.written()
-    return house.twin(directory)
+async def restarted(harness: Harness, directory: Path) -> Harness:
+    await harness.written()
+    return harness.twin(directory)
 
 
 PROPERTIES: Properties = {
@@ -60,13 +60,13 @@ PROPERTIES: Properties = {
 }
 
 
-async def test_every_field_comes_back(house: House, tmp_path: Path) -> None:
+async def test_every_field_comes_back(harness: Harness, tmp_path: Path) -> None:
     will = Will("will", b"gone", 1, True, {Property.WILL_DELAY_INTERVAL: 60, **PROPERTIES})
-    client = await house.join("client", will=will, **lasting(5, 1000))
+    client = await harness.join("client", will=will, **lasting(5, 1000))
     options = Subscription("a/+", 2, True, True, 2)
     client.send(Subscribe(1, [options], {Property.SUBSCRIPTION_IDENTIFIER: [7]}))
     client.send(Subscribe(2, [Subscription("$share/group/b", 1)]))
-    publisher = await house.join("publisher", **lasting(5))
+    publisher = await harness.join("publisher", **lasting(5))
     for number in range(3):
         for qos in (1, 2):
             packet_id = 10 * number + qos
@@ -76,17 +76,17 @@ async def test_every_field_comes_back(house: House, tmp_path: Path) -> None:
             publisher.send(Pubrel(packet_id))
     publisher.send(Publish("b", b"shared", 1, packet_id=90))
     publisher.send(Publish("a/y", b"unreleased", 2, packet_id=91, properties=dict(PROPERTIES)))
-    await house.written()
+    await harness.written()
     messages = [packet for packet in client.received() if isinstance(packet, Publish)]
     assert [message.qos for message in messages] == [1, 2, 1, 2]
     client.send(Puback(messages[0].packet_id), Pubrec(messages[1].packet_id))
     client.lose()
-    before = state(house.broker)
+    before = state(harness.broker)
     session = before["sessions"]["client"]
     assert [each is None for _, each in session["inflight"]].count(True) == 1
     assert session["will_at"] is not None and session["queue"]
     assert before["sessions"]["publisher"]["received"]
-    twin = await restarted(house, tmp_path / "twin")
+    twin = await restarted(harness, tmp_path / "twin")
     after = state(twin.broker)
     assert not difference(before["sessions"].pop("client"), after["sessions"].pop("client"))
     # Its client was connected, and counts as gone since now.
@@ -98,20 +98,20 @@ async def test_every_field_comes_back(house: House, tmp_path: Path) -> None:
 
 
 async def test_retained_messages_that_were_not_sent_yet_are_sent_behind_the_restart(
-    house: House, tmp_path: Path
+    harness: Harness, tmp_path: Path
 ) -> None:
     """The client has its SUBACK and will find its session: it does not subscribe again."""
     topics = [f"a/{number}" for number in range(10)]
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     for number, topic in enumerate(topics, 1):
         publisher.send(Publish(topic, b"x", 1, retain=True, packet_id=number))
-    client = await house.join("client", **lasting(5))
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a/#", 1)]))
-    await house.written()
+    await harness.written()
     sent = [packet for packet in client.received() if isinstance(packet, Publish)]
-    assert len(sent) == house.limits.inflight
+    assert len(sent) == harness.limits.inflight
     client.send(Puback(sent[0].packet_id))
-    twin = await restarted(house, tmp_path / "twin")
+    twin = await restarted(harness, tmp_path / "twin")
     again = await twin.join("client", **lasting(5))
     assert await _acknowledge_all(twin, again) == {*topics}
     # That was all of them: behind another restart there is nothing left to be sent.
@@ -123,66 +123,66 @@ async def test_retained_messages_that_were_not_sent_yet_are_sent_behind_the_rest
 
 
 async def test_what_was_asked_for_first_is_sent_behind_the_restart_whatever_was_asked_then(
-    house: House, tmp_path: Path
+    harness: Harness, tmp_path: Path
 ) -> None:
     """It would be sent without a restart: who asks for nothing more takes nothing back."""
     topics = [f"a/{number}" for number in range(10)]
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     for number, topic in enumerate(topics, 1):
         publisher.send(Publish(topic, b"x", 1, retain=True, packet_id=number))
-    client = await house.join("client", **lasting(5))
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a/#", 1)]))
     client.send(Subscribe(2, [Subscription("a/#", 1, retain_handling=2)]))
-    await house.written()
-    twin = await restarted(house, tmp_path / "twin")
+    await harness.written()
+    twin = await restarted(harness, tmp_path / "twin")
     again = await twin.join("client", **lasting(5))
     assert await _acknowledge_all(twin, again) == {*topics}
-    assert await _acknowledge_all(house, client) == {*topics}
+    assert await _acknowledge_all(harness, client) == {*topics}
     await twin.stop()
 
 
-async def _acknowledge_all(house: House, client: Peer) -> set[str]:
+async def _acknowledge_all(harness: Harness, client: Peer) -> set[str]:
     """Topics of all that the client is sent."""
     topics: set[str] = set()
     while messages := [p for p in client.received() if isinstance(p, Publish)]:
         topics |= {message.topic for message in messages}
         client.send(*(Puback(message.packet_id) for message in messages if message.packet_id))
-        await house.written()
+        await harness.written()
     return topics
 
 
 async def test_a_store_of_before_replays_were_in_it(tmp_path: Path) -> None:
-    house = House(tmp_path / "first").start()
-    client = await house.join("client", **lasting(5))
+    harness = Harness(tmp_path / "first").start()
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 1)]))
-    await house.stop()
-    with contextlib.closing(sqlite3.connect(house.path)) as connection:
+    await harness.stop()
+    with contextlib.closing(sqlite3.connect(harness.path)) as connection:
         connection.execute("ALTER TABLE subscription DROP COLUMN replaying")
         connection.execute("UPDATE about SET version = 2")
         connection.execute("PRAGMA user_version = 2")
         connection.commit()
-    assert [session.subscriptions for session in summarise(house.path).sessions] == [1]
-    twin = house.twin(tmp_path / "twin")
+    assert [session.subscriptions for session in summarise(harness.path).sessions] == [1]
+    twin = harness.twin(tmp_path / "twin")
     assert [*twin.broker.sessions["client"].subscriptions] == ["a"]
     await twin.stop()
 
 
 @pytest.mark.parametrize("version", [4, 5])
 async def test_what_was_in_flight_comes_again_with_its_id(
-    house: House, tmp_path: Path, version: int
+    harness: Harness, tmp_path: Path, version: int
 ) -> None:
     """[MQTT-4.4.0-1], [MQTT-3.3.1-1]: with DUP, in its order, and nothing before its turn."""
-    client = await house.join("client", version, **lasting(version))
+    client = await harness.join("client", version, **lasting(version))
     client.send(Subscribe(1, [Subscription("a", 2)]))
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     for number in range(6):
         publisher.publish("a", b"%d" % number, 0)
         publisher.send(Publish("a", b"%d" % number, 1 + number % 2, packet_id=number + 1))
         publisher.send(Pubrel(number + 1))
-    await house.written()
+    await harness.written()
     sent = [p for p in client.received() if isinstance(p, Publish) and p.qos]
     client.send(Pubrec(sent[1].packet_id))
-    twin = await restarted(house, tmp_path / "twin")
+    twin = await restarted(harness, tmp_path / "twin")
     again = await twin.join("client", version, **lasting(version))
     _, released, *rest = again.received()
     assert isinstance(released, Pubrel) and released.packet_id == sent[1].packet_id
@@ -201,13 +201,13 @@ async def test_what_was_in_flight_comes_again_with_its_id(
 
 
 async def test_a_qos_2_message_is_released_after_the_restart_once(
-    house: House, tmp_path: Path
+    harness: Harness, tmp_path: Path
 ) -> None:
-    subscriber = await house.join("subscriber", **lasting(5))
+    subscriber = await harness.join("subscriber", **lasting(5))
     subscriber.send(Subscribe(1, [Subscription("a", 2)]))
-    publisher = await house.join("publisher", **lasting(5))
+    publisher = await harness.join("publisher", **lasting(5))
     publisher.send(Publish("a", b"x", 2, packet_id=5))
-    twin = await restarted(house, tmp_path / "twin")
+    twin = await restarted(harness, tmp_path / "twin")
     publisher = await twin.join("publisher", **lasting(5))
     publisher.received()
     publisher.send(Publish("a", b"x", 2, False, True, 5))
@@ -219,15 +219,15 @@ async def test_a_qos_2_message_is_released_after_the_restart_once(
     await twin.stop()
 
 
-async def test_a_will_is_published_after_a_crash(house: House, tmp_path: Path) -> None:
+async def test_a_will_is_published_after_a_crash(harness: Harness, tmp_path: Path) -> None:
     """5.0 section 3.1.2.5: a server that failed may do so after its restart; its delay counts."""
-    watcher = await house.join("watcher", **lasting(5))
+    watcher = await harness.join("watcher", **lasting(5))
     watcher.send(Subscribe(1, [Subscription("will/+", 1)]))
-    await house.join("lasting", will=Will("will/now", b"", 1), **lasting(5))
+    await harness.join("lasting", will=Will("will/now", b"", 1), **lasting(5))
     delayed = Will("will/late", b"", 1, properties={Property.WILL_DELAY_INTERVAL: 60})
-    await house.join("delayed", will=delayed, **lasting(5))
-    await house.join("clean", will=Will("will/clean", b"", 1))
-    twin = await restarted(house, tmp_path / "twin")
+    await harness.join("delayed", will=delayed, **lasting(5))
+    await harness.join("clean", will=Will("will/clean", b"", 1))
+    twin = await restarted(harness, tmp_path / "twin")
     queue = twin.broker.sessions["watcher"].queue
     twin.tick()
     assert {delivery[0].topic for delivery in queue} == {"will/now", "will/clean"}
@@ -243,12 +243,12 @@ async def test_a_will_is_published_after_a_crash(house: House, tmp_path: Path) -
     await twin.stop()
 
 
-async def test_a_clean_stop_keeps_sessions_and_sends_no_will(house: House, tmp_path: Path) -> None:
-    watcher = await house.join("watcher", **lasting(5))
+async def test_a_clean_stop_saves_sessions_without_wills(harness: Harness, tmp_path: Path) -> None:
+    watcher = await harness.join("watcher", **lasting(5))
     watcher.send(Subscribe(1, [Subscription("will", 1)]))
-    await house.join("client", will=Will("will", b"", 1), **lasting(5))
-    house.broker.close(lambda session: session.close_link(0x8B, ""))  # type: ignore[arg-type]
-    twin = await restarted(house, tmp_path / "twin")
+    await harness.join("client", will=Will("will", b"", 1), **lasting(5))
+    harness.broker.close(lambda session: session.close_link(0x8B, ""))  # type: ignore[arg-type]
+    twin = await restarted(harness, tmp_path / "twin")
     twin.tick(1)
     assert set(twin.broker.sessions) == {"watcher", "client"}
     assert not twin.broker.sessions["watcher"].queue
@@ -259,18 +259,18 @@ async def test_a_clean_stop_keeps_sessions_and_sends_no_will(house: House, tmp_p
 async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
     """What expired while the robot was switched off is gone."""
     clock, boot = 1_800_000_000.0, "one"
-    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
+    harness = Harness(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
     for name, seconds in (("short", 100), ("long", 1000)):
-        client = await house.join(name, **lasting(5, seconds))
+        client = await harness.join(name, **lasting(5, seconds))
         client.send(Subscribe(1, [Subscription("a", 1)]))
         client.lose()
     expiry = {Property.MESSAGE_EXPIRY_INTERVAL: 200}
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     publisher.send(Publish("a", b"short", 1, True, packet_id=1, properties=dict(expiry)))
     publisher.send(Publish("a", b"long", 1, packet_id=2))
-    await house.written()
+    await harness.written()
     clock, boot = clock + 300, "other"
-    twin = house.twin(tmp_path / "twin")
+    twin = harness.twin(tmp_path / "twin")
     twin.tick()
     assert set(twin.broker.sessions) == {"long"}
     assert not len(twin.broker.retained)
@@ -278,7 +278,7 @@ async def test_times_are_those_of_the_wall_clock(tmp_path: Path) -> None:
     payloads = [p.payload for p in client.received() if isinstance(p, Publish)]
     assert payloads == [b"long"]
     await twin.stop()
-    await house.stop()
+    await harness.stop()
 
 
 @pytest.mark.parametrize(
@@ -297,33 +297,33 @@ async def test_nothing_expires_early_by_a_wrong_clock(
 ) -> None:
     """The store's time goes on with the time that the computer was on, and known to be off."""
     clock, boot = before, boots[0]
-    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
-    client = await house.join("client", **lasting(5, 100))
+    harness = Harness(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
+    client = await harness.join("client", **lasting(5, 100))
     client.lose()
-    await house.written()
+    await harness.written()
     clock, boot = after, boots[1]
-    twin = house.twin(tmp_path / "twin")
+    twin = harness.twin(tmp_path / "twin")
     twin.tick()
     assert ("client" in twin.broker.sessions) is not expired
     twin.tick(ahead=101)  # nor too late, as far as it was on
     assert "client" not in twin.broker.sessions
     await twin.stop()
-    await house.stop()
+    await harness.stop()
 
 
 async def test_the_clock_is_set_after_the_boot(tmp_path: Path) -> None:
     """A robot without a clock of its own learns the time from the network, later; that is no time
     that has passed, also when the power fails right after it."""
     clock, boot = 1000.0, "one"
-    house = House(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
-    client = await house.join("client", **lasting(5, 100))
+    harness = Harness(tmp_path / "first", wall=lambda: clock, boot=lambda: boot).start()
+    client = await harness.join("client", **lasting(5, 100))
     client.lose()
-    await house.written()
+    await harness.written()
     clock = YEAR_2030
-    house.store._check_clock()
-    await house.written()
+    harness.store._check_clock()
+    await harness.written()
     boot, clock = "two", clock + 50
-    twin = house.twin(tmp_path / "twin")
+    twin = harness.twin(tmp_path / "twin")
     twin.tick()
     assert "client" in twin.broker.sessions
     [session] = summarise(twin.path).sessions
@@ -331,56 +331,56 @@ async def test_the_clock_is_set_after_the_boot(tmp_path: Path) -> None:
     twin.tick(ahead=51)
     assert "client" not in twin.broker.sessions
     await twin.stop()
-    await house.stop()
+    await harness.stop()
 
 
 async def test_a_store_of_before_there_was_a_clock_in_it(tmp_path: Path) -> None:
-    house = House(tmp_path / "first").start()
-    client = await house.join("client", **lasting(5, 100))
+    harness = Harness(tmp_path / "first").start()
+    client = await harness.join("client", **lasting(5, 100))
     client.lose()
-    await house.written()
-    await house.stop()
-    with contextlib.closing(sqlite3.connect(house.path)) as connection:
+    await harness.written()
+    await harness.stop()
+    with contextlib.closing(sqlite3.connect(harness.path)) as connection:
         connection.execute("DROP TABLE clock")
         connection.execute("UPDATE about SET version = 1")
         connection.execute("PRAGMA user_version = 1")
         connection.commit()
-    assert [session.client_id for session in summarise(house.path).sessions] == ["client"]
-    twin = house.twin(tmp_path / "twin")
+    assert [session.client_id for session in summarise(harness.path).sessions] == ["client"]
+    twin = harness.twin(tmp_path / "twin")
     twin.tick()
     assert "client" in twin.broker.sessions
     await twin.stop()
 
 
-async def test_nothing_is_written_for_who_is_not_stored(house: House) -> None:
-    await house.written()
-    commits = house.store.metrics.commits
-    client = await house.join("client")
+async def test_nothing_is_written_for_who_is_not_stored(harness: Harness) -> None:
+    await harness.written()
+    commits = harness.store.metrics.commits
+    client = await harness.join("client")
     client.send(Subscribe(1, [Subscription("#", 2)]))
     client.received()
-    publisher = await house.join("publisher", 4)
+    publisher = await harness.join("publisher", 4)
     publisher.received()
     publisher.publish("a", qos=1)
     publisher.publish("a", qos=2)
     publisher.publish("$SYS/x", qos=0, retain=True)
     assert len(client.drain()) == 2
-    assert not house.store._committer.open and not house.store.staged
-    assert house.store.metrics.commits == commits
+    assert not harness.store._committer.open and not harness.store.staged
+    assert harness.store.metrics.commits == commits
 
 
 async def test_nothing_passes_what_waits_for_a_batch_in_which_there_is_nothing(
-    house: House,
+    harness: Harness,
 ) -> None:
     """[MQTT-4.6.0-6]: a client may be held to depend on more than it does."""
-    store, broker = house.store, house.broker
-    client, inside = await house.join("client"), broker.attach("inside", FakeLink())
+    store, broker = harness.store, harness.broker
+    client, inside = await harness.join("client"), broker.attach("inside", FakeLink())
     client.send(Subscribe(1, [Subscription("a", 1)]))
     client.received()
-    for number in range(house.limits.inflight + 1):
+    for number in range(harness.limits.inflight + 1):
         broker.publish(Message("a", b"%d" % number, 1), inside)
     broker.flush()
     sent = client.messages()
-    await house.written()
+    await harness.written()
     broker.publish(Message("b", b"x", 1, True), inside)
     store.hurry()  # and the batch is closed that this is in
     client.send(*(Puback(message.packet_id) for message in sent))
@@ -392,41 +392,41 @@ async def test_nothing_passes_what_waits_for_a_batch_in_which_there_is_nothing(
         await asyncio.sleep(0)
     broker.publish(Message("a", b"last", 1), inside)
     broker.flush()
-    await house.written()
+    await harness.written()
     assert client.payloads() == [b"4", b"last"]
 
 
-async def test_a_payload_is_stored_once(house: House) -> None:
+async def test_a_payload_is_stored_once(harness: Harness) -> None:
     for number in range(20):
-        client = await house.join(f"client{number}", **lasting(5))
+        client = await harness.join(f"client{number}", **lasting(5))
         client.send(Subscribe(1, [Subscription("a", 1)]))
         client.lose()
-    publisher = await house.join("publisher")
+    publisher = await harness.join("publisher")
     publisher.send(Publish("a", bytes(100_000), 1, True, packet_id=1))
-    await house.written()
-    size = house.path.stat().st_size + house.path.with_name("store.db-wal").stat().st_size
+    await harness.written()
+    size = harness.path.stat().st_size + harness.path.with_name("store.db-wal").stat().st_size
     assert size < 1_000_000
-    assert len(house.store._messages) == 1
+    assert len(harness.store._messages) == 1
 
 
-async def test_nothing_is_left_when_all_is_settled(house: House, tmp_path: Path) -> None:
-    client = await house.join("client", **lasting(5))
+async def test_nothing_is_left_when_all_is_settled(harness: Harness, tmp_path: Path) -> None:
+    client = await harness.join("client", **lasting(5))
     client.send(Subscribe(1, [Subscription("a", 2)]))
-    await house.written()
+    await harness.written()
     client.received()
-    publisher = await house.join("publisher", **lasting(5))
+    publisher = await harness.join("publisher", **lasting(5))
     for number in range(1, 9):
         publisher.send(Publish("a", b"x", 1 + number % 2, packet_id=number), Pubrel(number))
     for _ in range(40):
-        await house.written()
+        await harness.written()
         for packet in client.received():
             if isinstance(packet, Publish):
                 answer = Puback if packet.qos == 1 else Pubrec
                 client.send(answer(packet.packet_id))
             elif isinstance(packet, Pubrel):
                 client.send(Pubcomp(packet.packet_id))
-    assert not house.store._messages and house.store.bytes == 0
-    twin = await restarted(house, tmp_path / "twin")
+    assert not harness.store._messages and harness.store.bytes == 0
+    twin = await restarted(harness, tmp_path / "twin")
     contents = state(twin.broker)["sessions"]
     assert not contents["client"]["inflight"] and not contents["client"]["queue"]
     await twin.stop()
@@ -439,8 +439,8 @@ class Chaos:
     TOPICS = ("t/1", "t/2", "u")
     FILTERS = ("t/+", "#", "u", "$share/g/t/#", "$share/g/u", "t/1")
 
-    def __init__(self, house: House, seed: int) -> None:
-        self.house = house
+    def __init__(self, harness: Harness, seed: int) -> None:
+        self.harness = harness
         self.dice = random.Random(seed)
         self.peers: dict[str, Peer] = {}
         self.unanswered: dict[str, list[Publish | Pubrel]] = {}
@@ -470,7 +470,7 @@ class Chaos:
             delay = {Property.WILL_DELAY_INTERVAL: 100} if version == 5 else None
             options["will"] = Will(dice.choice(self.TOPICS), b"will", 1, False, delay)
         self.unanswered[name] = []
-        self.peers[name] = await self.house.join(name, version, **options)
+        self.peers[name] = await self.harness.join(name, version, **options)
 
     def _listen(self, name: str, peer: Peer) -> None:
         for packet in peer.received():
@@ -527,16 +527,16 @@ class Chaos:
 
 @pytest.mark.parametrize("seed", range(6))
 async def test_whatever_happens_is_there_again(tmp_path: Path, seed: int) -> None:
-    house = House(tmp_path / "first", Limits(inflight=3, queue_messages=8)).start()
-    chaos = Chaos(house, seed)
+    harness = Harness(tmp_path / "first", Limits(inflight=3, queue_messages=8)).start()
+    chaos = Chaos(harness, seed)
     for number in range(6):
         for _ in range(60):
             await chaos.step()
             if chaos.dice.random() < 0.1:
                 await asyncio.sleep(0)
-        await house.written()
-        before = state(house.broker)
-        twin = house.twin(tmp_path / f"twin{number}")
+        await harness.written()
+        before = state(harness.broker)
+        twin = harness.twin(tmp_path / f"twin{number}")
         after = state(twin.broker)
         for name, session in before["sessions"].items():
             if session["ends_at"] is None:  # it was connected
@@ -544,26 +544,26 @@ async def test_whatever_happens_is_there_again(tmp_path: Path, seed: int) -> Non
                     entry["ends_at"] = entry["will_at"] = None
         assert not difference(before, after)
         check_accounts(twin.broker)
-        assert twin.store.bytes == house.store.bytes
+        assert twin.store.bytes == harness.store.bytes
         await twin.stop()
-    await house.stop()
+    await harness.stop()
 
 
-async def test_whose_all_of_it_is_is_known_after_a_restart(house: House, tmp_path: Path) -> None:
+async def test_owners_are_known_after_a_restart(harness: Harness, tmp_path: Path) -> None:
     for user in ("alice", "mallory", None):
         for number in range(2):
-            peer = await house.join(f"{user}-{number}", user=user, **lasting(5))
+            peer = await harness.join(f"{user}-{number}", user=user, **lasting(5))
             peer.send(Subscribe(1, [Subscription(f"{user}/queue", 1)]))
             peer.send(Publish(f"{user}/{number}", b"retained", 1, True, packet_id=1))
             peer.lose()
-    publisher = await house.join("publisher", user="alice")
+    publisher = await harness.join("publisher", user="alice")
     for user in ("alice", "mallory", None):
         publisher.send(Publish(f"{user}/queue", b"owed", 1, packet_id=1))
-    inside = house.broker.attach("inside", InsideLink())
-    house.broker.publish(Message("state", b"online", 1, True), inside)
+    inside = harness.broker.attach("inside", InsideLink())
+    harness.broker.publish(Message("state", b"online", 1, True), inside)
     publisher.lose()
-    house.broker.flush()
-    await house.written()
+    harness.broker.flush()
+    await harness.written()
 
     def figures(broker: Broker) -> dict[str, tuple[object, ...]]:
         accounts = broker.accounting.accounts
@@ -579,34 +579,34 @@ async def test_whose_all_of_it_is_is_known_after_a_restart(house: House, tmp_pat
             for each in (*users, accounts.inside)
         }
 
-    before = figures(house.broker)
+    before = figures(harness.broker)
     assert before["the appliance"][2] == 1
     assert before["user 'mallory'"][0] == ["mallory-0", "mallory-1"]
     assert before["user 'mallory'"][2] == 2 and before["user 'mallory'"][4]
-    again = house.twin(tmp_path / "again")
+    again = harness.twin(tmp_path / "again")
     assert figures(again.broker) == before
     check_accounts(again.broker)
     await again.stop()
 
 
 async def test_a_store_of_an_older_appliance_does_not_say_whose_a_message_is(
-    house: House, tmp_path: Path
+    harness: Harness, tmp_path: Path
 ) -> None:
-    peer = await house.join("peer", user="alice")
+    peer = await harness.join("peer", user="alice")
     peer.send(Publish("t", b"kept", 1, True, packet_id=1))
-    await house.written()
+    await harness.written()
     older = tmp_path / "older"
     older.mkdir()
     (older / "state").mkdir()
-    await house.stop()
-    shutil.copyfile(house.path, older / "state/store.db")
+    await harness.stop()
+    shutil.copyfile(harness.path, older / "state/store.db")
     with contextlib.closing(sqlite3.connect(older / "state/store.db")) as database:
         for column in ("username", "inside"):
             database.execute(f"ALTER TABLE retained DROP COLUMN {column}")
         database.execute("UPDATE about SET version = 3")
         database.execute("PRAGMA user_version = 3")
         database.commit()
-    again = House(older, house.limits, **house.options).start()
+    again = Harness(older, harness.limits, **harness.options).start()
     message = again.broker.retained.get("t")
     assert message is not None and message.payload == b"kept"
     assert again.broker.accounting.accounts.of_user(None).retained == 1

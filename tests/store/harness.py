@@ -1,4 +1,4 @@
-"""A broker with its store on disk, in the event loop of a test, and what both know, to compare."""
+"""A broker with its store on disk in the event loop of a test, and their state, for comparison."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from appliance.broker.shared import Share
 from appliance.store import SqliteStore
 
 
-class House:
-    """`start` builds the broker out of what the directory has; times are those of the loop."""
+class Harness:
+    """Starts a broker with what is in the directory; times are those of the event loop."""
 
     def __init__(self, directory: Path, limits: Limits | None = None, **options: Any) -> None:
         self.path = directory / "state/store.db"
         self.limits = limits or Limits()
         self.options = options
 
-    def start(self) -> House:
+    def start(self) -> Harness:
         self.store = SqliteStore(self.path, **{"durability": "process", **self.options})
         self.store.open()
         self.access = FakeAccess()
@@ -51,7 +51,7 @@ class House:
         return peer
 
     async def written(self) -> None:
-        """All that was staged is committed."""
+        """Wait until all that was staged is committed."""
         store = self.store
         deadline = time.monotonic() + PATIENCE
         while not store._committer.is_idle:
@@ -62,9 +62,9 @@ class House:
     async def stop(self) -> None:
         await self.store.close()
 
-    def twin(self, directory: Path) -> House:
-        """What would be there had the process been killed now."""
-        copy = House(directory, self.limits, **self.options)
+    def twin(self, directory: Path) -> Harness:
+        """A second broker, with what would be stored if the process had been killed now."""
+        copy = Harness(directory, self.limits, **self.options)
         copy.path.parent.mkdir(parents=True)
         for name in (self.path.name, f"{self.path.name}-wal"):
             if (self.path.parent / name).exists():
@@ -73,7 +73,7 @@ class House:
 
 
 def state(broker: Broker) -> dict[str, Any]:
-    """All of it that is to outlive a restart."""
+    """Everything of the broker that outlives a restart."""
     return {
         "sessions": {
             name: _session(broker, session)
@@ -86,7 +86,7 @@ def state(broker: Broker) -> dict[str, Any]:
 
 
 def _session(broker: Broker, session: Session) -> dict[str, Any]:
-    #: By their names; one whose members are all gone behind a restart is gone as well.
+    # Shared subscriptions without persistent members do not outlive a restart.
     groups = {
         name
         for name, share in broker.router.shares.items()
@@ -101,7 +101,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
         return _message(message), qos, retain, ids or None, group
 
     def full(held: UnreleasedPublish) -> set[str]:
-        """Of those that are still there, or there again."""
+        """The names of those that outlive a restart."""
         names = {each.filter for each in held.full if isinstance(each, Share)}
         return (names & groups) | {
             each.client_id
@@ -109,7 +109,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
             if each in held.full and each.persistent
         }
 
-    # The others are not known behind a restart, nor counted.
+    # The others are not restored, so their bytes are not counted.
     forgotten = sum(len(held.full) - len(full(held)) for held in session.received.values())
     will = session.will
     return {
@@ -143,7 +143,7 @@ def _message(message: Message) -> Any:
 
 
 def difference(before: Any, after: Any, path: str = "") -> list[str]:
-    """Where two states are not the same, for people."""
+    """The differences between two states, for people."""
     if isinstance(before, dict) and isinstance(after, dict):
         found = []
         for key in {**before, **after}:
@@ -158,7 +158,7 @@ def difference(before: Any, after: Any, path: str = "") -> list[str]:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Equal, and times nearly so: they were on the wall clock meanwhile."""
+    """Whether they are equal; times only nearly, because they were converted to the wall clock."""
     if isinstance(one, float) and isinstance(other, float):
         return abs(one - other) < 0.1
     if isinstance(one, tuple | list) and isinstance(other, tuple | list):
