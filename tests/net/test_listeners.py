@@ -883,7 +883,7 @@ def test_each_user_is_counted_for_itself():
     assert addresses.oldest_guest() is members[0]
     for member in members:
         addresses.ended(member)
-    addresses._forget_idle(1000.0)
+    addresses._evict_idle(1000.0)
     assert not addresses._known
 
 
